@@ -1,134 +1,251 @@
-"""The command `landscape`: its verbs in the groups and the order of its help, and how it ends."""
+"""The command `landscape`, made of the functions of `api`: its verbs in the groups of its help, and how it ends."""
 
 from __future__ import annotations
 
 import os
 import shlex
 import sys
-from collections.abc import Callable
-from inspect import signature
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cache
+from importlib import import_module
+from inspect import Parameter as Slot
+from inspect import Signature, getdoc, signature
 from io import TextIOWrapper
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-from typer.core import TyperGroup
+from cyclopts import App, CycloptsError, Group, MissingArgumentError, Parameter
 
 from . import __version__
-from .commands import gallery
-from .commands.bench import bench
-from .commands.card import card
-from .commands.census import census
-from .commands.check import check
-from .commands.compare import compare
-from .commands.dims import TakesDims
-from .commands.envs import envs
-from .commands.export import export
-from .commands.extremes import extremes
-from .commands.info import info
-from .commands.league import league
-from .commands.optimize import methods, optimize
-from .commands.overlay import overlay
-from .commands.pairs import pairs
-from .commands.plan import plan
-from .commands.race import race
-from .commands.replay import replay
-from .commands.report import report_
-from .commands.slice import bounce, slice_
-from .commands.surface import surface
-from .commands.sweep import sweep
-from .commands.tradeoff import tradeoff
-from .commands.view import view
+from .commands.results import as_json, kind_of, shower
 
+if TYPE_CHECKING:
+    from pathlib import Path
 
-class Listed(TyperGroup):
-    """Verbs that help lists with their first sentences in full, those of the command in groups."""
-
-    def format_commands(self, ctx: Any, formatter: Any) -> None:
-        """Write the verbs of each group under its heading."""
-        groups = GROUPS if ctx.parent is None else {"Commands": tuple(self.commands)}
-        for heading, verbs in groups.items():
-            with formatter.section(heading):
-                formatter.write_dl([(name, _first_sentence(self.commands[name])) for name in map(_name, verbs)])
-
-
-class Verbs(Listed):
-    """The verbs of the command, of which Ctrl-C ends as it is raised: the library would make an exit code of it."""
-
-    def invoke(self, ctx: Any) -> Any:
-        """Run a verb; return what Ctrl-C has raised, for `main` to raise it again."""
-        try:
-            return super().invoke(ctx)
-        except KeyboardInterrupt as stop:
-            return stop
-
-
-app = typer.Typer(
-    name="landscape",
-    cls=Verbs,
-    help="See, measure and search the loss landscapes of differentiable simulators.",
-    add_completion=False,
-    rich_markup_mode=None,
-    pretty_exceptions_enable=False,
-    context_settings={"help_option_names": ["-h", "--help"]},
-)
-
-STOPPED = 130  # the exit code of what Ctrl-C has ended
-LONG = 200  # characters of a path that an error shows
-_GALLERY = "gallery"
-GROUPS: dict[str, tuple[Callable[..., None] | str, ...]] = {  # of the help: heading -> verbs
-    "Look": (slice_, bounce, sweep, replay, surface, overlay, compare, view, envs, info),
-    "Measure": (check, report_, census, pairs, tradeoff, extremes, card, bench, plan),
-    "Search": (methods, optimize, race, league),
-    "Publish": (export, _GALLERY),
+GROUPS = {  # of the help: heading -> verbs, each with the module of `api` that declares it
+    "Look": {
+        "slice": "slice",
+        "bounce": "slice",
+        "sweep": "sweep",
+        "replay": "replay",
+        "surface": "surface",
+        "overlay": "overlay",
+        "compare": "compare",
+        "view": "view",
+        "envs": "environments",
+        "info": "info",
+    },
+    "Measure": {
+        "check": "measure",
+        "report": "report",
+        "census": "measure",
+        "pairs": "measure",
+        "card": "measure",
+        "bench": "measure",
+    },
+    "Search": {"methods": "environments", "optimize": "search", "race": "search", "league": "search"},
+    "Publish": {
+        "export": "export",
+        "gallery compute": "gallery",
+        "gallery list": "gallery",
+        "gallery build": "gallery",
+        "gallery serve": "gallery",
+    },
 }
+GALLERY = "Compute the figures of the paper, and build a site that shows them offline."
+RENAMED = {  # verbs and options of earlier versions, and today's
+    "tradeoff": "landscape study fidelity, model, convergence or mixed",
+    "extremes": "landscape study extremes",
+    "--against": "--second-engine",
+    "--also": "--second-fidelity",
+    "--extent": "--window",
+    "--print": "--figure-width-mm",
+    "--report": "--claims",
+}
+STOPPED = 130  # the exit code of what Ctrl-C has ended
+LONG_PATH = 200  # characters of a path that an error shows
+DIMS = "--dims"
+JSON = Annotated[bool, Parameter(show_default=False, help="Print the result as one JSON object on standard output.")]
+WORDS = Parameter(negative=())
 
 
-def _name(verb: Callable[..., None] | str) -> str:
-    """Return what is typed for a verb."""
-    return verb if isinstance(verb, str) else verb.__name__.rstrip("_")
+@dataclass(frozen=True)
+class Verb:
+    """A verb of the command: the public function that declares it, under the words that are typed for it."""
+
+    words: str
+    function: Callable[..., Any]
+
+    @property
+    def parameters(self) -> list[Slot]:
+        """Its arguments and options: those of the function, then those of what shows its result, then --json."""
+        own = _slots(self.function)
+        if not _returned(self.function):
+            return own
+        shown = {}
+        for kind in _returned(self.function):
+            shown |= {slot.name: slot for slot in _slots(shower(kind), (Slot.KEYWORD_ONLY,))}
+        last = own.pop() if own and own[-1].kind is Slot.VAR_KEYWORD else None
+        whole = [*own, *shown.values(), Slot("json", Slot.KEYWORD_ONLY, default=False, annotation=JSON)]
+        return [*whole, last] if last else whole
+
+    @property
+    def displayed(self) -> set[str]:
+        """The names of the options of what shows its result."""
+        own = {slot.name for slot in _slots(self.function)}
+        return {slot.name for slot in self.parameters} - own - {"json"}
+
+    def command(self) -> Callable[..., int]:
+        """Return what the command line calls."""
+
+        def call(*given: Any, **named: Any) -> int:
+            return self.run(given, named)
+
+        call.__doc__ = self.help()
+        slots = self.parameters
+        call.__signature__ = Signature(slots)  # type: ignore[attr-defined]
+        call.__annotations__ = {slot.name: slot.annotation for slot in slots}
+        return call
+
+    def help(self) -> str:
+        """Return its docstring without what is for Python alone, and with the options of what shows its result."""
+        said, options = _docstring(self.function)
+        for kind in _returned(self.function):
+            options |= _docstring(shower(kind))[1]
+        paragraphs = [" ".join(one.split()) for one in said.split("\n\n") if not one.startswith("Raises ")]
+        words = "\n".join(f"{name}\n    {text}" for name, text in options.items())
+        return "\n\n".join(paragraphs) + (f"\n\nParameters\n----------\n{words}" if words else "")
+
+    def run(self, given: Sequence[Any], named: dict[str, Any]) -> int:
+        """Call the function, show what it returns, and return the exit code."""
+        from .api.call import Call, calling
+        from .commands.terminal import Bars, Console, command_line
+
+        shown = {name: named.pop(name) for name in self.displayed & set(named)}
+        as_object, results, code = named.pop("json", False), [], 0
+        for one in _for_each_point(named):
+            bars = Bars()
+            with calling(Call(command_line(), bars, on_disk=True)):
+                result = self.function(*given, **one)
+                show = shower(kind_of(result))
+                if show is not None:
+                    code = max(code, show(result, Console(stderr=as_object), **shown) or 0)
+            results.append(as_json(result, bars.folder) if as_object else None)
+        if as_object:
+            import json
+
+            print(json.dumps(results[0] if len(results) == 1 else {f"{self.words}s": results}))
+        return code
 
 
-def _first_sentence(command: Any) -> str:
-    return " ".join(str(command.help).partition("\n\n")[0].split())
+def _slots(function: Callable[..., Any] | None, kinds: Sequence[Any] = tuple(type(Slot.KEYWORD_ONLY))) -> list[Slot]:
+    """Return a function's parameters for the command line: arguments are those that are marked, all else is options."""
+    from .api.options import ARGUMENT
+
+    slots = []
+    for slot in signature(function).parameters.values() if function else ():
+        hint, kind = _hint(function, slot.annotation), slot.kind
+        if kind not in kinds:
+            continue
+        if slot.default is None or slot.default is False or slot.default == ():
+            hint = Annotated[hint, Parameter(show_default=False)]
+        if ARGUMENT in getattr(hint, "__metadata__", ()):
+            kind = Slot.POSITIONAL_ONLY
+        elif kind is Slot.POSITIONAL_OR_KEYWORD:
+            kind = Slot.KEYWORD_ONLY
+        slots.append(slot.replace(kind=kind, annotation=hint))
+    return slots
 
 
-for _verb in (one for verbs in GROUPS.values() for one in verbs):
-    if not isinstance(_verb, str):
-        app.command(_name(_verb), cls=TakesDims if "dims" in signature(_verb).parameters else None)(_verb)
-_gallery = typer.Typer(cls=Listed, help="Compute the figures of the paper, and build a site that shows them offline.")
-for _verb in (gallery.compute, gallery.list_, gallery.build, gallery.serve):
-    _gallery.command(_name(_verb))(_verb)
-app.add_typer(_gallery, name=_GALLERY)
+def _hint(function: Callable[..., Any] | None, written: Any) -> Any:
+    """Return the type that stands for a parameter; what only type checkers know is no option of the command."""
+    try:
+        return eval(written, getattr(function, "__wrapped__", function).__globals__)
+    except NameError:
+        return Any
 
 
-@app.callback(invoke_without_command=True)
-def _root(
-    context: typer.Context,
-    version: Annotated[bool, typer.Option("--version", help="Print the version and exit.")] = False,
-) -> None:
-    if version:
-        typer.echo(f"gradscape {__version__}")
-        raise typer.Exit()
-    _help_without_verb(context)
+def _returned(function: Callable[..., Any]) -> list[str]:
+    """Return the names of the types that a function returns, none where it returns nothing."""
+    written = str(signature(function).return_annotation)
+    return [] if written == "None" else written.split(" | ")
 
 
-@_gallery.callback(invoke_without_command=True)
-def _help_without_verb(context: typer.Context) -> None:
-    if context.invoked_subcommand is None:
-        typer.echo(context.get_help())
-        raise typer.Exit()
+def _docstring(function: Callable[..., Any] | None) -> tuple[str, dict[str, str]]:
+    """Return a function's docstring without its parameters, and what it says of each of these."""
+    said, _, listed = ((getdoc(function) or "") if function else "").partition("\n\nParameters\n----------\n")
+    options, name = dict[str, str](), ""
+    for line in listed.splitlines():
+        if line.startswith(" "):
+            options[name] = f"{options[name]} {line.strip()}".strip()
+        elif line:
+            options[name := line.strip()] = ""
+    return said, options
+
+
+def _for_each_point(named: dict[str, Any]) -> list[dict[str, Any]]:
+    """Return the options of each slice or sweep where --through names several points, A,B, with a folder for each."""
+    if "," not in str(named.get("through", "")):
+        return [named]
+    from .jobs.cut import folder_for, split_points
+
+    points = split_points(named["through"])
+    out = named.get("out")
+    return [
+        named | {"through": point} | ({"out": folder_for(_path(out), point, points)} if out else {}) for point in points
+    ]
+
+
+def _path(text: str) -> Path:
+    from pathlib import Path
+
+    return Path(text)
+
+
+@cache
+def verbs() -> dict[str, Verb]:
+    """Return every verb by what is typed after `landscape`; what simulates is not imported for that."""
+    return {words: find_verb(words) for group in GROUPS.values() for words in group}
+
+
+@cache
+def find_verb(words: str) -> Verb:
+    """Return a verb, importing the module of `api` that declares it."""
+    module = next(group[words] for group in GROUPS.values() if words in group)
+    found = import_module(f".api.{module}", __package__)
+    name = words.split()[-1]
+    return Verb(words, getattr(found, name, None) or getattr(found, f"{name}_"))
+
+
+def make_app(only: Sequence[str] = ()) -> App:
+    """Make the command with all verbs, or with those of `only` these words."""
+    panels = {heading: Group(heading, sort_key=number) for number, heading in enumerate(GROUPS, 1)}
+    look: Any = {"default_parameter": WORDS, "help_format": "plaintext"}
+    app = App(name="landscape", help=ABOUT, version=f"gradscape {__version__}", help_flags=["--help", "-h"], **look)
+    gallery = App(name="gallery", help=GALLERY, group=panels["Publish"], **look)
+    for heading, group in GROUPS.items():
+        for words in group:
+            if only and words not in only:
+                continue
+            *of, name = words.split()
+            place: Any = {} if of else {"group": panels[heading], "sort_key": len(app._commands)}
+            (gallery if of else app).command(find_verb(words).command(), name=name, **place)
+    if not only or any(words.startswith("gallery ") for words in only):
+        app.command(gallery)
+    return app
+
+
+ABOUT = "See, measure and search the loss landscapes of differentiable simulators."
 
 
 def main(arguments: list[str] | None = None) -> Any:
     """Run the command; bad input ends with one line on standard error and exit code 2."""
-    from typer.exceptions import TyperException
-
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # a file's name need not be text
     try:
-        code = _run(arguments)
-    except TyperException as error:
+        code = _run(sys.argv[1:] if arguments is None else arguments)
+    except CycloptsError as error:
         code = _fail(_usage(error), 2)
     except ValueError as error:
         code = _fail(str(error), 2)
@@ -136,19 +253,42 @@ def main(arguments: list[str] | None = None) -> Any:
         code = _fail(_system(error), 1)
     except (MemoryError, RuntimeError) as error:
         code = _fail(_memory(error), 1)
-    except (KeyboardInterrupt, typer.Abort) as stop:
-        code = _stop(stop) or _fail("stopped before anything was computed; the same command begins again", 130)
+    except KeyboardInterrupt as stop:
+        code = _stop(stop) or _fail("stopped before anything was computed; the same command begins again", STOPPED)
     sys.exit(code)
 
 
-def _run(arguments: list[str] | None) -> Any:
-    """Run the command, and raise what Ctrl-C has raised in a verb again."""
-    code = app(args=arguments, prog_name="landscape", standalone_mode=False)
-    if isinstance(code, KeyboardInterrupt):
-        raise code
-    if code == STOPPED:  # what the library makes of Ctrl-C where no verb has begun
-        raise KeyboardInterrupt
-    return code
+def _run(words: list[str]) -> Any:
+    """Run the command with these words."""
+    written = [words[:1], *([word.partition("=")[0]] for word in words[1:] if word.startswith("--"))]
+    for (word,) in filter(None, written):
+        if word in RENAMED:
+            raise ValueError(f"{word} is {RENAMED[word]} today")
+    named = next(
+        (name for group in GROUPS.values() for name in group if words[: len(name.split())] == name.split()), ""
+    )
+    app = make_app([named] if named else ())
+    how: Any = {"exit_on_error": False, "print_error": False, "result_action": "return_value"}
+    if DIMS not in words:
+        return app(words, **how)
+    try:
+        return app(_dims_first(words, len(named.split()), 2), **how)
+    except MissingArgumentError:
+        return app(_dims_first(words, len(named.split()), 1), **how)
+
+
+def _dims_first(words: Sequence[str], at: int, most: int) -> list[str]:
+    """Return a command's words with at most so many behind --dims; others that follow there are arguments."""
+    found, moved, left = list[str](), list[str](), list(words)
+    while left:
+        found.append(left.pop(0))
+        if found[-1] == DIMS:
+            values = list[str]()
+            while left and not left[0].startswith("-"):
+                values.append(left.pop(0))
+            found += values[:most]
+            moved += values[most:]
+    return [*found[:at], *moved, *found[at:]]
 
 
 def _stop(stop: BaseException) -> int:
@@ -158,20 +298,20 @@ def _stop(stop: BaseException) -> int:
     if not isinstance(stop, Stopped):
         return 0
     again = shlex.join(["landscape", *sys.argv[1:]])
-    then = "goes on from there" if stop.kept else "begins again"
+    then = "continues from there" if stop.kept else "begins again"
     _say(f"stopped: {stop}; the same command {then}: {again}")
     return STOPPED
 
 
-def _usage(error: Any) -> str:
+def _usage(error: CycloptsError) -> str:
     """Return what is wrong with a command's words, and where it is said what the command takes."""
-    context = getattr(error, "ctx", None)
-    said = error.format_message().rstrip(".")
-    return f"{said} (`{context.command_path} --help` says what it takes)" if context else said
+    chain = " ".join(["landscape", *(error.command_chain or ())])
+    said = " ".join(str(error).split()).rstrip(".")
+    return f"{said} (`{chain} --help` says what it takes)"
 
 
 def _system(error: OSError) -> str:
-    """Return what to say where the system refused: of a full disk how to go on, of a file which, why and what to do."""
+    """Return what to say where the system refused: of a full disk how to continue, of a file which, why and what."""
     from .landscapes.storage.disk import DiskFullError, is_full
 
     if not isinstance(error, DiskFullError) and is_full(error):
@@ -181,7 +321,7 @@ def _system(error: OSError) -> str:
     if error.filename is None or error.strerror is None:
         return str(error)
     name = os.fsdecode(error.filename2 or error.filename)
-    return f"{name if len(name) < LONG else name[:LONG] + '...'}: {error.strerror.lower()}; give another path"
+    return f"{name if len(name) < LONG_PATH else name[:LONG_PATH] + '...'}: {error.strerror.lower()}; give another path"
 
 
 def _memory(error: Exception) -> str:
@@ -203,4 +343,4 @@ def _say(line: str) -> None:
     """Print a line on standard error; what others have put into it cannot steer the terminal."""
     from .landscapes.plain import printable
 
-    typer.echo(printable(line), err=True)
+    print(printable(line), file=sys.stderr)

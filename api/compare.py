@@ -3,75 +3,75 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Unpack
+from typing import TYPE_CHECKING, Annotated, Any, Unpack
 
-from .progress import default_watch
-from .scene import Scene, SceneKeywords, environment, say_call
-from .slice import open_slice
+from .call import current, verb
+from .options import ARGUMENT, FigureWidth, Force, Out, Scene, SceneKeywords
+from .scene import environment, spec_of
+from .slice import as_slice
+from .values import as_path, as_widths
 
 if TYPE_CHECKING:
     from ..envs.base import Environment
-    from ..jobs.watch import Watch
     from ..landscapes.measures.slice_comparison_record import SliceComparison
     from ..landscapes.slice import Slice
 
 
+@verb
 def compare(
-    a: str | Path | Slice,
-    b: str | Path | Slice | Scene,
+    a: Annotated[Any, ARGUMENT],
+    b: Annotated[Any, ARGUMENT],
     *,
-    out: str | Path | None = None,
-    force: bool = False,
+    figure_width_mm: FigureWidth = (),
+    out: Out = None,
+    force: Force = False,
     **keywords: Unpack[SceneKeywords],
 ) -> SliceComparison:
-    """Hold the slice `b` against the slice `a`: losses, their order, gradients, and where they part.
+    """Compare two slices of the same plane: losses, their order, gradients and the largest differences.
 
-    Slices are folders, or what `gradscape.slice` returns, that lie on one plane: of any two fidelities, engines,
-    options, versions or environments that have the same parameters and unit of the loss. In the place of `b` there may
-    be an environment, by its name or itself, or anyone's objective: it is sampled where `a` is, as the `keywords` say,
-    in a folder of the comparison's; the same call goes on there. The files lie in the folder `out`, by default one
-    under out/ named after both.
+    They may differ in fidelity, engine, options, version or environment, if the environments have the same parameters
+    and the same unit of the loss. The folder then holds compare.json and compare.png, and slice B if it was sampled
+    here. Stop at any time: the same command continues from there.
 
     Raises ValueError for slices that cannot be compared, for what the scene does not have, and where the folder holds
-    something else or another comparison, which `force` replaces; Stopped where it is interrupted.
+    something else or another comparison; Stopped where it is interrupted.
+
+    Example: landscape compare out/my-slice bounce --fidelity standard
+
+    Parameters
+    ----------
+    a
+        Folder of slice A, or the slice itself.
+    b
+        Folder of slice B on the same plane, the slice itself, or an environment to sample on that plane with the
+        options below.
     """
+    if _is_scene(b):
+        spec_of(b, keywords)
+    first = as_slice(a)
     from ..jobs.compare import CompareJob
 
-    watch = default_watch()
-    first = _slice(a)
+    call = current()
     job = CompareJob.of(
-        first,
-        _second(b, keywords, watch),
-        command=say_call("compare", _said(a), _said(b), **keywords),
-        out=Path(out) if out is not None else None,
-        force=force,
-    )
-    return job.run(watch)
+        first, _second(b, keywords), command=call.command, out=as_path(out), force=force,
+        prints=as_widths(figure_width_mm),
+    )  # fmt: skip
+    return job.run(call.watch)
 
 
-def _said(given: str | Path | Slice | Scene) -> str:
-    """Return what stands for a slice or a scene in a call."""
-    from ..jobs.scene import SceneSpec
+def _is_scene(given: str | Path | Slice | Scene) -> bool:
+    """Say whether it is something to sample, and no slice that is there."""
+    if isinstance(given, str):
+        return not Path(given).exists()
     from ..landscapes.slice import Slice
 
-    named = given.name if isinstance(given, SceneSpec) else given
-    if isinstance(named, Slice):
-        return str(named.folder or named.identity["objective"])
-    if isinstance(named, type):
-        return named.__name__
-    return str(named) if isinstance(named, str | Path) else str(getattr(named, "name", type(named).__name__))
+    return not isinstance(given, Slice | Path)
 
 
-def _slice(given: str | Path | Slice) -> Slice:
-    return open_slice(given) if isinstance(given, str | Path) else given
-
-
-def _second(given: str | Path | Slice | Scene, keywords: SceneKeywords, watch: Watch) -> Slice | Environment:
+def _second(given: str | Path | Slice | Scene, keywords: SceneKeywords) -> Slice | Environment:
     """Return a slice that is there, and else the objective to sample. Raises ValueError for keywords beside a slice."""
-    from ..landscapes.slice import Slice
-
-    if not (isinstance(given, Slice | Path) or (isinstance(given, str) and Path(given).exists())):
-        return environment(given, keywords, watch)
+    if _is_scene(given):
+        return environment(given, keywords)
     if keywords:
-        raise ValueError(f"{', '.join(keywords)} are of an environment to sample; b is a slice that is there already")
-    return _slice(given)
+        raise ValueError(f"{', '.join(keywords)} are of an environment to sample; {given} is there: leave them out")
+    return as_slice(given)

@@ -1,16 +1,18 @@
-"""`gs.overlay`: lay runs over a slice."""
+"""`gs.overlay`: draw runs over a slice."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from .progress import default_watch
-from .slice import open_slice
+from .call import current, verb
+from .options import ARGUMENT, Device, FigureWidth, Of, Out, Side
+from .slice import as_slice
+from .values import as_path, as_widths
 
 if TYPE_CHECKING:
-    from typing import Protocol, TypeAlias
+    from typing import Protocol
 
     import pandas as pd
 
@@ -34,48 +36,72 @@ if TYPE_CHECKING:
         def lookup_data(self) -> Any:
             """Return what its metrics measured."""
 
-    Points: TypeAlias = str | Path | Run | pd.DataFrame | Study | Experiment
+    SliceFolder = str | Path | Slice
+    RunFolder = str | Path | Run | pd.DataFrame | Study | Experiment
+    RunFolders = RunFolder | Sequence[RunFolder]
+else:
+    SliceFolder, RunFolders = str, list[str]
 
 
+@verb
 def overlay(
-    slice: str | Path | Slice,
-    runs: Points | Sequence[Points],
+    slice: Annotated[SliceFolder, ARGUMENT],
+    runs: Annotated[RunFolders, ARGUMENT],
     *,
+    env: Of = None,
     through: str | None = None,
-    plane: str | None = None,
-    resolution: int | None = None,
-    device: str = "auto",
-    out: str | Path | None = None,
+    plane: Literal["pca"] | None = None,
+    resolution: Side | None = None,
+    device: Device = "auto",
+    figure_width_mm: FigureWidth = (),
+    out: Out = None,
 ) -> Overlay:
-    """Lay runs over a slice of a plane: where their points lie, how far off it, and what the slice shows there.
+    """Draw runs over a slice, with their distance from its plane.
 
-    Slice and runs are folders, a race's for all of its runs, or what `gradscape.slice` and `gradscape.optimize` return.
-    Points that another program evaluated are a CSV or Parquet file or a pandas table, with a column for each parameter,
-    called as it is, and one called loss, which is missing where an evaluation failed; or an Optuna study, or what its
-    `trials_dataframe()` returns; or an experiment of Ax, or its client. Values of a study or an experiment that
-    maximises are negated, and its name says so. Rows without a number for each parameter are skipped and counted.
-    The slice is cut anew `through` the best point of all runs (best) or of one run's folder, or any other point that
-    `gradscape.slice` goes through by its name, and along the runs' two principal directions with `plane` pca, with
-    `resolution` points along each axis, on `device`. The files lie in the folder `out`, by default one under out/ named
-    after the overlay.
+    The folder then holds overlay.png, and overlay.rrd to walk around in and to play back. It also says how many points
+    the slice does not show. Runs of Python may also be what `gradscape.optimize` returns, pandas tables, an Optuna
+    study, or an Ax experiment or its client; values of a study that maximises are negated. Rows without a number for
+    each parameter are skipped and counted.
 
-    Raises ValueError for runs of other landscapes than the slice's, for a slice of a line, where there is no slice or
-    run, where a table lacks a column, has one twice or holds no point, and where the folder holds something else;
-    Stopped where it is interrupted.
+    Raises ValueError for runs of other landscapes than the slice's, for a slice of a line, where a table lacks a
+    column, has one twice or holds no point, and where the folder holds something else; Stopped where it is interrupted.
+
+    Example: landscape overlay out/fluid-6-8 out/race-fluid --through best
+
+    Parameters
+    ----------
+    slice
+        Folder of the slice.
+    runs
+        Folders of runs or of races, or CSV and Parquet tables of points. A table has a column per parameter, with its
+        name, and a column loss, or is what Optuna's trials_dataframe() returns.
+    through
+        Sample a new slice through a point: best for the best of all runs, the folder of a run for its best, or any
+        point of `landscape slice --through`.
+    plane
+        Sample a new slice along the two principal directions of the runs: pca.
+    resolution
+        Number of points along each axis of a new slice. The default is that of SLICE.
     """
+    several = [runs] if isinstance(runs, str | Path) or not isinstance(runs, Sequence) else list(runs)
+    from ..landscapes.storage.paths import refuse_missing
+
+    if isinstance(slice, str | Path):
+        refuse_missing(str(slice), "slice")
+    for run in several:
+        if isinstance(run, str | Path) and not Path(run).suffix:  # a table is looked for by whoever reads it
+            refuse_missing(str(run), "run")
+    if isinstance(env, str):
+        from ..envs.registry import refuse_unknown
+
+        refuse_unknown(env)
     from ..jobs.foreign import tables_over
     from ..jobs.overlay import Cut, OverlayJob
 
-    watch, cut = default_watch(), Cut.of(through, plane, resolution)
-    several = [runs] if isinstance(runs, str | Path) or not isinstance(runs, Sequence) else list(runs)
-    beneath = open_slice(slice) if isinstance(slice, str | Path) else slice
+    call, cut = current(), Cut.of(through, plane, resolution)  # type: ignore[arg-type] # one number for both axes
+    beneath = as_slice(slice, env=env)
     job = OverlayJob.of(
-        beneath,
-        tables_over(beneath, several, watch),
-        command="gradscape.overlay(...)",
-        cut=cut,
-        device=device,
-        out=Path(out) if out is not None else None,
-        watch=watch,
-    )
-    return job.run(watch)
+        beneath, tables_over(beneath, several, call.watch), command=call.command, cut=cut, device=device,
+        out=as_path(out), prints=as_widths(figure_width_mm), watch=call.watch,
+    )  # fmt: skip
+    return job.run(call.watch)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 from rich import console as rich
@@ -65,6 +66,13 @@ class Bars(Watch):
 
     def __init__(self, console: Console | None = None) -> None:
         self.console = console or Console(stderr=True, soft_wrap=True, highlight=False)
+
+    folder: Path | None = None  # of the last job that has finished
+
+    def finish(self, folder: Path, files: Sequence[str], said: str = "") -> None:
+        """Print what came out, and which files are where."""
+        self.folder = folder
+        super().finish(folder, files, said)
 
     def note(self, text: str) -> None:
         """Print a line."""

@@ -1,49 +1,55 @@
-"""How a function of the front door is told which scene to simulate."""
+"""Which simulator a public function is given."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, TypedDict
+from typing import TYPE_CHECKING, Any, cast
 
+from ..envs.registry import refuse_unknown
 from ..jobs.scene import SceneSpec
-from ..jobs.watch import Watch
+from .call import current
+from .options import Scene, SceneKeywords
+from .values import as_settings
 
 if TYPE_CHECKING:
-    from torch import Tensor
+    from ..envs.base import Environment
 
-    from ..envs.base import Environment, Fidelity
-
-Scene = Any
-"""What every function takes for a simulator: the name of a scene, FILE.py:NAME, an environment (`gs.from_torch` and
-its like make one of a function) or its class, a `SceneSpec`, or an object of one's own with `space` and `evaluate`."""
+OWN = {*SceneSpec.__dataclass_fields__, "self", "what"}  # names that no option of a scene may have
 
 
-class SceneKeywords(TypedDict, total=False):
-    """The keywords that every function takes which simulates a scene: those of `SceneSpec`, with its defaults."""
+def spec_of(scene: Scene, keywords: SceneKeywords, *, dims: Sequence[int | str] | None = None) -> SceneSpec:
+    """Return the spec of whatever names or is a simulator.
 
-    fidelity: str | Fidelity | None
-    tolerance: str | None
-    device: str
-    engine: str
-    deterministic: bool
-    options: Mapping[str, Any]
-
-
-def spec_of(scene: Scene, keywords: SceneKeywords) -> SceneSpec:
-    """Return the spec of whatever names or is a simulator. Raises ValueError for what is none."""
+    Raises ValueError for what is none, and for words that it cannot have, before what simulates is imported. The
+    parameters `dims` are numbered as the scene's class has them; its options may change that.
+    """
+    named = cast("dict[str, Any]", dict(keywords))
+    if "options" in named:
+        named["options"] = as_settings(named["options"])
+        if taken := OWN & set(named["options"]):
+            name = min(taken)
+            raise ValueError(f"--set takes a scene's own options; {name} is none, and chosen by --{name} if at all")
     if isinstance(scene, SceneSpec):
-        return replace(scene, **keywords)
+        return replace(scene, **named)
     if not isinstance(scene, str):
         from ..envs.registry import find_environment
 
-        scene = find_environment(scene)
-    return SceneSpec(scene, **keywords)
+        return SceneSpec(find_environment(scene), **named)
+    spec = SceneSpec(scene, **named)
+    if scene:
+        words = [str(dim) for dim in dims or ()] if not spec.options else []
+        refuse_unknown(scene, fidelity=spec.fidelity, device=spec.device, engine=spec.engine, dims=words)
+        if spec.tolerance is not None:
+            from ..jobs.tolerance import tolerance_of
+
+            tolerance_of(spec)
+    return spec
 
 
-def environment(scene: Scene, keywords: SceneKeywords, watch: Watch) -> Environment:
+def environment(scene: Scene, keywords: SceneKeywords, *, dims: Sequence[int | str] | None = None) -> Environment:
     """Return the environment that is meant, with these keywords. Raises ValueError for what it does not have."""
-    return spec_of(scene, keywords).make(watch)
+    return spec_of(scene, keywords, dims=dims).make(current().watch)
 
 
 def is_in_memory(env: Environment, out: object) -> bool:
@@ -51,21 +57,4 @@ def is_in_memory(env: Environment, out: object) -> bool:
 
     Functions change from one call to the next, as in a notebook; a folder of results that do not fit would be refused.
     """
-    return out is None and not env.model_version
-
-
-def say_cut(
-    along: str | None, through: str | Tensor, extent: float | tuple[float, float] | None, *, gradients: bool | int
-) -> dict[str, Any]:
-    """Return what `say_call` is told of where a slice goes and whether it has gradients; None where it need not be."""
-    point = through if isinstance(through, str) else through.tolist()
-    where = {"along": along, "through": None if point == "center" else point, "extent": extent}
-    return {**where, "gradients": None if gradients is True or gradients == 1 else gradients or False}
-
-
-def say_call(function: str, scene: object, *given: object, **named: object) -> str:
-    """Return a call of the front door as one writes it, to be kept with what it makes; of the scene its name."""
-    name = scene.name if isinstance(scene, SceneSpec) else scene
-    said = repr(name) if isinstance(name, str) else str(getattr(name, "name", name))
-    words = [said, *map(repr, given), *(f"{key}={value!r}" for key, value in named.items() if value is not None)]
-    return f"gradscape.{function}({', '.join(words)})"
+    return out is None and not env.model_version and not current().on_disk

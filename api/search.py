@@ -1,99 +1,238 @@
-"""`gs.optimize`, `gs.race` and `gs.open_run`: search a scene by one method or by several, and open what was found."""
+"""`gs.optimize`, `gs.race`, `gs.league` and `gs.open_run`: search scenes by one method or by several."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Unpack
+from typing import TYPE_CHECKING, Annotated, Any, Unpack
 
-from ..jobs.watch import Watch
-from .progress import default_watch
-from .scene import Scene, SceneKeywords, environment, is_in_memory, say_call
+from cyclopts import Parameter
+
+from .call import current, verb
+from .options import (
+    ARGUMENT,
+    Budget,
+    Count,
+    FigureWidth,
+    Force,
+    MethodSettings,
+    Names,
+    Out,
+    Scene,
+    SceneKeywords,
+    Scheduler,
+    Seed,
+    Settings,
+)
+from .scene import environment, is_in_memory, spec_of
+from .values import as_method_settings, as_names, as_path, as_settings, as_widths
 
 if TYPE_CHECKING:
     from ..envs.base import Environment
+    from ..jobs.scene import SceneSpec
     from ..optim.base import Optimizer
+    from ..optim.league import League
     from ..optim.race import Race
     from ..optim.runs.run import Run
 
+    Scenes = Scene | Sequence[Scene]
+else:
+    Scenes = list[str]
 
+Workers = Annotated[
+    int | None,
+    Parameter(
+        help="Number of processes that fit Gaussian processes. The default is one per core for the command, and 1 in "
+        "Python, where more need a script whose own work stands under `if __name__ == '__main__':`. Results do not "
+        "depend on it."
+    ),
+]
+
+
+@verb
 def optimize(
     scene: Scene,
-    method: str,
+    method: str = "bo-leap",
     *,
-    budget: int = 1000,
-    seed: int = 0,
-    method_options: Mapping[str, Any] | None = None,
-    out: str | Path | None = None,
-    force: bool = False,
+    budget: Budget = 1000,
+    seed: Seed = 0,
+    method_options: Annotated[Settings, Parameter(name="--option")] = (),
+    figure_width_mm: FigureWidth = (),
+    out: Out = None,
+    force: Force = False,
     **keywords: Unpack[SceneKeywords],
 ) -> Run:
-    """Search a scene's parameters for the least loss by a method, and return the run.
+    """Search for the lowest loss with one method, and keep every evaluated point.
 
-    `budget` episodes are evaluated, not one more; `seed` decides the method's random numbers, and `method_options` are
-    its own. The run lies in the folder `out`, by default one under out/ named after it: the same call goes on there
-    where it stopped, and a larger budget goes on from its end. A function is searched in memory without `out`.
+    The folder then holds run.zarr (every episode), progress.png and summary.json. Stop at any time: the same command
+    continues from there. A larger budget continues the run, which is then the same as one that had this budget from the
+    start. A function is searched in memory unless it is given a folder.
 
     Raises ValueError for what the scene or the method does not have, and where the folder holds something else or
-    another run, which `force` replaces; Stopped where it is interrupted.
+    another run; Stopped where it is interrupted.
+
+    Example: landscape optimize fluid --method bo-leap --budget 300
+
+    Parameters
+    ----------
+    scene
+        The environment: a name that `landscape envs` lists, or FILE.py:NAME for a simulator in a file of your own.
+    method
+        Method to search with. `landscape methods` lists them.
+    budget
+        Number of episodes to evaluate. It is never exceeded.
+    seed
+        Random seed.
+    method_options
+        An option of the method, as name=value. It may be repeated.
     """
-    watch = default_watch()
-    env = environment(scene, keywords, watch)
+    from ..optim.registry import find_method
+
+    find_method(method)  # a name that does not exist is refused before what searches is imported
+    options, call = as_settings(method_options, "--option"), current()
+    env = environment(scene, keywords)
     from ..jobs.search import SearchJob, make_optimizer
 
-    optimizer = make_optimizer(method, env, seed=seed, options=method_options)
+    optimizer = make_optimizer(method, env, seed=seed, options=options)
     if is_in_memory(env, out):
-        return _search_in_memory(env, optimizer, budget, watch)
-    command = say_call("optimize", scene, method, budget=budget, seed=seed, **keywords)
+        return _search_in_memory(env, optimizer, budget)
     job = SearchJob.of(
-        env, optimizer, budget=budget, command=command, out=Path(out) if out is not None else None, force=force
-    )
-    job.run(watch)
+        env, optimizer, budget=budget, command=call.command, out=as_path(out), force=force,
+        prints=as_widths(figure_width_mm),
+    )  # fmt: skip
+    summary = job.run(call.watch)
+    call.watch.finish(job.folder, summary.files, summary.outcome())
     return job.result()
 
 
+@verb
 def race(
     scene: Scene,
-    methods: str | Sequence[str] = (),
+    methods: Names = (),
     *,
-    budget: int = 1000,
-    seeds: int = 10,
-    method_options: Mapping[str, Mapping[str, Any]] | None = None,
-    workers: int = 1,
+    budget: Budget = 1000,
+    seeds: Count = 10,
+    method_options: Annotated[MethodSettings, Parameter(name="--option")] = (),
+    workers: Annotated[Workers, Parameter(name="--workers")] = None,
+    scheduler: Scheduler = None,
     best_known: float | None = None,
-    out: str | Path | None = None,
-    force: bool = False,
+    figure_width_mm: FigureWidth = (),
+    out: Out = None,
+    force: Force = False,
     **keywords: Unpack[SceneKeywords],
 ) -> Race:
-    """Let methods compete on an environment, with the same budget and several seeds each, and return the race.
+    """Compare methods on the same budget over several seeds: best losses, targets reached and ranks.
 
-    `methods` are by default all that can search it here, `method_options` are given by method. Targets go down to the
-    least loss of the race, or to `best_known`, where less is known from elsewhere. All runs go on in lockstep: what
-    they propose is simulated in one batch. Gaussian processes are computed by as many processes as
-    `workers` says; more than one needs a script whose own work stands under `if __name__ == "__main__":`. The race lies
-    in the folder `out`, by default one under out/ named after it: the same call goes on there where it stopped, and so
-    do more methods, seeds or episodes.
+    All runs advance in lockstep, and one batch evaluates the proposals of all of them. The folder then holds race.png,
+    race.json (ranks, pairwise comparisons, running times, curves) and a folder per run. Stop at any time: the same
+    command continues from there. More methods, seeds or episodes also continue from there, and finished runs are not
+    repeated. --workers and --scheduler exclude each other.
 
     Raises ValueError for what the scene or a method does not have, and where the folder holds something else or other
-    runs, which `force` replaces; Stopped where it is interrupted.
-    """
-    watch, named = default_watch(), [methods] if isinstance(methods, str) else list(methods)
-    env = environment(scene, keywords, watch)
-    from ..jobs.race import RaceJob
+    runs; Stopped where it is interrupted.
 
-    return RaceJob.of(
-        env,
-        named,
-        budget=budget,
-        seeds=seeds,
-        command=say_call("race", scene, named, budget=budget, seeds=seeds, **keywords),
-        options=method_options,
-        workers=workers,
-        best_known=best_known,
-        out=Path(out) if out is not None else None,
-        force=force,
-        watch=watch,
-    ).run(watch).race  # fmt: skip
+    Example: landscape race fluid --methods random,bo-leap --budget 200 --seeds 3
+
+    Parameters
+    ----------
+    scene
+        The environment: a name that `landscape envs` lists, or FILE.py:NAME for a simulator in a file of your own.
+    methods
+        Methods to race, a,b or repeated. The default is all that can run here; `landscape methods` lists them.
+    budget
+        Number of episodes of each run. It is never exceeded.
+    seeds
+        Number of runs per method, with seeds 0, 1, ...
+    method_options
+        An option of a method, as METHOD.NAME=VALUE. It may be repeated.
+    best_known
+        Lowest loss known from elsewhere, at which the targets end.
+    """
+    from ..jobs.methods import check_methods
+    from ..optim.registry import methods as registered
+
+    many, call = _workers(workers, scheduler), current()
+    chosen = check_methods(as_names(methods))
+    options = as_method_settings(method_options, chosen or list(registered()))
+    env = environment(scene, keywords)
+    from ..gallery.paper import read_paper
+    from ..jobs.race import RaceJob
+    from ..jobs.workers import workers as cluster
+
+    job = RaceJob.of(
+        env, chosen, budget=budget, seeds=seeds, command=call.command, options=options, workers=many,
+        best_known=best_known, claims=read_paper().claims_about(env.name), out=as_path(out), force=force,
+        prints=as_widths(figure_width_mm), watch=call.watch,
+    )  # fmt: skip
+    with cluster(scheduler, env.device) as executor:
+        summary = replace(job, executor=executor).run(call.watch)
+    call.watch.finish(job.folder, summary.files)
+    return summary.race
+
+
+@verb
+def league(
+    scenes: Annotated[Scenes, ARGUMENT, Parameter(name="env")] = (),
+    methods: Names = (),
+    *,
+    budget: Budget = 1000,
+    seeds: Count = 10,
+    workers: Annotated[Workers, Parameter(name="--workers")] = None,
+    scheduler: Scheduler = None,
+    figure_width_mm: FigureWidth = (),
+    out: Out = None,
+    force: Force = False,
+    **keywords: Unpack[SceneKeywords],
+) -> League:
+    """Race the same methods in many environments, and rank them in each and overall.
+
+    It first says what is there of each environment and how long the others take to simulate. The folder then holds a
+    race per environment, as `landscape race` leaves it, league.png (mean ranks) and league.json (a row per environment
+    and method, and the best points). Stop at any time: the same command continues from there. More environments,
+    methods, seeds or episodes also continue from there. An environment that fails is named with the reason, the others
+    are raced, and the exit code is 1.
+
+    Raises ValueError for scenes, fidelities and methods that there are not, where the folder holds something else, and
+    where no scene could be raced; Stopped where it is interrupted.
+
+    Example: landscape league bounce fluid@standard --methods random,cma-es,bo-leap --budget 200 --seeds 3
+
+    Parameters
+    ----------
+    scenes
+        Environments to race in, as ENV or ENV@FIDELITY. The default is all sixteen that gradscape simulates itself.
+    methods
+        Methods to race, a,b or repeated. The default is all that can run here; `landscape methods` lists them.
+    budget
+        Number of episodes of each run. It is never exceeded.
+    seeds
+        Number of runs per method, with seeds 0, 1, ...
+    """
+    from ..jobs.methods import check_methods
+
+    many, call = _workers(workers, scheduler), current()
+    named = as_names(methods)
+    check_methods(named)
+    given = list(scenes) if isinstance(scenes, list | tuple) else [scenes]
+    specs = [_league_spec(one, keywords) for one in given]
+    from ..gallery.paper import read_paper
+    from ..jobs.folder import LEAGUE
+    from ..jobs.league import LeagueJob, simulated_scenes
+    from ..jobs.workers import workers as cluster
+
+    specs = specs or [_league_spec(one, keywords) for one in simulated_scenes()]
+    job = LeagueJob.of(
+        specs, named, budget=budget, seeds=seeds, command=call.command, out=as_path(out), force=force,
+        prints=as_widths(figure_width_mm),
+    )  # fmt: skip
+    claims = {fixture.name: read_paper().claims_about(fixture.name) for fixture in job.fixtures}
+    with cluster(scheduler, keywords.get("device", "auto")) as executor:
+        found = replace(job, claims=claims, workers=many, executor=executor).run(call.watch)
+    call.watch.finish(job.folder, [*LEAGUE.files, "and a race in each folder"])
+    if found.failed:
+        call.watch.note(f"{len(found.failed)} of {len(job.fixtures)} scenes were left out: {', '.join(found.failed)}")
+    return found
 
 
 def open_run(path: str | Path) -> Run:
@@ -107,11 +246,33 @@ def open_run(path: str | Path) -> Run:
     return RunStore.open(store_in(Path(path), RUN_STORE)).read()
 
 
-def _search_in_memory(env: Environment, optimizer: Optimizer, budget: int, watch: Watch) -> Run:
+def _league_spec(scene: Any, keywords: SceneKeywords) -> SceneSpec:
+    from ..jobs.scene import read_scene
+
+    if not isinstance(scene, str):
+        return spec_of(scene, keywords)
+    spec = read_scene(scene, spec_of("", keywords))
+    return spec_of(spec.name, {**keywords, **({"fidelity": spec.fidelity} if spec.fidelity else {})})
+
+
+def _workers(workers: int | None, scheduler: str | None) -> int:
+    """Return how many processes fit models. Raises ValueError for both, and for less than one."""
+    if workers and scheduler:
+        raise ValueError(f"--scheduler has workers of its own, so --workers is left out; got {workers}")
+    if workers is not None and workers < 1:
+        raise ValueError(f"--workers is a number of processes, 1 or more; got {workers}")
+    if workers is None and current().on_disk:  # the command, which starts no script again
+        from ..envs.engines.runtime import cores
+
+        return cores()
+    return workers or 1
+
+
+def _search_in_memory(env: Environment, optimizer: Optimizer, budget: int) -> Run:
     """Search without keeping the run on disk."""
     from ..landscapes.threads import one_torch_thread
     from ..optim.search import search
 
-    with one_torch_thread(), watch.progress(budget) as advance:
+    with one_torch_thread(), current().watch.progress(budget) as advance:
         store = search(env, optimizer, budget=budget, progress=lambda now: advance(now.done))
     return store.read()

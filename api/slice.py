@@ -1,24 +1,38 @@
-"""`gs.slice` and `gs.open_slice`: sample a slice of a scene, or open one."""
+"""`gs.slice`, `gs.bounce`, `gs.sample` and `gs.open_slice`: sample a slice of a scene, or open one."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Unpack
+from typing import TYPE_CHECKING, Annotated, Any, Unpack
 
-from ..jobs.cut import cut, describe_cut
+from cyclopts import Parameter
+
 from ..jobs.scene import environment_of, with_policy
-from ..jobs.watch import Watch
-from ..landscapes.objective import BoxedObjective
-from ..landscapes.space import as_stride
-from .progress import default_watch
-from .scene import Scene, SceneKeywords, environment, is_in_memory, say_call, say_cut
+from .call import current, verb
+from .options import (
+    Device,
+    Dims,
+    FigureWidth,
+    Force,
+    Gradients,
+    Out,
+    Point,
+    Scene,
+    SceneKeywords,
+    Scheduler,
+    Settings,
+    Share,
+    Side,
+    Window,
+    at_least,
+)
+from .scene import environment, is_in_memory
+from .values import as_path, as_share, as_widths, as_window
 
 if TYPE_CHECKING:
     import xarray as xr
-    from jaxtyping import Float
-    from torch import Tensor
 
     from ..landscapes.objective import Objective
     from ..landscapes.plane import Plane
@@ -26,67 +40,157 @@ if TYPE_CHECKING:
     from ..landscapes.slice import Slice
 
 
+@verb
 def slice(
     scene: Scene,
-    dims: Sequence[int | str] | None = None,
+    dims: Dims | None = None,
     *,
     along: str | None = None,
-    resolution: int | Sequence[int] = 16,
-    through: str | Float[Tensor, " dim"] = "center",
-    extent: float | tuple[float, float] | None = None,
+    resolution: Side = 16,
+    through: Point = "center",
+    window: Window | None = None,
+    refine: Share | None = None,
+    budget: Annotated[int | None, at_least(1)] = None,
+    policy: str | None = None,
+    gradients: Gradients = True,
+    scheduler: Scheduler = None,
+    figure_width_mm: FigureWidth = (),
+    out: Out = None,
+    force: Force = False,
+    **keywords: Unpack[SceneKeywords],
+) -> Slice:
+    """Sample losses and gradients on a plane through parameter space, and draw them.
+
+    The folder then holds slice.zarr (the samples), landscape.png and summary.json. Stop at any time: the same command
+    continues from there. The status of each sample tells which are interpolated, and no measure uses those. A function
+    is sampled in memory unless it is given a folder.
+
+    Raises ValueError for what the scene does not have, and where the folder holds something else or another slice;
+    Stopped where it is interrupted.
+
+    Example: landscape slice fluid --dims 6 8 --resolution 24
+
+    Parameters
+    ----------
+    scene
+        The environment: a name that `landscape envs` lists, or FILE.py:NAME for a simulator in a file of your own.
+    dims
+        One or two parameters to vary, by number or by name. An environment with at most two needs none.
+    along
+        Directions to vary instead of --dims: random:SEED, gradient, hessian, pca:RUN, the line A:B through two points,
+        or the plane A:B:C through three. What lies outside the bounds is left out.
+    resolution
+        Number of points along each axis.
+    through
+        Point that the slice passes through: center, random:SEED, example:NAME, best, best:RUN, a file of numbers, or a
+        row of a table, TABLE.csv:ROW. Row 1 of a table is its heading; without ROW it is the row with the lowest loss.
+        The command takes several points, A,B, and makes a slice in a folder of its own for each.
+    window
+        Range to cover: a fraction of the box around the point, or the values LOW:HIGH. The default is the whole box.
+    refine
+        Adaptive sampling: refine until 95 % of the interpolated points are within this fraction of the loss range, such
+        as 1%.
+    budget
+        Adaptive sampling with at most this many episodes, alone or together with --refine.
+    policy
+        Sample over the weights of a neural policy instead of the parameters of the environment: mlp:32x32 has two
+        hidden layers of 32. It has losses only.
+    """
+    return _slice(
+        scene, dims, keywords, along=along, resolution=resolution, through=through, window=as_window(window),
+        refine=as_share(refine, "--refine"), budget=budget, policy=policy, gradients=gradients,
+        scheduler=scheduler, widths=as_widths(figure_width_mm), out=as_path(out), force=force,
+    )  # fmt: skip
+
+
+@verb
+def bounce(
+    *,
+    axis: str,
+    resolution: Side = 512,
+    through: Point = "example:aim",
+    window: Window | None = None,
+    fidelity: str = "standard",
+    device: Device = "auto",
+    options: Annotated[
+        Settings, Parameter(name="--set", help="An option of the environment, as name=value. It may be repeated.")
+    ] = (),
+    figure_width_mm: FigureWidth = (),
+    out: Out = None,
+    force: Force = False,
+) -> Slice:
+    """Draw loss and gradient of the bouncing ball along one velocity, and mark where the number of bounces changes.
+
+    The folder then holds slice.zarr (the samples), landscape.png and summary.json.
+
+    Example: landscape bounce --axis y
+
+    Parameters
+    ----------
+    axis
+        Component of the initial velocity to vary: x, y or z.
+    resolution
+        Number of velocities.
+    through
+        Point that the line passes through, as for `landscape slice`.
+    window
+        Range to cover: a fraction of the box around the point, or the values LOW:HIGH [m/s].
+    fidelity
+        Accuracy of the simulation: draft, standard or reference.
+    """
+    if axis not in ("x", "y", "z"):
+        raise ValueError(f"bounce varies the velocity along axis x, y or z; got {axis!r}")
+    return _slice(
+        "bounce", (f"velocity {axis}",), {"fidelity": fidelity, "device": device, "options": options},
+        resolution=resolution, through=through, window=as_window(window), widths=as_widths(figure_width_mm),
+        out=as_path(out), force=force,
+    )  # fmt: skip
+
+
+def _slice(
+    scene: Scene,
+    dims: Dims | None,
+    keywords: SceneKeywords,
+    *,
+    resolution: Any,
+    through: Any,
+    window: float | tuple[float, float] | None,
+    widths: list[float],
+    out: Path | None,
+    force: bool,
+    along: str | None = None,
     refine: float | None = None,
     budget: int | None = None,
     policy: str | None = None,
-    gradients: bool | int = True,
-    out: str | Path | None = None,
-    force: bool = False,
-    **keywords: Unpack[SceneKeywords],
+    gradients: bool | int | None = True,
+    scheduler: str | None = None,
 ) -> Slice:
-    """Sample losses and gradients of a scene over a plane through its parameter space, and return the slice.
+    from ..jobs.cut import cut, describe_cut, refuse_cut
 
-    `scene` is an environment's name, FILE.py:NAME, its class or itself, as `from_torch` and its like make one of a
-    function, or an object with `space` and `evaluate`. `dims` are one or two parameters, by number or by name, by
-    default all where there are no more. `through` is the point that the plane goes through: its name, or a point as
-    `evaluate` takes it, with the decimal logarithm of a logarithmic parameter. `extent` is what it covers: a fraction
-    of the box around that point, or two values [the parameters' unit]; the whole box by default. `along` names
-    directions instead of `dims`: random:SEED, gradient, hessian, pca:RUN, a line A:B or a plane A:B:C between points;
-    what lies off the box is left out. The samples lie in the folder `out`, by default one under out/ named after the
-    slice: the same call goes on there where it stopped. A function is sampled in memory without `out`.
-
-    `gradients` says whether it has any, or at every how many samples along each axis: 4 has losses at all samples, and
-    gradients at a sixteenth of them.
-
-    With a `policy`, mlp:32x32, it is over the weights of a perceptron that takes the environment's decisions by what it
-    sees, not over the environment's own parameters; it has losses only.
-
-    With `refine`, a share of the range of the losses, it is sampled only where neighbours do not explain to that share
-    what is between them, and with a `budget` at no more points than that. The others are interpolated: status says
-    which, their loss is NaN, and no measure uses them.
-
-    Raises ValueError for what the scene does not have, and where the folder holds something else or another slice,
-    which `force` replaces; Stopped where it is interrupted.
-    """
-    watch = default_watch()
-    env = environment(scene, keywords, watch)
-    objective, gradients = with_policy(env, policy), gradients if policy is None else 0
+    refuse_cut(dims, along)
+    call = current()
+    env = environment(scene, keywords, dims=dims if policy is None else None)
+    from ..landscapes.objective import BoxedObjective
     from ..landscapes.sampling.refine import Refinement
+    from ..landscapes.space import as_stride
 
-    fine, folder = Refinement.of(refine, budget), Path(out) if out is not None else None
-    in_memory = is_in_memory(env, out)
-    stride = as_stride(gradients)
-    begun: dict[str, Any] = {"out": folder, "gradients": stride, "refinement": fine}
-    where: dict[str, Any] = {"through": through, "extent": extent, "resolution": resolution}
+    objective, stride = with_policy(env, policy), as_stride(gradients or 0) if policy is None else 0
+
+    fine, in_memory = Refinement.of(refine, budget), is_in_memory(env, out)
+    begun: dict[str, Any] = {"out": out, "gradients": stride, "refinement": fine}
+    where: dict[str, Any] = {"through": through, "extent": window, "resolution": resolution}
     plane = cut(objective, dims, along, **where, kept=None if force or in_memory else begun)
     if in_memory:
-        return _sample_in_memory(BoxedObjective(objective) if along else objective, plane, fine, watch, stride)
+        return _sample_in_memory(BoxedObjective(objective) if along else objective, plane, fine, stride)
     from ..jobs.slice import SliceJob
+    from ..jobs.workers import workers
 
-    how = {"refine": refine, "budget": budget, "policy": policy}
-    how |= say_cut(along, through, extent, gradients=gradients if policy is None else True)
-    command = say_call("slice", scene, *([tuple(dims)] if dims else []), resolution=resolution, **how, **keywords)
-    named = describe_cut(along, through, extent)
-    job = SliceJob.of(objective, plane, command=command, cut=named, force=force, **begun)
-    job.run(watch)
+    with workers(scheduler, env.device) as executor:
+        job = SliceJob.of(
+            objective, plane, command=call.command, cut=describe_cut(along, through, window), force=force,
+            executor=executor, prints=widths, **begun,
+        )  # fmt: skip
+        job.run(call.watch)
     return _open(job.folder, None, lambda: objective)
 
 
@@ -97,6 +201,7 @@ def sample(scene: Scene, plane: Plane, *, gradients: bool | int = True) -> xr.Da
     """
     from ..envs.registry import as_environment
     from ..landscapes.sampling.fill import sample as fill
+    from ..landscapes.space import as_stride
 
     return fill(as_environment(scene), plane, gradients=as_stride(gradients))
 
@@ -105,12 +210,22 @@ def open_slice(path: str | Path, *, env: Scene = None) -> Slice:
     """Open a slice: the folder that `slice` or `landscape slice` left it in, or its store.
 
     `env` is the simulator that it was sampled from, where it is not registered by its name: a function, a class or
-    FILE.py:NAME. It is needed only for what evaluates anew, such as `report`.
+    FILE.py:NAME. It is needed only for what evaluates it again, such as `report`.
 
     What is not sampled yet is NaN, with status MISSING. Raises StoreError, a ValueError, where there is no slice, and
     where it is damaged.
     """
     return _open(Path(path), env, None)
+
+
+def as_slice(given: str | Path | Slice, *, env: Scene = None) -> Slice:
+    """Return a slice that is given as it is, or by its folder. Raises ValueError where there is none."""
+    if not isinstance(given, str | Path):
+        return given
+    from ..landscapes.storage.paths import refuse_missing
+
+    refuse_missing(str(given), "slice")
+    return open_slice(given, env=env)
 
 
 def _open(path: Path, env: Scene, remake: Callable[[], Objective] | None) -> Slice:
@@ -122,9 +237,7 @@ def _open(path: Path, env: Scene, remake: Callable[[], Objective] | None) -> Sli
     return Slice(dataset, folder, remake or (lambda: environment_of(dataset, "auto", env)))
 
 
-def _sample_in_memory(
-    objective: Objective, plane: Plane, refinement: Refinement | None, watch: Watch, gradients: int
-) -> Slice:
+def _sample_in_memory(objective: Objective, plane: Plane, refinement: Refinement | None, gradients: int) -> Slice:
     from ..jobs.slice_summary import look_between
     from ..landscapes.lattice import check_gradients
     from ..landscapes.sampling.fill import describe, sample
@@ -133,7 +246,7 @@ def _sample_in_memory(
     from ..landscapes.storage.store import SliceStore
 
     gradients = check_gradients(gradients, plane, refined=refinement is not None)
-    with watch.progress(math.prod(plane.resolution), "evaluations") as advance:
+    with current().watch.progress(math.prod(plane.resolution), "evaluations") as advance:
         how: dict[str, Any] = {
             "progress": lambda now: advance(now.done),
             "conclude": lambda whole: look_between(objective, whole),

@@ -2,61 +2,96 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, Unpack
+from dataclasses import replace
+from typing import TYPE_CHECKING, Annotated, Unpack
 
-from ..jobs.cut import cut, describe_cut
-from .progress import default_watch
-from .scene import Scene, SceneKeywords, environment, say_call, say_cut
+from .call import current, verb
+from .options import (
+    Dims,
+    Force,
+    Gradients,
+    Out,
+    Parameter_,
+    Point,
+    Scene,
+    SceneKeywords,
+    Scheduler,
+    Side,
+    Window,
+    at_least,
+)
+from .scene import environment
+from .values import as_path, as_window
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
-    from torch import Tensor
-
     from ..landscapes.draw.figures.sweep import Sweep
 
 
+@verb
 def sweep(
     scene: Scene,
-    dims: Sequence[int | str] | None = None,
-    over: int | str | None = None,
+    dims: Dims | None = None,
+    over: Parameter_ | None = None,
     *,
     along: str | None = None,
-    frames: int = 24,
-    resolution: int = 16,
-    through: str | Float[Tensor, " dim"] = "center",
-    extent: float | tuple[float, float] | None = None,
-    gradients: bool | int = True,
-    out: str | Path | None = None,
-    force: bool = False,
+    frames: Annotated[int, at_least(2)] = 24,
+    resolution: Side = 16,
+    through: Point = "center",
+    window: Window | None = None,
+    gradients: Gradients = True,
+    scheduler: Scheduler = None,
+    out: Out = None,
+    force: Force = False,
     **keywords: Unpack[SceneKeywords],
 ) -> Sweep:
-    """Sample a slice for each of `frames` values of what `over` names, film them, and return them.
+    """Sample one slice per value of a third parameter, and film them on one colour scale.
 
-    `over` is a third parameter, by number or by name, or horizon, the episode's duration, or smoothing, of one slice.
-    Along directions, which `along` names instead of `dims` as for `slice`, a parameter is moved at the point that the
-    slices go through, and what lies off the box is left out. The samples and the films lie in the folder `out`, by
-    default one under out/ named after the sweep: the same call goes on there where it stopped. The rest is that of
-    `slice`. Of smoothed losses there are no gradients.
+    The folder then holds frames/ (the samples of each frame; slice.zarr if there is only one slice), sweep.mp4,
+    sweep.gif, sweep.rrd (a 3-D scene, which `landscape view` opens) and summary.json. Stop at any time: the same
+    command continues from there. Smoothed losses have no gradients.
 
     Raises ValueError for what the scene does not have or cannot be swept, where nothing is to move, and where the
-    folder holds something else or another sweep, which `force` replaces; Stopped where it is interrupted.
+    folder holds something else or another sweep; Stopped where it is interrupted.
+
+    Example: landscape sweep fluid --dims 6 8 --over 7 --frames 12
+
+    Parameters
+    ----------
+    scene
+        The environment: a name that `landscape envs` lists, or FILE.py:NAME for a simulator in a file of your own.
+    dims
+        One or two parameters to vary, by number or by name. An environment with at most two needs none.
+    over
+        What changes from frame to frame: a third parameter over its bounds, horizon (the duration of the episode), or
+        smoothing (of one slice).
+    along
+        Directions to vary instead of --dims, as for `landscape slice`.
+    frames
+        Number of frames, both ends included.
+    resolution
+        Number of points along each axis.
+    through
+        Point that the slices pass through, as for `landscape slice`. The command takes several points, A,B.
+    window
+        Range to cover: a fraction of the box around the point, or the values LOW:HIGH. The default is the whole box.
     """
     if over is None:
-        raise ValueError("a sweep takes over: a third parameter, horizon or smoothing; got None")
-    watch = default_watch()
-    env = environment(scene, keywords, watch)
-    plane = cut(env, dims, along, through=through, extent=extent, resolution=resolution)
-    from ..jobs.sweep import SweepJob
+        raise ValueError("a sweep takes --over: a third parameter, horizon or smoothing; got none")
+    from ..jobs.cut import cut, describe_cut, refuse_cut
 
-    said: dict[str, Any] = {"over": over, "frames": frames, "resolution": resolution}
-    said |= say_cut(along, through, extent, gradients=gradients)
-    settings: dict[str, Any] = {
-        "command": say_call("sweep", scene, *([tuple(dims)] if dims else []), **said, **keywords),
-        "out": Path(out) if out is not None else None,
-        "cut": describe_cut(along, through, extent),
-    }
-    job = SweepJob.of(env, plane, over, frames, gradients=gradients, force=force, **settings)
-    job.run(watch)
+    refuse_cut(dims, along)
+    call, ends = current(), as_window(window)
+    env = environment(scene, keywords, dims=[*(dims or ()), over])
+    plane = cut(env, dims, along, through=through, extent=ends, resolution=resolution)
+    from ..jobs.sweep import SweepJob
+    from ..jobs.workers import workers
+    from ..landscapes.space import as_stride
+
+    with workers(scheduler, env.device) as executor:
+        with call.watch.busy(f"opening {frames} slices"):
+            job = SweepJob.of(
+                env, plane, over, frames, command=call.command, gradients=as_stride(gradients or 0), force=force,
+                out=as_path(out), cut=describe_cut(along, through, ends),
+            )  # fmt: skip
+        replace(job, executor=executor).run(call.watch)
     return job.sample()

@@ -1,21 +1,17 @@
-"""`landscape check`: whether an environment keeps what every environment promises."""
+"""What a check found, on the terminal."""
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
-import typer
-
-from ..jobs.scene import SceneSpec
-from .arguments import Json, Seed, takes_scene
+from .terminal import Console, table
 
 if TYPE_CHECKING:
     from rich.table import Table
 
+    from ..jobs.check import CheckReport
     from ..landscapes.conformance.finding import Finding
-    from .terminal import Console
 
 STYLES = {
     "pass": "green",
@@ -27,38 +23,13 @@ STYLES = {
 }
 
 
-@takes_scene("tolerance", "deterministic")
-def check(
-    scene: SceneSpec,
-    points: Annotated[int, typer.Option(min=2, help="Number of random points to check at.")] = 4,
-    seed: Seed = 0,
-    json_: Json = False,
-) -> None:
-    """Check that the gradients of an environment are right, and that it behaves at the extremes.
-
-    It checks shapes, refusals, batches, determinism, gradients against differences at several steps and at special
-    points, their growth with the horizon, forward against reverse differentiation if both exist, corners of the box
-    and beyond, long time steps, materials, horizons and precision. Each check prints a line. A warning is no failure:
-    the gradient is right, but useless over an optimiser's step. The exit code is 0 if the environment passes, else 1.
-    It writes no file.
-
-    Example: landscape check bounce
-    """
-    from ..jobs.check import CheckJob
-    from .terminal import Bars, Console, command_line, print_json
-
-    bars = Bars()
-    console = bars.console if json_ else Console(soft_wrap=True, highlight=False)
-    job = CheckJob.open(scene, points=points, seed=seed, command=command_line())
-    found = []
-    for finding in job.findings(bars):
-        found.append(finding)
+def show(found: CheckReport, console: Console) -> int:
+    """Print a line for each check and the sum of them; the exit code is 1 where the environment fails."""
+    console.soft_wrap = True
+    for finding in found.findings:
         _show(finding, console)
-    report = job.report(tuple(found))
-    _conclude(found, report.passed, console)
-    if json_:
-        print_json(report.record())
-    sys.exit(0 if report.passed else 1)
+    _conclude(found.findings, found.passed, console)
+    return 0 if found.passed else 1
 
 
 def _show(finding: Finding, console: Console) -> None:
@@ -75,8 +46,6 @@ def _show(finding: Finding, console: Console) -> None:
 
 def _table(finding: Finding) -> Table:
     from rich.box import SIMPLE
-
-    from .terminal import table
 
     headings = ("compared", "failed", "cosine", "sign right", "relative error, median")
     found = table("step [of the box]", *headings, box=SIMPLE)

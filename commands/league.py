@@ -1,29 +1,10 @@
-"""`landscape league`: the same methods raced in many scenes, and how each came off over all of them."""
+"""A league, on the terminal."""
 
 from __future__ import annotations
 
-from dataclasses import replace
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING
 
-import typer
-
-from .arguments import (
-    Budget,
-    Claims,
-    Deterministic,
-    Device,
-    Fidelity,
-    ForceRuns,
-    Json,
-    Methods,
-    Print,
-    Processes,
-    Scheduler,
-    Seeds,
-    read_names,
-    refuse_words,
-)
+from .terminal import Console, table
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -31,78 +12,17 @@ if TYPE_CHECKING:
     from ..optim.league import League
 
 
-def league(
-    envs: Annotated[
-        list[str] | None,
-        typer.Argument(
-            metavar="[ENV...]",
-            help="Environments to race in, as ENV or ENV@FIDELITY. The default is all sixteen that "
-            "gradscape simulates itself.",
-        ),
-    ] = None,
-    methods: Methods = None,
-    budget: Budget = 1000,
-    seeds: Seeds = 10,
-    fidelity: Fidelity = None,
-    device: Device = "auto",
-    deterministic: Deterministic = False,
-    workers: Processes = None,
-    scheduler: Scheduler = None,
-    out: Annotated[
-        str | None, typer.Option(help="Folder for the results. The default, under out/, holds all leagues on a device.")
-    ] = None,
-    print_: Print = None,
-    json_: Json = False,
-    report: Claims = False,
-    force: ForceRuns = False,
-) -> None:
-    """Race the same methods in many environments, and rank them in each and overall.
+def show(found: League, console: Console, *, claims: bool = False) -> int:
+    """Print mean ranks by scene, and if asked the paper's claims with what was measured.
 
-    It first says what is there of each environment and how long the others take to simulate. The folder then holds a
-    race per environment, as `landscape race` leaves it, league.png (mean ranks) and league.json (a row per environment
-    and method, and the best points). Stop at any time: the same command goes on from there. More environments,
-    methods, seeds or episodes also continue from there. An environment that fails is named with the reason, the others
-    are raced, and the exit code is 1.
+    The exit code is 1 where a scene could not be raced.
 
-    Example: landscape league bounce fluid@standard --methods random,cma-es,bo-leap --budget 200 --seeds 3
+    Parameters
+    ----------
+    claims
+        Check the paper's claims about which method wins.
     """
-    from ..jobs.methods import check_methods
-    from ..jobs.scene import SceneSpec, read_scene
-    from .terminal import Bars, command_line, print_json
-
-    if workers and scheduler:
-        raise ValueError(f"--scheduler has workers of its own, so --workers is left out; got {workers}")
-    bars, one = Bars(), SceneSpec("", fidelity, device=device, deterministic=deterministic)
-    chosen = read_names(methods)
-    check_methods(chosen)
-    for text in envs or ():
-        refuse_words(read_scene(text, one))
-    from ..envs.engines.runtime import cores
-    from ..gallery.paper import read_paper
-    from ..jobs.league import PICTURE, RECORD, LeagueJob, simulated_scenes
-    from ..jobs.workers import workers as cluster
-
-    how: dict[str, Any] = {"out": Path(out) if out else None, "force": force, "prints": print_ or []}
-    scenes = [read_scene(text, one) for text in envs or simulated_scenes()]
-    job = LeagueJob.of(scenes, chosen, budget=budget, seeds=seeds, command=command_line(), **how)
-    claims = {fixture.name: read_paper().claims_about(fixture.name) for fixture in job.fixtures}
-    with cluster(scheduler, device) as executor:
-        found = replace(job, claims=claims, workers=workers or cores(), executor=executor).run(bars)
-    if json_:
-        print_json(found.record(), folder=str(job.folder))
-    else:
-        _print(found, claims=report)
-    bars.note(f"{job.folder}: {RECORD}, {PICTURE}, and a race in each folder")
-    if found.failed:
-        bars.note(f"{len(found.failed)} of {len(job.fixtures)} scenes were left out: {', '.join(found.failed)}")
-        raise typer.Exit(1)
-
-
-def _print(found: League, *, claims: bool) -> None:
-    """Print mean ranks by scene, and if asked what the paper claims beside what was measured."""
-    from .terminal import Console
-
-    console = Console(soft_wrap=True, highlight=False)
+    console.soft_wrap = True
     console.print(_ranks(found))
     for scene in found.scenes:
         if best := scene.best:
@@ -111,11 +31,10 @@ def _print(found: League, *, claims: bool) -> None:
     if claims:
         shown = _claims(found)
         console.print(shown if shown.row_count else "The paper compares no optimisers in these scenes.")
+    return 1 if found.failed else 0
 
 
 def _ranks(found: League) -> Table:
-    from .terminal import table
-
     shown = table("scene", *found.methods, title="mean ranks, 1 is best, with 95 % intervals over seeds")
     for scene in found.scenes:
         by = {one.method: _format(one.rank, one.rank_low, one.rank_high) for one in scene.standings}
@@ -126,7 +45,6 @@ def _ranks(found: League) -> Table:
 
 def _claims(found: League) -> Table:
     from ..gallery.paper import read_paper
-    from .terminal import table
 
     headings = ("scene", "claim", "this league", "wins", "corrected p", "where the paper says so")
     shown = table(*headings, title="what the paper claims, and this league")

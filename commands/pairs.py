@@ -1,64 +1,28 @@
-"""`landscape pairs`: which pairs of parameters to look at."""
+"""A ranking of pairs of parameters, on the terminal."""
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
-
-from ..jobs.scene import SceneSpec
-from .arguments import ForceStudy, Json, OutOfStudy, Seed, takes_scene
+from ..api.options import at_least
+from .terminal import Console, table
 
 if TYPE_CHECKING:
     from ..jobs.pairs import PairRanking
-    from .terminal import Console
 
 COLUMNS = ("score", "sensitivity", "interaction", "ruggedness", "disagreement")
 LEADERS = {"interaction": "strongest interaction", "ruggedness": "most rugged", "disagreement": "most misleading"}
 
 
-@takes_scene("tolerance", "deterministic")
-def pairs(
-    scene: SceneSpec,
-    samples: Annotated[
-        int | None,
-        typer.Option(
-            min=2,
-            help="Number of base points, of 1 + 5 x dim + 28 episodes each (fewer below 8 parameters). The"
-            " default is 16, and down to 4 with many parameters.",
-        ),
-    ] = None,
-    seed: Seed = 0,
-    top: Annotated[int, typer.Option(min=1, help="Number of pairs to show.")] = 10,
-    out: OutOfStudy = None,
-    json_: Json = False,
-    force: ForceStudy = False,
-) -> None:
-    """Rank pairs of parameters by sensitivity, ruggedness and misleading gradients, to choose which to slice.
+def show(ranking: PairRanking, console: Console, *, top: Annotated[int, at_least(1)] = 10) -> None:
+    """Print the highest pairs, who leads in each measure, and the command that slices the first.
 
-    The folder then holds pairs.json (all pairs) and the evaluated episodes. Stop at any time: the same command goes on
-    from there.
-
-    Example: landscape pairs fluid
+    Parameters
+    ----------
+    top
+        Number of pairs to show.
     """
-    from ..jobs.pairs import PairsJob
-    from .terminal import Bars, Console, command_line, print_json
-
-    folder = Path(out) if out else None
-    job = PairsJob.open(scene, samples=samples, seed=seed, out=folder, force=force, command=command_line())
-    ranking = job.run(Bars())
-    if json_:
-        record = ranking.record()
-        print_json(record | {"pairs": record["pairs"][:top]}, folder=str(job.folder))
-    show(ranking, Console(stderr=json_), top)
-
-
-def show(ranking: PairRanking, console: Console, top: int) -> None:
-    """Print the highest pairs, who leads in each measure, and the command that slices the first."""
     from rich.box import SIMPLE
-
-    from .terminal import table
 
     found = table("no.", "pair", *COLUMNS, box=SIMPLE)
     found.columns[0].no_wrap = True

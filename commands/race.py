@@ -1,142 +1,49 @@
-"""`landscape race`: let methods compete, and say which of them is better than which."""
+"""A race, on the terminal."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from math import isfinite
+from typing import TYPE_CHECKING
 
-import typer
-
-from ..jobs.scene import SceneSpec
-from .arguments import (
-    Budget,
-    Claims,
-    ForceRuns,
-    Json,
-    MethodOption,
-    Methods,
-    Print,
-    Processes,
-    Scheduler,
-    Seeds,
-    read_names,
-    read_settings,
-    takes_scene,
-)
+from .terminal import Console, table
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from ..jobs.race_summary import RaceSummary
+    from ..optim.race import Race
 
-ENOUGH = 10  # seeds, as the paper has
+PAPER_SEEDS = 10  # as many as the paper has
 
 
-@takes_scene("tolerance")
-def race(
-    scene: SceneSpec,
-    methods: Methods = None,
-    budget: Budget = 1000,
-    seeds: Seeds = 10,
-    workers: Processes = None,
-    scheduler: Scheduler = None,
-    option: MethodOption = None,
-    out: Annotated[
-        str | None, typer.Option(help="Folder for the results. The default is named after the race, under out/.")
-    ] = None,
-    best_known: Annotated[
-        float | None, typer.Option(help="Lowest loss known from elsewhere, at which the targets end.")
-    ] = None,
-    print_: Print = None,
-    json_: Json = False,
-    report: Claims = False,
-    force: ForceRuns = False,
-) -> None:
-    """Compare methods on the same budget over several seeds: best losses, targets reached and ranks.
+def show(race: Race, console: Console, *, claims: bool = False) -> None:
+    """Print ranks and comparisons, and if asked the paper's claims with what was measured.
 
-    All runs advance in lockstep, and one batch evaluates the proposals of all of them. The folder then holds race.png,
-    race.json (ranks, pairwise comparisons, running times, curves) and a folder per run. Stop at any time: the same
-    command goes on from there. More methods, seeds or episodes also continue from there, and finished runs are not
-    repeated. --workers and --scheduler exclude each other.
-
-    Example: landscape race fluid --methods random,bo-leap --budget 200 --seeds 3
+    Parameters
+    ----------
+    claims
+        Check the paper's claims about which method wins.
     """
-    from ..jobs.methods import check_methods
-    from .terminal import Bars, command_line, print_json
-
-    if workers and scheduler:
-        raise ValueError(f"--scheduler has workers of its own, so --workers is left out; got {workers}")
-    chosen = check_methods(read_names(methods))
-    bars, options = Bars(), read_method_options(option or [], chosen)
-    env = scene.make(bars)
-    from ..envs.engines.runtime import cores
-    from ..gallery.paper import read_paper
-    from ..jobs.race import RaceJob
-    from ..jobs.workers import workers as cluster
-
-    how: dict[str, Any] = {"out": Path(out) if out else None, "force": force, "prints": print_ or [], "watch": bars}
-    how |= {
-        "claims": read_paper().claims_about(env.name),
-        "command": command_line(),
-        "options": options,
-        "workers": workers or cores(),
-        "best_known": best_known,
-    }
-    job = RaceJob.of(env, chosen, budget=budget, seeds=seeds, **how)
-    with cluster(scheduler, env.device) as executor:
-        summary = replace(job, executor=executor).run(bars)
-    if json_:
-        short = {key: value for key, value in summary.record().items() if key not in ("curves", "ecdf")}
-        print_json(short, folder=str(job.folder))
-    else:
-        _print(summary, claims=report)
-    bars.note(f"{job.folder}: {', '.join(summary.files)}")
-
-
-def read_method_options(settings: Sequence[str], chosen: Sequence[str]) -> dict[str, dict[str, str]]:
-    """Return options given as METHOD.NAME=VALUE, method -> name -> value. Raises ValueError for other methods'."""
-    from ..optim.registry import methods
-
-    names = chosen or list(methods())
-    found: dict[str, dict[str, str]] = {}
-    for setting, value in read_settings(settings, "--option").items():
-        method, dot, name = setting.partition(".")
-        if not dot or method not in names:
-            raise ValueError(
-                f"--option takes METHOD.NAME=VALUE for one of {', '.join(names)}; got {setting + '=' + value!r}"
-            )
-        found.setdefault(method, {})[name] = value
-    return found
-
-
-def _print(summary: RaceSummary, *, claims: bool) -> None:
-    """Print the ranks, and if asked what the paper claims beside what was measured."""
-    from .terminal import Console
-
-    console = Console(soft_wrap=True, highlight=False)
-    console.print(_ranks(summary))
-    if len(summary.race.statistics.targets.loss):
-        console.print(_running_times(summary))
-    for line in _comparisons(summary):
+    console.soft_wrap = True
+    console.print(_ranks(race))
+    if len(race.statistics.targets.loss):
+        console.print(_running_times(race))
+    for line in _comparisons(race):
         console.print(line)
-    if summary.seeds < ENOUGH:
-        console.print(_doubt(summary.seeds))
+    if race.seeds < PAPER_SEEDS:
+        console.print(_doubt(race.seeds))
     if claims:
-        console.print(_claims(summary) if summary.claims else summary.silence)
+        console.print(_claims(race))
 
 
-def _ranks(summary: RaceSummary) -> Table:
+def _ranks(race: Race) -> Table:
     from ..optim.race import name_seeds
-    from .terminal import table
 
-    seeds = name_seeds(summary.seeds)
+    seeds = name_seeds(race.seeds)
     shown = table(
-        *("method", "mean rank", "wins", f"best loss{_unit(summary)}", "failed", "forward equivalents", "seconds"),
-        title=f"{summary.env} · {summary.fidelity} · {summary.budget} episodes · {seeds}",
+        *("method", "mean rank", "wins", f"best loss{_unit(race)}", "failed", "forward equivalents", "seconds"),
+        title=f"{race.identity['objective']} · {race.identity['fidelity']} · {race.budget} episodes · {seeds}",
     )
-    for rank in summary.race.statistics.ranks:
+    for rank in race.statistics.ranks:
         none = f"; none with {name_seeds(rank.unsuccessful)}" if rank.unsuccessful else ""
         shown.add_row(
             rank.method,
@@ -150,16 +57,12 @@ def _ranks(summary: RaceSummary) -> Table:
     return shown
 
 
-def _running_times(summary: RaceSummary) -> Table:
+def _running_times(race: Race) -> Table:
     """Show the expected running time of every method for some of the targets, the easiest first."""
-    from math import isfinite
-
-    from .terminal import table
-
-    figures = summary.race.statistics
+    figures = race.statistics
     some = figures.targets.some[::-1]
     losses = [f"{figures.targets.loss[number]:.3g}" for number in some]
-    title = f"episodes that a method takes to reach a loss{_unit(summary)}, by restarts until it does"
+    title = f"episodes that a method takes to reach a loss{_unit(race)}, by restarts until it does"
     shown = table("method", *losses, title=title)
     for rank in figures.ranks:
         times = figures.times[rank.method][some]
@@ -167,9 +70,9 @@ def _running_times(summary: RaceSummary) -> Table:
     return shown
 
 
-def _comparisons(summary: RaceSummary) -> list[str]:
+def _comparisons(race: Race) -> list[str]:
     """Say of each method, by rank, which others it is better than, and how often it wins against each."""
-    figures, lines = summary.race.statistics, list[str]()
+    figures, lines = race.statistics, list[str]()
     pairs = list(zip(figures.differences, figures.superiorities, strict=True))
     for better in (rank.method for rank in figures.ranks):
         seen = [chance if chance.first == better else chance.reversed for one, chance in pairs if one.better == better]
@@ -191,13 +94,18 @@ def _doubt(seeds: int) -> str:
     )
 
 
-def _claims(summary: RaceSummary) -> Table:
-    from .terminal import table
+def _claims(race: Race) -> Table | str:
+    """Return what the race makes of the paper's claims about its environment, or why there is none."""
+    from ..gallery.paper import read_paper
+    from ..optim.claims import check_claims
 
-    means = f"difference of mean losses{_unit(summary)}"
+    claimed = read_paper().claims_about(str(race.identity["objective"]))
+    if not claimed.claims:
+        return claimed.silence or ""
+    means = f"difference of mean losses{_unit(race)}"
     headings = ("claim", "this race", "wins", "corrected p", means, "where the paper says so")
     shown = table(*headings, title="what the paper claims, and this race")
-    for finding in summary.claims:
+    for finding in check_claims(claimed.claims, race.statistics.differences, race.statistics.superiorities):
         one = finding.difference
         numbers = _format_interval(one.mean, one.low, one.high, 3) if one else ""
         chance = finding.superiority
@@ -206,14 +114,12 @@ def _claims(summary: RaceSummary) -> Table:
     return shown
 
 
-def _unit(summary: RaceSummary) -> str:
-    return f" [{summary.loss_unit}]" if summary.loss_unit else ""
+def _unit(race: Race) -> str:
+    return f" [{race.loss_unit}]" if race.loss_unit else ""
 
 
 def _format_interval(value: float, low: float, high: float, digits: int) -> str:
     """Write a number and its interval, as far as they are finite."""
-    from math import isfinite
-
     if not isfinite(value):
         return "none"
     return f"{value:.{digits}g}" + (f" [{low:.{digits}g}, {high:.{digits}g}]" if isfinite(low) else "")

@@ -1,8 +1,7 @@
-"""The terminal, as the verbs write to it: tables, lines, bars and one JSON object."""
+"""The terminal, as the verbs write to it: tables, lines and bars."""
 
 from __future__ import annotations
 
-import json
 import shlex
 import sys
 from typing import Any
@@ -25,8 +24,3 @@ def table(*headings: str, title: str | None = None, **look: Any) -> Table:
     for heading in headings:
         found.add_column(heading, overflow="fold")
     return found
-
-
-def print_json(record: dict[str, Any], **more: Any) -> None:
-    """Print one JSON object on standard output."""
-    print(json.dumps({**record, **more}))

@@ -91,6 +91,15 @@ def _check_device(device: str) -> None:
 
 
 @dataclass(frozen=True)
+class Computed:
+    """Say in which folder how many figures were computed, and which of them failed."""
+
+    folder: Path
+    figures: int
+    failed: tuple[str, ...]
+
+
+@dataclass(frozen=True)
 class _Work:
     """What is done in `root`, and the names of the figures that failed in it."""
 

@@ -50,7 +50,7 @@ REMAKE = "delete it, and `landscape gallery compute --part {}` makes it anew"
 _EPISODE = re.compile(r"episode-\d+-\d+\.(?:mp4|webp)")
 
 
-def data_folder(named: str | None) -> Path:
+def data_folder(named: str | Path | None) -> Path:
     """Return where the figures' data is: as named, else a checkout's own, else under the folder where one stands."""
     if named:
         return Path(named)

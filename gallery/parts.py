@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..envs.registry import entries, environment_class
 from ..jobs.watch import Watch
+from ..landscapes.convert import to_json
 from ..landscapes.identity import gradient_stride
 from .figures import Figure
 from .files import PICTURE, RUN_SUFFIX, RUNS, STORE, SWEEP_FILM, SWEEP_RECORD
@@ -54,6 +55,19 @@ class State:
         if self.done is None:
             return "other settings"
         return f"{self.done} of {self.points} points" if self.done else "missing"
+
+
+@dataclass(frozen=True)
+class FigureList:
+    """Hold the figures of the gallery, and how much of each lies in a folder of data."""
+
+    folder: Path
+    figures: tuple[tuple[Figure, State], ...]
+
+    @property
+    def summary(self) -> list[dict[str, Any]]:
+        """Return for each figure its `id` and how much of it is there, as plain JSON."""
+        return [{"id": figure.id, **to_json(state)} for figure, state in self.figures]
 
 
 @dataclass(frozen=True)

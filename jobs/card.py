@@ -20,20 +20,17 @@ from ..landscapes.identity import PACKAGE
 from ..landscapes.measures.card import Card, CardSlice, Grade, Outcome, count_outcomes, first_finding
 from ..landscapes.storage.arrays import need_of
 from ..landscapes.storage.checkpoint import Checkpoint
-from ..landscapes.storage.files import tidy
-from ..landscapes.storage.records import write_record
 from .check import CheckJob
 from .folder import CARD, ROOT, folder_named
+from .job import CheckpointedJob
 from .scene import ABSENT, SceneSpec, plane_through
-from .studies import going_on
-from .watch import Watch, resumable
+from .watch import Watch
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from ..envs.base import Environment
 
-RECORD, PICTURE = CARD.files
 OURS = (PACKAGE, "warp-lang")  # what our own scenes are simulated by
 POINTS = 3  # that are checked
 LARGEST = 400  # parameters, of a chain
@@ -85,16 +82,14 @@ ENTRANTS = (
 )
 
 
-@dataclass(frozen=True)
-class CardJob:
-    """Engines in scenes to check and to cut, a piece on disk for each; `command` is how the card is made again."""
+@dataclass(frozen=True, kw_only=True)
+class CardJob(CheckpointedJob[Card]):
+    """Engines in scenes to check and to cut, a part of the checkpoint for each."""
 
+    results = CARD
     entrants: Sequence[Entrant]
     resolution: int
     device: str
-    pieces: Checkpoint
-    command: str
-    prints: Sequence[float] = ()
 
     @classmethod
     def open(
@@ -122,43 +117,19 @@ class CardJob:
         packages = dict.fromkeys([*OURS, *(package for extra in EXTRAS.values() for package in extra)])
         versions = {package: installed_version(package) for package in packages if package != PACKAGE}
         identity = {"resolution": resolution, "device": device, "versions": versions, "model_versions": _models()}
-        pieces = Checkpoint.open(
-            out or folder_named(["card"], identity, root), identity, what="report card", force=force
-        )
-        return cls(chosen, resolution, device, pieces, command, prints)
+        folder = out or folder_named(["card"], identity, root)
+        checkpoint = Checkpoint.open(folder, identity, what="report card", force=force)
+        return cls(
+            entrants=chosen, resolution=resolution, device=device, checkpoint=checkpoint, folder=folder,
+            command=command, prints=prints,
+        )  # fmt: skip
 
-    @property
-    def folder(self) -> Path:
-        """Where it is kept."""
-        return self.pieces.folder
-
-    def run(self, watch: Watch | None = None) -> Card:
-        """Check and cut what is missing; draw, write and return the card.
-
-        Raises Stopped where it is interrupted, and DiskFullError; the same job goes on from what is kept then.
-        """
-        from ..landscapes.draw.figures.page import save
-
-        watch = watch or Watch()
-        with going_on(self.pieces, None, self.say_kept, watch):
-            card = self._measure(watch)
-            save(card.plot(), self.folder / PICTURE)
-            write_record(self.folder / RECORD, card.record())
-            tidy(self.folder)
-        return card
-
-    def say_kept(self) -> str:
+    def kept(self) -> str:
         """Say how much of it is on disk."""
-        return f"{self.pieces.count()} of {len(self.entrants)} engines in scenes are kept in {self.folder}"
+        return f"{self.checkpoint.count()} of {len(self.entrants)} engines in scenes are kept in {self.folder}"
 
-    def print(self, card: Card) -> list[str]:
-        """Draw it for pages, too, and return the names of the files. Raises DiskFullError."""
-        from ..landscapes.draw.figures.page import save_prints
-
-        with resumable(self.say_kept):
-            return save_prints(lambda width: card.plot(width), self.folder / PICTURE, self.prints)
-
-    def _measure(self, watch: Watch) -> Card:
+    def compute(self, watch: Watch) -> Card:
+        """Check and cut what is missing, and return the card."""
         grades, slices, device = list[Grade](), dict[int, CardSlice](), self.device
         with watch.progress(len(self.entrants), "engines in scenes") as advance:
             for number, one in enumerate(self.entrants):
@@ -178,15 +149,15 @@ class CardJob:
 
     def _arrays(self, one: Entrant) -> dict[str, NDArray[Any]]:
         """Return what is found of an entrant, from what is kept of it where that is there."""
-        arrays = self.pieces.load(one.name)
+        arrays = self.checkpoint.load(one.name)
         if arrays is not None:
             if arrays["loss"].size:
-                self.pieces.verify(one.spec(self.device).make(), of=one.name)
+                self.checkpoint.verify(one.spec(self.device).make(), of=one.name)
             return arrays
         env, arrays = _measure(one, self.resolution, self.device)
         if arrays["loss"].size:
-            self.pieces.verify(env, of=one.name)
-        self.pieces.save(one.name, **arrays)
+            self.checkpoint.verify(env, of=one.name)
+        self.checkpoint.save(one.name, **arrays)
         return arrays
 
 

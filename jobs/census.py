@@ -15,11 +15,11 @@ import numpy as np
 from ..landscapes.capacity import Need, require
 from ..landscapes.cost import duration, seconds_per_episode
 from ..landscapes.sampling.distribution import make_objective, run_tasks, workers_of
-from ..landscapes.storage.files import replacing, tidy
-from ..landscapes.storage.records import read_json, reading, write_record
+from ..landscapes.storage.files import replacing
+from ..landscapes.storage.records import read_json, reading
 from .folder import CENSUS, ROOT, folder_named
+from .job import CheckpointedJob
 from .scene import SceneSpec, provenance
-from .studies import going_on
 from .watch import PREPARING, Watch
 from .workers import recipe
 
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from ..landscapes.measures.census import CensusDesign, SurveyedSlice
     from ..landscapes.measures.census_record import Census
     from ..landscapes.plane import Plane
-    from ..landscapes.storage.checkpoint import Checkpoint
 
 RECORD, LOSSES, PICTURE = CENSUS.files
 SLICES, RESOLUTION = 64, 24
@@ -45,22 +44,19 @@ class Task:
     other: bool
 
 
-@dataclass(frozen=True)
-class CensusJob:
-    """The slices of `design` to survey for `env`; a piece on disk for each.
+@dataclass(frozen=True, kw_only=True)
+class CensusJob(CheckpointedJob["Census"]):
+    """The slices of `design` to survey for `env`; a part of the checkpoint for each.
 
-    Some of them, one for each base point as far as cuts go, are surveyed for `other`, too: the scene at another
-    fidelity, None for none. `prints` are widths of pages [mm] that the census is also drawn for; with an `executor` its
-    workers survey, a slice each.
+    Some of them, one for each base point while cuts last, are surveyed for `other`, too: the scene at another fidelity,
+    None for none. With an `executor` its workers survey, a slice each.
     """
 
+    results = CENSUS
     env: Environment
     other: Environment | None
     design: CensusDesign
     seed: int
-    pieces: Checkpoint
-    command: str
-    prints: Sequence[float] = ()
     executor: Executor | None = None
 
     @classmethod
@@ -109,13 +105,11 @@ class CensusJob:
             identity["gradients"] = gradients
         identity["other"] = other.identity()["settings"] if other else None
         folder = out or folder_named(["census", env.name, env.fidelity.name, slices], identity, root)
-        pieces = Checkpoint.open(folder, identity, what="census", force=force)
-        return cls(env, other, design, seed, pieces, command, prints)
-
-    @property
-    def folder(self) -> Path:
-        """Where it is kept."""
-        return self.pieces.folder
+        checkpoint = Checkpoint.open(folder, identity, what="census", force=force)
+        return cls(
+            env=env, other=other, design=design, seed=seed, checkpoint=checkpoint, folder=folder, command=command,
+            prints=prints,
+        )  # fmt: skip
 
     @property
     def tasks(self) -> list[Task]:
@@ -125,48 +119,43 @@ class CensusJob:
         again = [Task(f"other-{n}", n, True) for n, (b, c) in enumerate(self.design.places) if c == b % many]
         return whole + (again if self.other else [])
 
-    def run(self, watch: Watch | None = None) -> Census:
-        """Survey what is missing; draw, write and return the census.
+    def compute(self, watch: Watch) -> Census:
+        """Survey what is missing, and return the census."""
+        deviation = self._noise(watch)
+        self._announce(watch)
+        return self._conclude(self._survey(deviation, watch))
 
-        Raises Stopped where it is interrupted, and DiskFullError; the same job goes on with the next slice then.
-        """
-        from ..landscapes.draw.figures.page import save, save_prints
+    def write(self, found: Census) -> list[str]:
+        """Draw and write the census, the losses in a file of their own."""
+        with replacing(self.folder / LOSSES) as partial, partial.open("wb") as file:
+            np.savez_compressed(file, loss=found.losses)
+        return super().write(found)
 
-        watch = watch or Watch()
-        with going_on(self.pieces, lambda: self.env, self.say_kept, watch):
-            deviation = self._noise(watch)
-            self._announce(watch)
-            found = self._conclude(self._survey(deviation, watch))
-            picture = self.folder / PICTURE
-            save(found.plot(), picture)
-            save_prints(lambda width: found.plot(width), picture, self.prints)
-            with replacing(self.folder / LOSSES) as partial, partial.open("wb") as file:
-                np.savez_compressed(file, loss=found.losses)
-            write_record(self.folder / RECORD, found.record())
-            tidy(self.folder)
-        return found
+    def verified(self) -> Environment:
+        """Return the environment."""
+        return self.env
 
-    def say_kept(self) -> str:
+    def kept(self) -> str:
         """Say how much of it is on disk."""
         return f"{len(self.tasks) - len(self.left())} of {len(self.tasks)} slices are kept in {self.folder}"
 
     def left(self) -> list[Task]:
         """Return what is not surveyed yet."""
-        return [task for task in self.tasks if self.pieces.load(task.piece) is None]
+        return [task for task in self.tasks if self.checkpoint.load(task.piece) is None]
 
     def _noise(self, watch: Watch) -> float:
         """Return the deviation of the losses' noise [loss unit], measured at random points of the box."""
         from ..landscapes.measures.noise import noise
         from ..landscapes.measures.profile import PRECISION
 
-        if (kept := self.pieces.load("noise")) is None:
+        if (kept := self.checkpoint.load("noise")) is None:
             with watch.busy(f"{self.env.name}: {PREPARING}, then its noise"):
                 self.env.prepare()
                 x = self.env.space.uniform(NOISE_POINTS, seed=self.seed)
                 rounding = PRECISION[self.env.fidelity.precision]
                 found = noise(self.env, x, rounding=rounding, repeats=REPEATS, seed=self.seed)
             kept = {"deviation": np.array(found.deviation)}
-            self.pieces.save("noise", **kept)
+            self.checkpoint.save("noise", **kept)
         return float(np.nan_to_num(kept["deviation"]))
 
     def _announce(self, watch: Watch) -> None:
@@ -195,9 +184,9 @@ class CensusJob:
             done = len(self.tasks) - len(left)
             advance(done)
             for piece, arrays in self._do(left, deviation):
-                self.pieces.save(piece, **arrays)
+                self.checkpoint.save(piece, **arrays)
                 advance(done := done + 1)
-        pieces = {task.piece: self.pieces.load(task.piece) for task in self.tasks}
+        pieces = {task.piece: self.checkpoint.load(task.piece) for task in self.tasks}
         return {name: SurveyedSlice.of_arrays(arrays) for name, arrays in pieces.items() if arrays is not None}
 
     def _do(self, tasks: Sequence[Task], deviation: float) -> Iterator[tuple[str, Mapping[str, Any]]]:

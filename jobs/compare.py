@@ -21,37 +21,35 @@ from ..landscapes.objective import Objective
 from ..landscapes.plain import plain_json
 from ..landscapes.slice import Slice
 from ..landscapes.space import scaled_labels
-from ..landscapes.storage.files import tidy, visible_files
+from ..landscapes.storage.files import visible_files
 from ..landscapes.storage.paths import slice_exists
-from ..landscapes.storage.records import read_json, reading, write_record
+from ..landscapes.storage.records import read_json, reading
 from ..landscapes.storage.store import open_slice
 from .folder import COMPARISON, SLICE_STORE, folder_named
+from .job import Job
 from .slice import SliceJob
 from .slice_place import identity_of
-from .watch import Watch, resumable
+from .watch import Watch
 
 if TYPE_CHECKING:
     import xarray as xr
 
-RECORD, PICTURE = COMPARISON.files
+RECORD = COMPARISON.files[0]
 IDENTITY = "identity"  # in the record: that of both slices
 
 
-@dataclass(frozen=True)
-class CompareJob:
-    """Two slices to compare into `folder`; `other` is the second, or an objective to sample on the first one's plane.
+@dataclass(frozen=True, kw_only=True)
+class CompareJob(Job[SliceComparison]):
+    """Two slices to compare; `other` is the second, or an objective to sample on the first one's plane.
 
-    `identity` says what is compared. `prints` are widths of pages [mm] that the picture is also drawn for; `command` is
-    how it is made again; `force` begins the second slice anew where it lies in the folder.
+    `identity` says what is compared; `force` begins the second slice again where it lies in the folder.
     """
 
+    results = COMPARISON
     slice: Slice
     other: Slice | Objective
     identity: dict[str, Any]
-    folder: Path
-    command: str
     force: bool = False
-    prints: Sequence[float] = ()
 
     @classmethod
     def of(
@@ -87,32 +85,20 @@ class CompareJob:
         COMPARISON.check(folder, allowed=[file for file in visible_files(folder) if slice_exists(file / SLICE_STORE)])
         if not force:
             _refuse_another(folder / RECORD, identity)
-        return cls(slice, other, identity, folder, command, force, prints)
+        return cls(
+            slice=slice, other=other, identity=identity, folder=folder, command=command, force=force, prints=prints
+        )
 
-    def run(self, watch: Watch | None = None) -> SliceComparison:
-        """Sample the second slice, if there is none, compare them, and write the files.
-
-        Raises Stopped where it is interrupted, and DiskFullError; the same job goes on from what is kept then.
-        """
-        from ..landscapes.draw.figures.page import save
-
-        watch = watch or Watch()
+    def compute(self, watch: Watch) -> SliceComparison:
+        """Sample the second slice, if there is none, and compare them."""
         theirs = self.other.data if isinstance(self.other, Slice) else self._sample(self.other, watch)
-        with resumable(self.say_kept):
-            found = compare_slices(self.slice.data, theirs, command=self.command)
-            save(found.plot(), self.folder / PICTURE)
-            write_record(self.folder / RECORD, {**found.record(), IDENTITY: self.identity})
-            tidy(self.folder)
-        return found
+        return compare_slices(self.slice.data, theirs, command=self.command)
 
-    def print(self, found: SliceComparison) -> list[str]:
-        """Draw it for pages, too, and return the names of the files. Raises DiskFullError."""
-        from ..landscapes.draw.figures.page import save_prints
+    def record(self, found: SliceComparison) -> Any:
+        """Return what is written of it, with what was compared."""
+        return {**super().record(found), IDENTITY: self.identity}
 
-        with resumable(self.say_kept):
-            return save_prints(lambda width: found.plot(width), self.folder / PICTURE, self.prints)
-
-    def say_kept(self) -> str:
+    def kept(self) -> str:
         """Say what of it is on disk."""
         return f"each file in {self.folder} is whole"
 
@@ -121,8 +107,7 @@ class CompareJob:
         boxed = bool(self.slice.identity.get("boxed"))
         how: dict[str, Any] = {"gradients": int("grad" in self.slice.data), "boxed": boxed, "force": self.force}
         job = SliceJob.of(objective, self.slice.plane, command=self.command, root=self.folder, **how)
-        summary = job.run(watch)
-        watch.note(f"{summary.outcome()}\n{job.folder}: {', '.join(summary.files)}")
+        job.run(watch)
         return open_slice(job.folder / SLICE_STORE)
 
 

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from .. import __version__
+from ..landscapes.convert import to_json
 from ..landscapes.objective import Status, failed, has_loss
 from ..landscapes.storage.files import tidy, write_json
 from .folder import EPISODE, folder_named
+from .job import Job
 from .scene import named_point, provenance
 from .watch import Watch
 
@@ -46,26 +48,21 @@ class EpisodeSummary:
     files: list[str]
 
 
-@dataclass(frozen=True, eq=False)
-class EpisodeJob:
-    """An episode of `env` at `x` to draw into `folder`; `source` says where its parameters are from.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class EpisodeJob(Job[EpisodeSummary]):
+    """An episode of `env` at `x` to draw; `source` says where its parameters are from."""
 
-    `prints` are widths of pages [mm] that its key frames are also drawn for; `command` is how it is made again.
-    """
-
+    results = EPISODE
     env: Environment
     x: Float[Tensor, " dim"]
     source: str
-    folder: Path
-    command: str
     film: bool = True
-    prints: Sequence[float] = ()
 
     @classmethod
     def of(
         cls,
         env: Environment,
-        params: str,
+        params: str | Float[Tensor, " dim"],
         *,
         command: str,
         out: Path | None = None,
@@ -76,17 +73,19 @@ class EpisodeJob:
 
         Raises ValueError where there is no such point, and where `out` holds something else.
         """
-        x = named_point(env, params)
+        x = named_point(env, params) if isinstance(params, str) else params
         folder = out or folder_named(["replay", env.name], [env.identity(), x.tolist()])
         EPISODE.check(folder)
-        return cls(env, x, params, folder, command, film, prints)
+        return cls(
+            env=env, x=x, source=params if isinstance(params, str) else "a point", folder=folder, command=command,
+            film=film, prints=prints,
+        )  # fmt: skip
 
-    def run(self, watch: Watch | None = None) -> EpisodeSummary:
-        """Simulate the episode, draw it, write and return what came out.
+    def compute(self, watch: Watch) -> EpisodeSummary:
+        """Simulate the episode, draw it and return what came out.
 
         Raises ValueError where the environment has no episodes to draw.
         """
-        watch = watch or Watch()
         with watch.busy(f"{self.env.name}: simulating (kernels are compiled once, then kept)"):
             episode = self.env.episode(self.x)
             result = self.env.evaluate(self.x[None], grad=False)
@@ -94,13 +93,24 @@ class EpisodeJob:
         caption = self._caption(loss, status)
         watch.note(f"{caption.title}: {len(episode.time)} instants to draw{', and to film' if self.film else ''}")
         with watch.busy(f"{self.env.name}: drawing"):
-            files = self._draw(episode, caption)
-        record = self._record(loss, status)
-        write_json(self.folder / RECORD, asdict(record))
-        tidy(self.folder)
-        return EpisodeSummary(caption.title, caption.outcome, record, [*files, RECORD])
+            files = self._draw_episode(episode, caption)
+        return EpisodeSummary(caption.title, caption.outcome, self._describe(loss, status), [*files, RECORD])
 
-    def _draw(self, episode: Episode, caption: Caption) -> list[str]:
+    def write(self, found: EpisodeSummary) -> list[str]:
+        """Write the record."""
+        write_json(self.folder / RECORD, to_json(found.record))
+        tidy(self.folder)
+        return found.files
+
+    def kept(self) -> str:
+        """Say what of it is on disk."""
+        return f"each file in {self.folder} is whole"
+
+    def outcome(self, found: EpisodeSummary) -> str:
+        """Say in a line what came out."""
+        return f"{found.title} · {self.env.device} · {found.outcome}"
+
+    def _draw_episode(self, episode: Episode, caption: Caption) -> list[str]:
         """Draw key frames, a recording and perhaps films; return the names of the files."""
         from ..landscapes.draw.figures.contact import episode_figure, save_sheet
         from ..landscapes.draw.figures.page import save_prints
@@ -136,7 +146,7 @@ class EpisodeJob:
         values: list[float] = self.env.space.to_values(self.x).tolist()
         return values
 
-    def _record(self, loss: float, status: Status) -> EpisodeRecord:
+    def _describe(self, loss: float, status: Status) -> EpisodeRecord:
         return EpisodeRecord(
             identity=self.env.identity(),
             provenance=provenance(self.env, self.command),

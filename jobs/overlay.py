@@ -21,9 +21,10 @@ from ..landscapes.storage.paths import slice_exists
 from ..landscapes.storage.store import open_slice
 from ..landscapes.verification import RESAMPLE, verify_dataset
 from .folder import OVERLAY, ROOT, SLICE_STORE, folder_named, run_tables
+from .job import Job
 from .scene import environment_of, named_point
 from .slice import SliceJob
-from .watch import PREPARING, Watch, resumable
+from .watch import PREPARING, Watch
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -141,20 +142,15 @@ class Overlay:
         return f"<Overlay of {self.summary.outcome()}, in {self.folder}>"
 
 
-@dataclass(frozen=True)
-class OverlayJob:
-    """Runs to lay over a slice in `folder`; with a `cut` over one that is sampled there first, on `device`.
+@dataclass(frozen=True, kw_only=True)
+class OverlayJob(Job[Overlay]):
+    """Runs to lay over a slice; with a `cut` over one that is sampled first in the same folder, on `device`."""
 
-    `prints` are widths of pages [mm] that the picture is also drawn for; `command` is how it is made again.
-    """
-
+    results = OVERLAY
     slice: Slice
     runs: Sequence[xr.Dataset]
-    folder: Path
-    command: str
     cut: Cut | None = None
     device: str = "auto"
-    prints: Sequence[float] = ()
 
     @classmethod
     def of(
@@ -178,33 +174,40 @@ class OverlayJob:
         overlay(slice.data, runs)
         folder = out or overlay_folder(slice.data, runs, cut)
         OVERLAY.check(folder, allowed=[file for file in visible_files(folder) if slice_exists(file / SLICE_STORE)])
-        return cls(slice, runs, folder, command, cut, device, prints)
+        return cls(slice=slice, runs=runs, folder=folder, command=command, cut=cut, device=device, prints=prints)
 
-    def run(self, watch: Watch | None = None) -> Overlay:
-        """Sample the new slice, if there is to be one, lay the runs over it and write the files.
+    def compute(self, watch: Watch) -> Overlay:
+        """Sample the new slice, if there is to be one, lay the runs over it and draw them.
 
-        Raises StoreMismatchError where a slice is to be cut anew that its objective gives other numbers for, Stopped
-        where it is interrupted, and DiskFullError; the same job goes on from what is kept then.
+        Raises StoreMismatchError where a slice is to be cut again that its objective gives other numbers for.
         """
-        beneath = self._sample(watch or Watch()) if self.cut else self.slice
-        with resumable(self._say_kept):
-            return self._write(Overlay(beneath, overlay(beneath.data, self.runs), self.folder, []))
+        beneath = self._sample(watch) if self.cut else self.slice
+        return self._draw(Overlay(beneath, overlay(beneath.data, self.runs), self.folder, []))
 
-    def _say_kept(self) -> str:
+    def write(self, found: Overlay) -> list[str]:
+        """Leave nothing but the files that are drawn."""
+        tidy(self.folder)
+        return found.files
+
+    def kept(self) -> str:
+        """Say what of it is on disk."""
         return f"each file in {self.folder} is whole"
+
+    def outcome(self, found: Overlay) -> str:
+        """Say in a line what it shows."""
+        return found.summary.outcome()
 
     def _sample(self, watch: Watch) -> Slice:
         """Sample the slice that is cut anew."""
         assert self.cut is not None  # as `run` has seen
         env = self._objective()
         if self.slice.folder is not None:
-            with resumable(self._say_kept), watch.busy(PREPARING):
+            with watch.busy(PREPARING):
                 verify_dataset(env, self.slice.data, self.slice.folder, todo=RESAMPLE)
         plane = self.cut.plane(plane_of(self.slice.data), self.runs, env)
         how: dict[str, Any] = {"gradients": int("grad" in self.slice.data), "boxed": self.cut.principal}
         job = SliceJob.of(env, plane, command=self.command, root=self.folder, **how)
-        summary = job.run(watch)
-        watch.note(f"{summary.outcome()}\n{job.folder}: {', '.join(summary.files)}")
+        job.run(watch)
         return Slice(open_slice(job.folder / SLICE_STORE), job.folder, lambda: env)
 
     def _objective(self) -> Objective:
@@ -212,16 +215,11 @@ class OverlayJob:
         found = self.slice.remake() if self.slice.remake else environment_of(self.slice.data, self.device)
         return found if self.device == "auto" else as_environment(found).remake(device=self.device)
 
-    def _write(self, drawn: Overlay) -> Overlay:
-        from ..landscapes.draw.figures.page import save, save_prints
+    def _draw(self, drawn: Overlay) -> Overlay:
         from ..landscapes.draw.recordings.runs import save_stream
 
-        path = self.folder / PICTURE
-        save(drawn.plot(), path)
         save_stream(drawn.slice.data, drawn.runs, self.folder / STREAM)
-        printed = save_prints(lambda width: drawn.plot(width=width), path, self.prints)
-        tidy(self.folder)
-        return replace(drawn, files=[PICTURE, STREAM, *printed])
+        return replace(drawn, files=[PICTURE, STREAM, *self.draw(drawn.plot)])
 
 
 def check_run(dataset: xr.Dataset, run: xr.Dataset, watch: Watch) -> None:

@@ -11,10 +11,9 @@ from ..landscapes.capacity import Need, require
 from ..landscapes.cost import duration, seconds_per_episode
 from ..landscapes.measures.sensitivity import Design, Pair, default_samples, explore, rank
 from ..landscapes.storage.checkpoint import Checkpoint
-from ..landscapes.storage.files import tidy, write_json
 from .folder import PAIRS, ROOT, folder_named
+from .job import CheckpointedJob
 from .scene import SceneSpec, provenance
-from .studies import going_on
 from .watch import PREPARING, Watch
 
 if TYPE_CHECKING:
@@ -22,7 +21,6 @@ if TYPE_CHECKING:
 
     from ..envs.base import Environment
 
-(RECORD,) = PAIRS.files
 NUMBERS = 60  # that are held for each parameter of a base point, copies included
 
 
@@ -80,16 +78,15 @@ class PairRanking:
         return str(self.table().to_html())
 
 
-@dataclass(frozen=True)
-class PairsJob:
-    """A design of points to evaluate for an environment; a piece on disk for each batch."""
+@dataclass(frozen=True, kw_only=True)
+class PairsJob(CheckpointedJob[PairRanking]):
+    """A design of points to evaluate for an environment; a part of the checkpoint for each batch."""
 
+    results = PAIRS
     env: Environment
     design: Design
     identity: dict[str, Any]
-    pieces: Checkpoint
     options: Mapping[str, Any] = field(default_factory=dict)
-    command: str = ""
 
     @classmethod
     def open(
@@ -117,43 +114,37 @@ class PairsJob:
         require("samples", samples, lambda count: Need(8.0 * NUMBERS * dim * count))
         identity = {**env.identity(), "samples": samples, "seed": seed}
         folder = out or folder_named(["pairs", identity["objective"], identity["fidelity"], samples], identity, root)
-        pieces = Checkpoint.open(folder, identity, what="pairs", force=force)
-        return cls(env, Design.sobol(env.space, samples, seed=seed), identity, pieces, scene.options, command)
+        checkpoint = Checkpoint.open(folder, identity, what="pairs", force=force)
+        return cls(
+            env=env, design=Design.sobol(env.space, samples, seed=seed), identity=identity, checkpoint=checkpoint,
+            folder=folder, options=scene.options, command=command,
+        )  # fmt: skip
 
-    @property
-    def folder(self) -> Path:
-        """Where it is kept."""
-        return self.pieces.folder
+    def compute(self, watch: Watch) -> PairRanking:
+        """Evaluate what is missing, and return the ranking."""
+        self._announce(watch)
+        with watch.progress(self.design.episodes) as advance:
+            found = explore(self.env, self.design, self.checkpoint, follow=advance)
+        return PairRanking(
+            identity=self.identity,
+            options=dict(self.options),
+            env=self.env.name,
+            episodes=self.design.episodes,
+            failed=found.failed,
+            spread=found.spread,
+            parameters=tuple(self.env.space.names),
+            total=tuple(found.total().tolist()),
+            pairs=tuple(rank(found)),
+            provenance=provenance(self.env, self.command),
+        )
 
-    def run(self, watch: Watch | None = None) -> PairRanking:
-        """Evaluate what is missing, write and return the ranking.
+    def verified(self) -> Environment:
+        """Return the environment."""
+        return self.env
 
-        Raises Stopped where it is interrupted, and DiskFullError; the same job goes on from what is kept then.
-        """
-        watch = watch or Watch()
-        with going_on(self.pieces, lambda: self.env, self.say_kept, watch):
-            self._announce(watch)
-            with watch.progress(self.design.episodes) as advance:
-                found = explore(self.env, self.design, self.pieces, follow=advance)
-            ranking = PairRanking(
-                identity=self.identity,
-                options=dict(self.options),
-                env=self.env.name,
-                episodes=self.design.episodes,
-                failed=found.failed,
-                spread=found.spread,
-                parameters=tuple(self.env.space.names),
-                total=tuple(found.total().tolist()),
-                pairs=tuple(rank(found)),
-                provenance=provenance(self.env, self.command),
-            )
-            write_json(self.folder / RECORD, ranking.record())
-        tidy(self.folder)
-        return ranking
-
-    def say_kept(self) -> str:
+    def kept(self) -> str:
         """Say how much of it is on disk."""
-        return f"{self.pieces.count()} batches are kept in {self.folder}"
+        return f"{self.checkpoint.count()} batches are kept in {self.folder}"
 
     def _announce(self, watch: Watch) -> None:
         env, design = self.env, self.design

@@ -69,8 +69,7 @@ def sample_subject(env: Environment, points: int, command: str, watch: Watch) ->
     refuse_too_many(points, len(dims), env.space.dim)
     plane = plane_through(env, dims, through="center", extent=None, resolution=RESOLUTION)
     job = SliceJob.of(env, plane, command=command)
-    summary = job.run(watch)
-    watch.note(f"{summary.outcome()}\n{job.folder}: {', '.join(summary.files)}")
+    job.run(watch)
     return ReportedSlice.of(job.folder)
 
 
@@ -325,7 +324,6 @@ def _leave(dataset: xr.Dataset, profile: Profile, report: Report, folder: Path, 
     save(quality_figure(dataset, profile.steps, profile.samples, profile.smooth), folder / PICTURE)
     _leave_measures(folder, report)
     write_record(folder / RECORD, report.record())
-    watch.note(f"{folder}: {RECORD}, {MEASURES}, {PICTURE}, {ARRAYS}")
 
 
 def _leave_measures(folder: Path, report: Report) -> None:

@@ -8,7 +8,9 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
+from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +20,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..landscapes.capacity import size
+from ..landscapes.convert import to_json
 from ..landscapes.cost import duration, seconds_per_episode
 from ..landscapes.identity import with_stride
 from ..landscapes.lattice import check_gradients
@@ -37,6 +40,7 @@ from ..landscapes.storage.store import SliceStore
 from ..landscapes.storage.tiles import Tile
 from ..landscapes.verification import verify_dataset, verify_store
 from .folder import ROOT, SLICE, SUMMARY
+from .job import Job
 from .scene import provenance
 from .slice_place import default_folder, identity_of
 from .slice_summary import SliceSummary, barrier_of, count_statuses, flat_points, look_between, range_of
@@ -69,23 +73,20 @@ class SliceCost:
         return replace(self, episodes=self.episodes - done, seconds=self.seconds * (1 - done / self.episodes))
 
 
-@dataclass(frozen=True)
-class SliceJob:
-    """A slice to sample into `folder`, and how to draw it; `executor` and `remake` are those of `sample`.
+@dataclass(frozen=True, kw_only=True)
+class SliceJob(Job[SliceSummary]):
+    """A slice to sample, and how to draw it, here or by the workers of an `executor`, each with what `remake` returns.
 
-    `prints` are widths of pages [mm] that it is also drawn for; `command` is how it is made again. With a `refinement`
-    it is sampled only where it has to be.
+    With a `refinement` it is sampled only where it has to be.
     """
 
+    results = SLICE
     objective: Objective
     plane: Plane
-    folder: Path
     store: SliceStore
-    draw: Draw
-    command: str
+    plot: Draw
     executor: Executor | None = None
     remake: Callable[[], Objective] | None = None
-    prints: Sequence[float] = ()
     refinement: Refinement | None = None
 
     @classmethod
@@ -122,7 +123,10 @@ class SliceJob:
             pieces_in(folder, store).remove()
         else:
             store = SliceStore.open_or_create(path, plane, objective.space, **settings)
-        return cls(objective, plane, folder, store, draw, command, executor, remake, prints, refinement)
+        return cls(
+            objective=objective, plane=plane, folder=folder, store=store, plot=draw, command=command,
+            executor=executor, remake=remake, prints=prints, refinement=refinement,
+        )  # fmt: skip
 
     @classmethod
     def of(
@@ -175,26 +179,33 @@ class SliceJob:
         """Estimate what is left; workers that compute it do, which warms them, and leaves a GPU of theirs alone."""
         return estimate_cost(self.objective, self.store, self.executor, self.remake)
 
-    def run(self, watch: Watch | None = None) -> SliceSummary:
-        """Sample what is missing, draw each finer picture as it completes, write and return the summary.
+    def compute(self, watch: Watch) -> SliceSummary:
+        """Sample what is missing, draw each finer picture as it completes, and return the summary.
 
-        Raises StoreMismatchError where the objective gives other numbers than are stored, Stopped where it is
-        interrupted, and DiskFullError; the same job goes on from what is kept then.
+        Raises StoreMismatchError where the objective gives other numbers than are stored.
         """
-        watch = watch or Watch()
-        with resumable(self.say_kept, self.picture):
-            self._verify(watch)
-            self._announce(watch)
-            start = time.monotonic()
-            dataset, computed = self._sample(watch)
-            self._save(dataset)
-            files = [STORE, PICTURE, *self._print(dataset), SUMMARY]
-            summary = self._summary(dataset, computed, time.monotonic() - start, files)
-            write_json(self.folder / SUMMARY, asdict(summary))
-            tidy(self.folder)
-        return summary
+        self._verify(watch)
+        self._announce(watch)
+        start = time.monotonic()
+        dataset, computed = self._sample(watch)
+        printed = self.draw(partial(self.plot, dataset))
+        return self._summary(dataset, computed, time.monotonic() - start, [STORE, PICTURE, *printed, SUMMARY])
 
-    def say_kept(self) -> str:
+    def write(self, found: SliceSummary) -> list[str]:
+        """Write the summary."""
+        write_json(self.folder / SUMMARY, to_json(found))
+        tidy(self.folder)
+        return found.files
+
+    def holding(self, watch: Watch) -> AbstractContextManager[None]:
+        """Leave the finest complete picture where it is stopped."""
+        return resumable(self.kept, self.picture)
+
+    def outcome(self, found: SliceSummary) -> str:
+        """Say in a line what the slice cost and what came out."""
+        return found.outcome()
+
+    def kept(self) -> str:
         """Say how much of it is on disk."""
         status = self._so_far()["status"] if self.refinement else self.store.status()
         return f"{int((status > 0).sum())} of {status.size} points are kept in {self.folder}"
@@ -203,7 +214,9 @@ class SliceJob:
         """Draw the finest complete picture of the whole so far, if there is one."""
         coarse = self._so_far() if self.refinement else self.store.coarse()
         if coarse is not None and bool((coarse["status"] != Status.MISSING).any()):
-            self._save(coarse)
+            from ..landscapes.draw.figures.page import save
+
+            save(self.plot(coarse), self.folder / PICTURE)
 
     def _so_far(self) -> xr.Dataset:
         """Return what is sampled of a slice that is refined."""
@@ -264,16 +277,6 @@ class SliceJob:
                 return sample(self.objective, self.plane, self.store, gradients=int(self.store.grad), **how), computed
             how |= {"refinement": self.refinement, "pieces": pieces_in(self.folder, self.store)}
             return refine(self.objective, self.plane, self.store, **how), computed
-
-    def _save(self, dataset: xr.Dataset) -> None:
-        from ..landscapes.draw.figures.page import save
-
-        save(self.draw(dataset), self.folder / PICTURE)
-
-    def _print(self, dataset: xr.Dataset) -> list[str]:
-        from ..landscapes.draw.figures.page import save_prints
-
-        return save_prints(lambda width: self.draw(dataset, width=width), self.folder / PICTURE, self.prints)
 
     def _summary(self, dataset: xr.Dataset, computed: int, seconds: float, files: list[str]) -> SliceSummary:
         identity, status = self.store.identity, dataset["status"].to_numpy()

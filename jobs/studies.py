@@ -23,16 +23,16 @@ if TYPE_CHECKING:
 
 @contextmanager
 def going_on(
-    pieces: Checkpoint, make: Callable[[], Environment] | None, kept: Callable[[], str], watch: Watch
+    pieces: Checkpoint, make: Callable[[], Environment | None], kept: Callable[[], str], watch: Watch
 ) -> Iterator[None]:
     """Hold a study's folder, after another process that fills it, and verify the environment that `make` returns.
 
     Raises StoreMismatchError where it gives other numbers than when the study began, and as `resumable` does.
     """
     with resumable(kept), holding(pieces.folder, watch.note):
-        if make is not None:
+        if (env := make()) is not None:
             with watch.busy(PREPARING):
-                pieces.verify(make())
+                pieces.verify(env)
                 free_memory()  # which the environment has taken, if nobody else has it
         yield
 

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..landscapes.identity import stored_identity
 from ..landscapes.storage.files import tidy
 from .folder import SLICE_STORE, SURFACE, folder_named, run_tables, store_in
+from .job import Job
 from .watch import Watch
 
 if TYPE_CHECKING:
@@ -18,16 +20,16 @@ if TYPE_CHECKING:
 PICTURE, MODEL = SURFACE.files
 
 
-@dataclass(frozen=True)
-class SurfaceJob:
-    """A slice to draw as a surface into `folder`, with what `placed` has of runs over it."""
+@dataclass(frozen=True, kw_only=True)
+class SurfaceJob(Job[Path]):
+    """A slice to draw as a surface, with what `placed` has of runs over it; it finds nothing but its folder."""
 
+    results = SURFACE
     dataset: xr.Dataset
     placed: Sequence[xr.Dataset]
-    folder: Path
 
     @classmethod
-    def of(cls, slice_: Path, runs: Sequence[str], out: Path | None = None) -> SurfaceJob:
+    def of(cls, slice_: Path, runs: Sequence[str], out: Path | None = None, prints: Sequence[float] = ()) -> SurfaceJob:
         """Lay the runs over the slice in a folder; results go to `out`, by default to one named after all of them.
 
         Raises ValueError where there is no slice or no run, where a run searched another landscape, and where `out`
@@ -45,19 +47,29 @@ class SurfaceJob:
         content = [ours, [stored_identity(table) for table in tables]]
         folder = out or folder_named(["surface", ours["objective"]], content)
         SURFACE.check(folder)
-        return cls(dataset, placed, folder)
+        return cls(dataset=dataset, placed=placed, folder=folder, prints=prints)
 
-    def run(self, watch: Watch | None = None, prints: Sequence[float] = ()) -> list[str]:
-        """Draw the surface, also for pages as wide as `prints` [mm]; return the names of the files."""
+    def compute(self, watch: Watch) -> Path:
+        """Draw the surface."""
+        from ..landscapes.draw.render.surface import save_surface
+
+        with watch.busy("drawing"):
+            save_surface(self.dataset, self.placed, self.folder / PICTURE, self.folder / MODEL)
+        return self.folder
+
+    def write(self, found: Path) -> list[str]:
+        """Draw it for pages, too."""
         from ..landscapes.draw.figures.page import save_prints
-        from ..landscapes.draw.render.surface import save_surface, surface_figure
+        from ..landscapes.draw.render.surface import surface_figure
 
-        with (watch or Watch()).busy("drawing"):
-            picture = self.folder / PICTURE
-            save_surface(self.dataset, self.placed, picture, self.folder / MODEL)
-            printed = save_prints(lambda width: surface_figure(self.dataset, self.placed, width=width), picture, prints)
+        draw = partial(surface_figure, self.dataset, self.placed)
+        printed = save_prints(lambda width: draw(width=width), self.folder / PICTURE, self.prints)
         tidy(self.folder)
         return [PICTURE, MODEL, *printed]
+
+    def kept(self) -> str:
+        """Say what of it is on disk."""
+        return f"each file in {self.folder} is whole"
 
 
 def check_landscape(dataset: xr.Dataset, table: xr.Dataset) -> None:

@@ -9,7 +9,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Mapping
 from concurrent.futures import Executor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import xarray as xr
 
 from ..landscapes.capacity import size
+from ..landscapes.convert import to_json
 from ..landscapes.cost import duration
 from ..landscapes.identity import with_stride
 from ..landscapes.lattice import check_gradients
@@ -28,12 +29,13 @@ from ..landscapes.storage.ownership import refuse_others
 from ..landscapes.storage.paths import check_replaceable, filling_path, slice_exists
 from ..landscapes.storage.store import SliceStore
 from .folder import ROOT, SWEEP, folder_named
+from .job import Job
 from .motion import HORIZON, SMOOTHING, Motion, refuse_too_large
 from .scene import provenance
 from .slice import SliceCost, estimate_cost, kind_of
 from .slice_place import MOST
 from .slice_summary import count_statuses, flat_points, range_of, say_range
-from .watch import PREPARING, Advance, Watch, resumable
+from .watch import PREPARING, Advance, Watch
 from .workers import recipe
 
 if TYPE_CHECKING:
@@ -92,18 +94,17 @@ class SweepSummary:
         return f"{done}; {len(self.frames)} frames; {losses}{failures}"
 
 
-@dataclass(frozen=True)
-class SweepJob:
-    """A sweep to sample into `folder`, slice by slice, and to film; `executor` is that of `sample`.
+@dataclass(frozen=True, kw_only=True)
+class SweepJob(Job[SweepSummary]):
+    """A sweep to sample slice by slice, here or by the workers of an `executor`, and to film.
 
-    A `boxed` one leaves out what lies beyond the parameters' bounds.
+    A `boxed` one leaves out what lies outside the parameters' bounds.
     """
 
+    results = SWEEP
     env: Environment
     motion: Motion
-    folder: Path
     stores: tuple[SliceStore, ...]
-    command: str
     executor: Executor | None = None
     boxed: bool = False
 
@@ -135,7 +136,7 @@ class SweepJob:
             SliceStore.open_or_create(folder / name, plane, env.space, identity=identity | oblique, **how)
             for name, plane, identity in zip(motion.stores, motion.planes, made, strict=True)
         )
-        return cls(env, motion, folder, stores, command, boxed=bool(cut))
+        return cls(env=env, motion=motion, folder=folder, stores=stores, command=command, boxed=bool(cut))
 
     @classmethod
     def of(
@@ -189,22 +190,24 @@ class SweepJob:
         cost = estimate_cost(objective, self.stores[last], self.executor, made)
         return SliceCost(sum(pending.values()), cost.seconds * sum(work.values()) / work[last], cost.memory)
 
-    def run(self, watch: Watch | None = None) -> SweepSummary:
-        """Sample what is missing, film it, write and return the summary.
+    def compute(self, watch: Watch) -> SweepSummary:
+        """Sample what is missing, film it and return the summary."""
+        self._announce(watch)
+        start, resumed = time.monotonic(), self.done()
+        drawn = self.sample(watch)
+        with watch.busy("drawing"):
+            self._film(drawn)
+        return self._summary(drawn, resumed, time.monotonic() - start)
 
-        Raises Stopped where it is interrupted, and DiskFullError; the same job goes on from what is kept then.
-        """
-        watch = watch or Watch()
-        with resumable(self.say_kept):
-            self._announce(watch)
-            start, resumed = time.monotonic(), self.done()
-            drawn = self.sample(watch)
-            with watch.busy("drawing"):
-                self._film(drawn)
-            summary = self._summary(drawn, resumed, time.monotonic() - start)
-            write_json(self.folder / SUMMARY, asdict(summary))
-            tidy(self.folder)
-        return summary
+    def write(self, found: SweepSummary) -> list[str]:
+        """Write the summary."""
+        write_json(self.folder / SUMMARY, to_json(found))
+        tidy(self.folder)
+        return found.files
+
+    def outcome(self, found: SweepSummary) -> str:
+        """Say in a line what the sweep cost and what came out."""
+        return found.outcome()
 
     def sample(self, watch: Watch | None = None) -> Sweep:
         """Sample what is missing, and return what there is to draw.
@@ -219,7 +222,7 @@ class SweepJob:
         moved = self.motion
         return Sweep(moved.label, moved.values, moved.slices(slices), moved.logarithmic)
 
-    def say_kept(self) -> str:
+    def kept(self) -> str:
         """Say how much of it is on disk."""
         return f"{self.done()} of {self.total} points are kept in {self.folder}"
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 
 from ..landscapes.storage.disk import until_full
 
@@ -46,6 +47,10 @@ class Watch:
 
     def note(self, text: str) -> None:
         """Take a line that is worth keeping: what a job will cost, a warning, what it has left out."""
+
+    def finish(self, folder: Path, files: Sequence[str], said: str = "") -> None:
+        """Take where a job has left which files, and in a line what came out."""
+        self.note(f"{said}\n{folder}: {', '.join(files)}".lstrip())
 
     @contextmanager
     def busy(self, text: str) -> Iterator[Say]:

@@ -1,4 +1,4 @@
-"""`landscape view`: open what the other verbs leave, with the viewer it is made for."""
+"""The verb `view`: open what the other verbs leave, with the viewer it is made for."""
 
 from __future__ import annotations
 
@@ -6,13 +6,12 @@ import os
 import shlex
 import sys
 import time
+import webbrowser
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
-import typer
-
-if TYPE_CHECKING:
-    from .terminal import Bars
+from .call import current, verb
+from .options import ARGUMENT
 
 SITE = "index.html"
 SHOWN = (  # of a folder, the first that is there
@@ -23,41 +22,45 @@ PICTURES = (".png", ".html", ".mp4", ".gif")
 DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY")  # variables of the environment that name one
 
 
-def view(
-    file: Annotated[str, typer.Argument(help="A picture, a film, a page, a recording (.rrd), or a results folder.")],
-    serve: Annotated[bool, typer.Option("--serve", help="Serve a recording to a browser, until Ctrl-C.")] = False,
-) -> None:
+@verb
+def view(file: Annotated[str, ARGUMENT], *, serve: bool = False) -> None:
     """Open the results of other verbs in a viewer.
 
     Pictures, films and pages open in the programs of this system. Recordings (.rrd) open in the rerun viewer, or with
     --serve in a browser. It writes no file.
 
     Example: landscape view out/my-episode --serve
-    """
-    from .terminal import Bars
 
+    Parameters
+    ----------
+    file
+        A picture, a film, a page, a recording (.rrd), or a results folder.
+    serve
+        Serve a recording to a browser, until Ctrl-C.
+    """
     path = _choose(Path(file), serve=serve)
     if path.suffix == ".rrd":
-        show_recording(path, Bars(), serve=serve)
+        show_recording(path, serve=serve)
     else:
-        _open(path, Bars(), serve=serve)
+        _open(path, serve=serve)
 
 
-def show_recording(path: Path, bars: Bars, *, serve: bool) -> None:
+def show_recording(path: Path, *, serve: bool) -> None:
     """Show a recording in rerun's viewer, or serve it to a browser until Ctrl-C.
 
     Raises ValueError where a window is wanted and there is no display, OSError where the viewer does not come up.
     """
     from ..landscapes.draw.recordings.viewer import open_viewer, serve_recording
 
+    note = current().watch.note
     if not serve:
         check_display(path, f"look at it in a browser: landscape view {shlex.quote(str(path))} --serve")
-        bars.note(f"opening {path} in rerun's viewer")
+        note(f"opening {path} in rerun's viewer")
         open_viewer(path)
         return
     with serve_recording(path) as address:
         try:
-            bars.note(f"{path} is at {address} until Ctrl-C")
+            note(f"{path} is at {address} until Ctrl-C")
             while True:
                 time.sleep(3600)
         except KeyboardInterrupt:
@@ -70,7 +73,7 @@ def check_display(path: Path, instead: str) -> None:
         raise ValueError(f"there is no display here to open {path} on; {instead}")
 
 
-def _open(path: Path, bars: Bars, *, serve: bool) -> None:
+def _open(path: Path, *, serve: bool) -> None:
     """Open a picture, a film or a page with this system's program for it."""
     from ..landscapes.storage.files import resolve
 
@@ -80,8 +83,8 @@ def _open(path: Path, bars: Bars, *, serve: bool) -> None:
     if serve:
         raise ValueError(f"--serve shows recordings (.rrd) in a browser; {path} is none")
     check_display(path, f"serve it to a browser: {serving}" if path.name == SITE else "copy it to where one is")
-    bars.note(f"opening {path}")
-    if typer.launch(str(resolve(path))):
+    current().watch.note(f"opening {path}")
+    if not webbrowser.open(resolve(path).as_uri()):
         raise OSError(f"no program of this system opens {path}; open it with one of your own")
 
 

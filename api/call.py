@@ -1,0 +1,89 @@
+"""How a public function was called: the command that is kept with its results, and who watches it work."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass
+from functools import wraps
+from pathlib import Path
+from typing import ParamSpec, TypeVar
+
+from ..jobs.watch import Watch
+
+Given = ParamSpec("Given")
+Result = TypeVar("Result")
+
+RENAMED = {  # keywords of earlier versions, and today's
+    "also": "second_fidelity",
+    "extent": "window",
+    "prints": "figure_width_mm",
+}
+
+
+@dataclass(frozen=True)
+class Call:
+    """Hold how a result is made again, and what shows the progress of making it.
+
+    A function of one's own is sampled in memory unless its results are to be kept `on_disk`.
+    """
+
+    command: str
+    watch: Watch
+    on_disk: bool = False
+
+
+_CURRENT: ContextVar[Call | None] = ContextVar("call", default=None)
+
+
+def current() -> Call:
+    """Return the call under way."""
+    return _CURRENT.get() or Call("", Watch())
+
+
+@contextmanager
+def calling(call: Call) -> Iterator[None]:
+    """Let the public functions that are called within this context work for one call."""
+    token = _CURRENT.set(call)
+    try:
+        yield
+    finally:
+        _CURRENT.reset(token)
+
+
+def verb(function: Callable[Given, Result]) -> Callable[Given, Result]:
+    """Make a function one of the public ones: its signature and docstring declare a verb of the command, too.
+
+    A call from Python is kept with its results as it was written. It shows bars in a notebook or a terminal.
+    """
+
+    @wraps(function)
+    def call(*given: Given.args, **named: Given.kwargs) -> Result:
+        if old := next((name for name in named if name in RENAMED), None):
+            raise ValueError(f"{function.__name__} takes {RENAMED[old]}= today; got {old}=")
+        if _CURRENT.get() is not None:
+            return function(*given, **named)
+        from .progress import default_watch
+
+        words = [*map(_written, given), *(f"{name}={_written(value)}" for name, value in named.items())]
+        with calling(Call(f"gradscape.{function.__name__}({', '.join(words)})", default_watch())):
+            return function(*given, **named)
+
+    return call
+
+
+def _written(value: object) -> str:
+    """Return a value as one writes it in Python: simulators, slices and runs by their names."""
+    if isinstance(value, Path):
+        return repr(str(value))
+    if isinstance(value, type):
+        return value.__name__
+    if isinstance(value, list | tuple):
+        ends = "[]" if isinstance(value, list) else "()"
+        comma = "," if len(value) == 1 and isinstance(value, tuple) else ""
+        return f"{ends[0]}{', '.join(map(_written, value))}{comma}{ends[1]}"
+    if hasattr(value, "tolist"):
+        return repr(value.tolist())
+    name = getattr(value, "name", getattr(value, "folder", None))
+    return repr(value) if name is None or isinstance(value, str) else str(name)

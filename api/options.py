@@ -1,0 +1,121 @@
+"""The arguments and options that several verbs share, each declared once: its type, its limits and its help.
+
+Types are what Python takes; the command line reads words, which the functions of `values` make something of.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, TypedDict
+
+from cyclopts import Parameter
+from cyclopts.validators import Number
+
+ARGUMENT = "argument"  # marks what stands on the command line without the name of an option
+
+
+def at_least(value: float, **more: Any) -> Parameter:
+    """Limit a number from below."""
+    return Parameter(validator=Number(gte=value, **more))
+
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+    from torch import Tensor
+
+    from ..envs.base import Fidelity
+
+    Point = str | Float[Tensor, " dim"]
+    Points = Point
+    Window = float | str | tuple[float, float]
+    Share = float | str
+    Settings = Mapping[str, Any] | Sequence[str]
+    MethodSettings = Mapping[str, Mapping[str, Any]] | Sequence[str]
+    Names = str | Sequence[str]
+    Dims = Sequence[int | str]
+    Stride = bool | int | None
+    Widths = float | Sequence[float]
+    FidelityName = str | Fidelity
+    Resolution = int | Sequence[int]
+    Parameter_ = int | str
+else:
+    Point = Points = Window = Share = FidelityName = Parameter_ = str
+    Names = Settings = MethodSettings = list[str]
+    Dims = Annotated[list[str], Parameter(consume_multiple=(1, 2))]
+    Stride = Annotated[int, Parameter(negative_none="no-", show_default=False)]
+    Widths = list[float]
+    Resolution = int
+
+Scene = Annotated[Any, ARGUMENT, Parameter(name="env")]
+"""What every function takes for a simulator: the name of a scene, FILE.py:NAME, an environment (`gs.from_torch` and
+its like make one of a function) or its class, a `SceneSpec`, or an object of one's own with `space` and `evaluate`."""
+
+Count = Annotated[int, at_least(1)]
+Budget = Annotated[int, at_least(1)]
+Side = Annotated[Resolution, at_least(2)]
+Seed = Annotated[int, at_least(0)]
+Out = Annotated[str | Path | None, Parameter(help="Folder of the results; by default one named after them, in out/.")]
+Force = Annotated[bool, Parameter(help="Replace what is in the folder already.")]
+FigureWidth = Annotated[
+    Widths,
+    Parameter(
+        validator=Number(gte=80, lte=400),
+        help="Also write the figure for print, as PDF and SVG of this width [mm]: 85 for a column, 170 for a page. "
+        "It may be repeated.",
+    ),
+]
+Scheduler = Annotated[
+    str | None,
+    Parameter(
+        help="Compute on Dask workers: the address of a scheduler, or local:N for N workers on this machine. "
+        "local alone starts one per GPU, or per core."
+    ),
+]
+Device = Annotated[str, Parameter(help="Device to compute on: auto, cpu or cuda. auto takes CUDA if there is a GPU.")]
+Gradients = Annotated[
+    Stride | None,
+    Parameter(
+        name="--gradients", help="Compute gradients only at every N-th sample per axis; none with --no-gradients."
+    ),
+]
+Of = Annotated[
+    Any,
+    Parameter(
+        name="--env",
+        help="The simulator that the slice was sampled from, as FILE.py:NAME, if it is not a registered environment.",
+    ),
+]
+Data = Annotated[
+    str | Path | None,
+    Parameter(help="Folder with the data of the figures. The default is that of a checkout, else out/gallery-data."),
+]
+
+
+class SceneKeywords(TypedDict, total=False):
+    """The keywords of every function that simulates a scene: those of `SceneSpec`, with its defaults."""
+
+    fidelity: Annotated[
+        FidelityName | None,
+        Parameter(help="Accuracy of the simulation: draft, standard or reference. The default is the cheapest."),
+    ]
+    tolerance: Annotated[
+        str | None,
+        Parameter(
+            help="Pick the fastest fidelity whose measured loss error is below this: 5% of the spread of losses, or "
+            "a number in their unit. `landscape study fidelity` measures the errors."
+        ),
+    ]
+    device: Device
+    engine: Annotated[
+        str | None,
+        Parameter(
+            help="Engine that simulates. The default is the first of the environment, usually warp; some also have "
+            "taichi, as an independent reference."
+        ),
+    ]
+    deterministic: Annotated[bool, Parameter(help="Fail if the engine is not reproducible on a GPU.")]
+    options: Annotated[
+        Settings,
+        Parameter(name="--set", help="An option of the environment, as name=value. It may be repeated."),
+    ]

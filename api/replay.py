@@ -1,0 +1,53 @@
+"""`gs.replay`: simulate an episode, and draw it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated, Unpack
+
+from cyclopts import Parameter
+
+from .call import current, verb
+from .options import FigureWidth, Out, Point, Scene, SceneKeywords
+from .scene import environment
+from .values import as_path, as_widths
+
+if TYPE_CHECKING:
+    from ..jobs.episode import EpisodeSummary
+
+
+@verb
+def replay(
+    scene: Scene,
+    *,
+    params: Point = "center",
+    film: Annotated[bool, Parameter(negative="--no-film")] = True,
+    figure_width_mm: FigureWidth = (),
+    out: Out = None,
+    **keywords: Unpack[SceneKeywords],
+) -> EpisodeSummary:
+    """Simulate one episode, draw it and film it.
+
+    The folder then holds episode.png (key frames side by side), episode.mp4 and episode.gif (films), episode.rrd (a
+    3-D scene, which `landscape view` opens) and episode.json (parameters, loss and settings).
+
+    Raises ValueError for what the scene does not have, and where it has no episodes to draw.
+
+    Example: landscape replay fluid --params example:scoop
+
+    Parameters
+    ----------
+    scene
+        The environment: a name that `landscape envs` lists, or FILE.py:NAME for a simulator in a file of your own.
+    params
+        Parameters of the episode: center, random:SEED, example:NAME, best:RUN or a file of numbers.
+    film
+        Also film the episode, which takes about a minute.
+    """
+    from ..jobs.episode import EpisodeJob
+
+    call = current()
+    env = environment(scene, keywords)
+    job = EpisodeJob.of(
+        env, params, command=call.command, out=as_path(out), film=film, prints=as_widths(figure_width_mm)
+    )
+    return job.run(call.watch)

@@ -1,0 +1,134 @@
+"""`gs.report`: what a landscape is like, in numbers and in words, with the paper's."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Unpack
+
+from cyclopts import Parameter
+
+from .call import current, verb
+from .options import ARGUMENT, Data, FigureWidth, Of, Out, Scene, SceneKeywords, Seed, at_least
+from .scene import environment, spec_of
+from .values import as_path, as_widths
+
+if TYPE_CHECKING:
+    from ..jobs.report import ReportedSlice
+    from ..jobs.report_record import Report, Reports
+
+
+@verb
+def report(
+    what: Annotated[Any, ARGUMENT] = None,
+    *,
+    env: Of = None,
+    all: Annotated[bool, Parameter(name="--all")] = False,
+    points_per_axis: Annotated[int, at_least(2)] = 6,
+    seed: Seed = 0,
+    data: Data = None,
+    figure_width_mm: FigureWidth = (),
+    out: Out = None,
+    **keywords: Unpack[SceneKeywords],
+) -> Report | Reports:
+    """Measure one landscape: minima, flatness, jumps, correlation and gradient quality, with a verdict in words.
+
+    The folder then holds report.json, measures.json, gradient-quality.png and gradient-quality.npz (the data of the
+    picture). Several slices have a folder each, with report.json and the table report.md. Stop at any time: the same
+    command continues with the next slice. With --all a slice that fails is named at the end, and the exit code is 1.
+    docs/measures.md explains each number.
+
+    Raises ValueError for a slice without gradients or on no disk, for what the scene does not have, and where the
+    folder holds something else or another report; Stopped where it is interrupted.
+
+    Example: landscape report out/fluid-6-8-draft-24x24-4e5ab2
+
+    Parameters
+    ----------
+    what
+        Folder of a slice, the slice itself, or an environment: its figures of the gallery, else a slice that is sampled
+        for it.
+    all
+        Report on every figure of the gallery that is sampled.
+    points_per_axis
+        Number of points along each axis at which new evaluations test gradients.
+    seed
+        Random seed.
+    """
+    _refuse_words(what, all, keywords, env)
+    from ..gallery.files import data_folder
+    from ..gallery.paper import read_paper
+    from ..jobs.folder import REPORT, REPORTS
+    from ..jobs.report import ReportJob
+
+    call, root = current(), data_folder(data)
+    subjects, env = (_figures(root), env) if what is None else _subjects(what, root, env, points_per_axis, keywords)
+    single = what is not None and len(subjects) == 1
+    name = subjects[0].name if single else Path(str(what or "all")).name
+    job = ReportJob.open(
+        subjects, what=name, single=single, out=as_path(out), points=points_per_axis, seed=seed,
+        device=keywords.get("device", "auto"), prints=as_widths(figure_width_mm), paper=read_paper().words,
+        command=call.command, env=env,
+    )  # fmt: skip
+    found = job.run(call.watch)
+    if single:
+        call.watch.finish(job.folder, REPORT.files)
+        return found.reports[0]
+    for failed, why in found.failed.items():
+        call.watch.note(f"not reported: {failed}: {why}")
+    call.watch.finish(job.folder, [*REPORTS.files, "and a folder of each slice"])
+    return found
+
+
+def _refuse_words(what: Any, everything: bool, keywords: SceneKeywords, env: Scene) -> None:
+    """Raise ValueError unless it is said what to report on, once, and for an environment that there is not."""
+    from ..envs.registry import refuse_unknown
+
+    if (what is None) != everything:
+        raise ValueError("report takes a slice's folder, an environment, or --all for every figure of the gallery")
+    if isinstance(what, str) and not Path(what).exists():
+        spec_of(what, keywords)
+    if isinstance(env, str):
+        refuse_unknown(env)
+
+
+def _figures(root: Path) -> list[ReportedSlice]:
+    """Return the gallery's slices that are sampled. Raises ValueError where none is."""
+    from ..gallery.figures import read_figures
+    from ..jobs.report import ReportedSlice
+
+    there = [ReportedSlice.of(root / figure.id) for figure in read_figures() if _is_finished(root / figure.id)]
+    if not there:
+        raise ValueError(f"{root} holds no figures yet; `landscape gallery compute` samples them")
+    return there
+
+
+def _subjects(
+    what: Any, root: Path, env: Scene, points: int, keywords: SceneKeywords
+) -> tuple[list[ReportedSlice], Scene]:
+    """Return a slice, or an environment's figures, or a slice sampled now for want of any; and its simulator."""
+    from ..gallery.figures import read_figures
+    from ..jobs.report import ReportedSlice, sample_subject
+    from ..landscapes.slice import Slice
+
+    if isinstance(what, Slice):
+        if what.folder is None:
+            raise ValueError("report takes a slice on disk; this one is in memory alone, so use its own report()")
+        return [ReportedSlice.of(what.folder)], env or (what.remake() if what.remake else None)
+    if isinstance(what, Path) or (isinstance(what, str) and Path(what).exists()):
+        return [ReportedSlice.of(Path(what))], env
+    call = current()
+    if call.on_disk and keywords.keys() <= {"fidelity", "device"}:
+        fidelity = keywords.get("fidelity")
+        figures = [one for one in read_figures() if one.env == what and fidelity in (None, one.fidelity)]
+        if found := [ReportedSlice.of(root / one.id) for one in figures if _is_finished(root / one.id)]:
+            return found, env
+    made = environment(what, keywords)
+    return [sample_subject(made, points, call.command, call.watch)], made
+
+
+def _is_finished(folder: Path) -> bool:
+    from ..jobs.folder import SLICE_STORE
+    from ..landscapes.storage.paths import is_slice
+    from ..landscapes.storage.store import SliceStore
+
+    return is_slice(folder / SLICE_STORE) and not SliceStore.open(folder / SLICE_STORE).pending()

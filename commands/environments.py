@@ -1,0 +1,94 @@
+"""What there is: environments, methods, versions and devices."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from .terminal import Console, table
+
+if TYPE_CHECKING:
+    from ..api.info import Info
+    from ..envs.base import Environment
+    from ..envs.registry import Entry
+    from ..optim.base import Optimizer
+    from ..optim.registry import Method
+
+
+def show_entries(found: list[Entry], console: Console) -> None:
+    """Print every registered environment as a row of a table.
+
+    One whose engine is not installed is grey, and below is what installs it.
+    """
+    from ..envs.registry import installs
+
+    shown = table("name", "dim", "parameters", "model", "fidelities", title="environments")
+    for entry in found:
+        style = "dim" if installs(entry) else None
+        shown.add_row(entry.name, entry.dim, entry.parameters, entry.model, ", ".join(entry.fidelities), style=style)
+    console.print(shown)
+    for line in sorted({installs(entry) for entry in found} - {""}):
+        names = ", ".join(entry.name for entry in found if installs(entry) == line)
+        console.print(f"not installed: {names}; {line}", markup=False, soft_wrap=True)
+    console.print("`landscape envs NAME` shows one in full: bounds, options, examples, fidelities, what it models.")
+
+
+def show_environment(env: Environment, console: Console) -> None:
+    """Print all there is to know about one environment."""
+    from ..gallery.paper import read_paper
+    from ..jobs.margins import say_margins
+    from ..landscapes.options import in_full
+    from ..landscapes.space import LOG10
+
+    console = Console(soft_wrap=True, highlight=False)
+    about = env.about() or "It says nothing of itself: its class has no docstring."
+    console.print(f"{env.name}: {env.space.dim} parameter{'s' if env.space.dim > 1 else ''}\n\n{about}\n")
+    bounded = table("no.", "parameter", "lower", "upper", "unit")
+    space = env.space
+    lower, upper = (space.to_values(end).tolist() for end in (space.lower, space.upper))
+    rows = zip(space.names, space.scales, lower, upper, space.units, strict=True)
+    for number, (one, scale, low, high, unit) in enumerate(rows):
+        label = f"{one} (logarithmic)" if scale == LOG10 else one
+        bounded.add_row(str(number), label, f"{low:g}", f"{high:g}", unit)
+    console.print(bounded)
+    for fidelity in env.fidelities.values():
+        console.print(f"fidelity {fidelity.record()}")
+    console.print(f"engines: {', '.join(env.engines)}")
+    for said in say_margins(env) if any(one.dt for one in env.fidelities.values()) else ():
+        console.print(said)
+    console.print(in_full(env.Options))
+    console.print(f"examples: {', '.join(env.examples) or 'none'}")
+    if words := read_paper().words.get(env.name):
+        console.print(f"the paper says: {words}")
+
+
+def show_methods(found: list[Method], console: Console) -> None:
+    """Print every method as a row of a table."""
+    shown = table("name", "what it does", "needs", title="methods")
+    for method in found:
+        shown.add_row(method.name, method.summary, f"extra {method.extra}" if method.extra else "")
+    console.print(shown)
+    console.print("`landscape methods NAME` shows one in full: what it does, its options and their defaults.")
+
+
+def show_method(kind: type[Optimizer], console: Console) -> None:
+    """Print all there is to know about one method."""
+    import inspect
+
+    from ..landscapes.options import in_full
+    from ..optim.registry import find_method
+
+    texts = [find_method(kind.name).summary, inspect.getdoc(kind) or ""]
+    texts += [f"gradients: {'yes' if kind.needs_grad else 'no'}", in_full(kind.Options)]
+    Console(soft_wrap=True, highlight=False).print(f"{kind.name}: " + "\n\n".join(texts))
+
+
+def show_info(found: Info, console: Console) -> None:
+    """Print versions and devices as a table."""
+    shown = table("what", "version or name", title=f"gradscape {found.gradscape}")
+    shown.add_row("python", found.python)
+    for package, version in found.packages.items():
+        shown.add_row(package, version)
+    shown.add_row("cpu", f"{found.cores} cores for this process")
+    for name in found.gpus or ("none found",):
+        shown.add_row("cuda", name)
+    console.print(shown)

@@ -1,0 +1,99 @@
+"""What every job that leaves results in a folder does: it can be stopped, continued, watched and written down."""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
+
+from ..landscapes.convert import to_json
+from ..landscapes.storage.checkpoint import Checkpoint
+from ..landscapes.storage.files import tidy
+from ..landscapes.storage.records import write_record
+from .folder import Results
+from .studies import going_on
+from .watch import Watch, resumable
+
+if TYPE_CHECKING:
+    from ..envs.base import Environment
+
+Found = TypeVar("Found")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Job(abc.ABC, Generic[Found]):
+    """Work whose results lie in `folder`: a job computes what is missing there, draws it and writes it down.
+
+    `command` is how the results are made again; `prints` are widths of pages [mm] that the figure is also drawn for.
+    The record is the first file of its `results`, which also name the figure.
+    """
+
+    results: ClassVar[Results]
+    folder: Path
+    command: str = ""
+    prints: Sequence[float] = ()
+
+    @abc.abstractmethod
+    def compute(self, watch: Watch) -> Found:
+        """Say what is left and what it costs, compute it and return what was found."""
+
+    @abc.abstractmethod
+    def kept(self) -> str:
+        """Say how much of it is on disk."""
+
+    def run(self, watch: Watch | None = None) -> Found:
+        """Compute what is missing; draw, write and return what was found.
+
+        Raises Stopped where it is interrupted, and DiskFullError; the same job continues from what is kept then.
+        """
+        watch = watch or Watch()
+        with self.holding(watch):
+            found = self.compute(watch)
+            files = self.write(found)
+        watch.finish(self.folder, files, self.outcome(found))
+        return found
+
+    def holding(self, watch: Watch) -> AbstractContextManager[None]:
+        """Give the context to work in; that of a job that is continued also locks its folder, and verifies it."""
+        return resumable(self.kept)
+
+    def outcome(self, found: Found) -> str:
+        """Say in a line what came out."""
+        return ""
+
+    def record(self, found: Found) -> Any:
+        """Return what is written of it."""
+        return to_json(found)
+
+    def write(self, found: Found) -> list[str]:
+        """Draw and write what was found; return the names of the files."""
+        printed = self.draw(found.plot) if self.results.picture and hasattr(found, "plot") else []
+        write_record(self.folder / self.results.files[0], self.record(found))
+        tidy(self.folder)
+        return [*self.results.files, *printed]
+
+    def draw(self, plot: Callable[..., Any]) -> list[str]:
+        """Draw the figure, for a screen and for pages; return the names of those for pages."""
+        from ..landscapes.draw.figures.page import save, save_prints
+
+        path = self.folder / self.results.picture
+        save(plot(), path)
+        return save_prints(lambda width: plot(width=width), path, self.prints)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CheckpointedJob(Job[Found]):
+    """A job that keeps its parts in a checkpoint while it is not finished."""
+
+    checkpoint: Checkpoint
+
+    def holding(self, watch: Watch) -> AbstractContextManager[None]:
+        """Hold the folder, and verify what simulates against what the checkpoint began with."""
+        return going_on(self.checkpoint, self.verified, self.kept, watch)
+
+    def verified(self) -> Environment | None:
+        """Return the environment that the checkpoint is verified with; None verifies parts as they are read."""
+        return None
