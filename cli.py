@@ -6,7 +6,7 @@ import os
 import shlex
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from importlib import import_module
 from inspect import Parameter as Slot
@@ -42,6 +42,7 @@ GROUPS = {  # of the help: heading -> verbs, each with the module of `api` that 
         "pairs": "measure",
         "card": "measure",
         "bench": "measure",
+        "plan": "plan",
     },
     "Search": {"methods": "environments", "optimize": "search", "race": "search", "league": "search"},
     "Publish": {
@@ -66,7 +67,17 @@ STOPPED = 130  # the exit code of what Ctrl-C has ended
 LONG_PATH = 200  # characters of a path that an error shows
 DIMS = "--dims"
 JSON = Annotated[bool, Parameter(show_default=False, help="Print the result as one JSON object on standard output.")]
-WORDS = Parameter(negative=())
+WORDS = Parameter(negative_bool=(), negative_iterable=())
+
+
+@dataclass(frozen=True)
+class Option:
+    """An argument or an option of a verb: what is typed for it, and what help says of it."""
+
+    names: tuple[str, ...]
+    help: str
+    type: Any
+    required: bool
 
 
 @dataclass(frozen=True)
@@ -75,6 +86,7 @@ class Verb:
 
     words: str
     function: Callable[..., Any]
+    planned: bool = False
 
     @property
     def parameters(self) -> list[Slot]:
@@ -107,6 +119,17 @@ class Verb:
         call.__annotations__ = {slot.name: slot.annotation for slot in slots}
         return call
 
+    @property
+    def options(self) -> list[Option]:
+        """Its arguments and options as they are typed, arguments first."""
+        app = App(name="verb", default_command=self.command(), help_flags=(), version_flags=())
+        listed = app.assemble_argument_collection(default_parameter=WORDS, parse_docstring=True)
+        return [
+            Option(tuple(one.names), one.parameter.help or "", one.hint, bool(one.required))
+            for one in listed
+            if one.names
+        ]
+
     def help(self) -> str:
         """Return its docstring without what is for Python alone, and with the options of what shows its result."""
         said, options = _docstring(self.function)
@@ -126,7 +149,7 @@ class Verb:
         for one in _for_each_point(named):
             bars = Bars()
             with calling(Call(command_line(), bars, on_disk=True)):
-                result = self.function(*given, **one)
+                result = _plan(self.function, given, one) if self.planned else self.function(*given, **one)
                 show = shower(kind_of(result))
                 if show is not None:
                     code = max(code, show(result, Console(stderr=as_object), **shown) or 0)
@@ -136,6 +159,12 @@ class Verb:
 
             print(json.dumps(results[0] if len(results) == 1 else {f"{self.words}s": results}))
         return code
+
+
+def _plan(function: Callable[..., Any], given: Sequence[Any], named: dict[str, Any]) -> Any:
+    from .api.plan import plan
+
+    return plan(function, *given, **named)
 
 
 def _slots(function: Callable[..., Any] | None, kinds: Sequence[Any] = tuple(type(Slot.KEYWORD_ONLY))) -> list[Slot]:
@@ -217,8 +246,8 @@ def find_verb(words: str) -> Verb:
     return Verb(words, getattr(found, name, None) or getattr(found, f"{name}_"))
 
 
-def make_app(only: Sequence[str] = ()) -> App:
-    """Make the command with all verbs, or with those of `only` these words."""
+def make_app(only: Sequence[str] = (), *, planned: bool = False) -> App:
+    """Make the command with all verbs, or with those of `only` these words, which may be `planned` and not done."""
     panels = {heading: Group(heading, sort_key=number) for number, heading in enumerate(GROUPS, 1)}
     look: Any = {"default_parameter": WORDS, "help_format": "plaintext"}
     app = App(name="landscape", help=ABOUT, version=f"gradscape {__version__}", help_flags=["--help", "-h"], **look)
@@ -228,8 +257,9 @@ def make_app(only: Sequence[str] = ()) -> App:
             if only and words not in only:
                 continue
             *of, name = words.split()
+            verb = replace(find_verb(words), planned=planned)
             place: Any = {} if of else {"group": panels[heading], "sort_key": len(app._commands)}
-            (gallery if of else app).command(find_verb(words).command(), name=name, **place)
+            (gallery if of else app).command(verb.command(), name=name, **place)
     if not only or any(words.startswith("gallery ") for words in only):
         app.command(gallery)
     return app
@@ -264,10 +294,14 @@ def _run(words: list[str]) -> Any:
     for (word,) in filter(None, written):
         if word in RENAMED:
             raise ValueError(f"{word} is {RENAMED[word]} today")
+    planned = words[:1] == ["plan"] and not set(words[1:2]) <= {"-h", "--help"}
+    words = words[planned:]
     named = next(
         (name for group in GROUPS.values() for name in group if words[: len(name.split())] == name.split()), ""
     )
-    app = make_app([named] if named else ())
+    if planned and not named:
+        raise ValueError(f"plan takes a verb and its words, such as: landscape plan slice {' '.join(words)}")
+    app = make_app([named] if named else (), planned=planned)
     how: Any = {"exit_on_error": False, "print_error": False, "result_action": "return_value"}
     if DIMS not in words:
         return app(words, **how)

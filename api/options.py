@@ -43,7 +43,7 @@ else:
     Point = Points = Window = Share = FidelityName = Parameter_ = str
     Names = Settings = MethodSettings = list[str]
     Dims = Annotated[list[str], Parameter(consume_multiple=(1, 2))]
-    Stride = Annotated[int, Parameter(negative_none="no-", show_default=False)]
+    Stride = int
     Widths = list[float]
     Resolution = int
 
@@ -76,7 +76,9 @@ Device = Annotated[str, Parameter(help="Device to compute on: auto, cpu or cuda.
 Gradients = Annotated[
     Stride | None,
     Parameter(
-        name="--gradients", help="Compute gradients only at every N-th sample per axis; none with --no-gradients."
+        negative_none="no-",
+        show_default=False,
+        help="Compute gradients only at every N-th sample per axis; none with --no-gradients.",
     ),
 ]
 Of = Annotated[

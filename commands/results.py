@@ -24,6 +24,7 @@ SHOWN = {
     "list[Method]": "environments:show_methods",
     "Overlay": "overlay:show",
     "PairRanking": "pairs:show",
+    "Plan": "plan:show",
     "Race": "race:show",
     "Report": "report:show",
     "Reports": "report:show_several",

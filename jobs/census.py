@@ -19,6 +19,7 @@ from ..landscapes.storage.files import replacing
 from ..landscapes.storage.records import read_json, reading
 from .folder import CENSUS, ROOT, folder_named
 from .job import CheckpointedJob
+from .plan import Work
 from .scene import SceneSpec, provenance
 from .watch import PREPARING, Watch
 from .workers import recipe
@@ -118,6 +119,20 @@ class CensusJob(CheckpointedJob["Census"]):
         many = len(self.design.cuts)
         again = [Task(f"other-{n}", n, True) for n, (b, c) in enumerate(self.design.places) if c == b % many]
         return whole + (again if self.other else [])
+
+    def work(self) -> list[Work]:
+        """Return the samples of all slices, and what their noise is measured by."""
+        without, having = self.design.samples
+        tasks, noise = self.tasks, NOISE_POINTS * (1 + REPEATS)
+        works = []
+        for env, count in (
+            (self.env, sum(not task.other for task in tasks)),
+            (self.other, sum(t.other for t in tasks)),
+        ):
+            if env is not None:
+                bytes_ = 8.0 * count * (without + having + having * env.space.dim)
+                works.append(Work(env, count * without + (noise if env is self.env else 0), count * having, bytes_))
+        return works
 
     def compute(self, watch: Watch) -> Census:
         """Survey what is missing, and return the census."""

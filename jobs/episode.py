@@ -14,6 +14,7 @@ from ..landscapes.objective import Status, failed, has_loss
 from ..landscapes.storage.files import tidy, write_json
 from .folder import EPISODE, folder_named
 from .job import Job
+from .plan import Work
 from .scene import named_point, provenance
 from .watch import Watch
 
@@ -80,6 +81,10 @@ class EpisodeJob(Job[EpisodeSummary]):
             env=env, x=x, source=params if isinstance(params, str) else "a point", folder=folder, command=command,
             film=film, prints=prints,
         )  # fmt: skip
+
+    def work(self) -> list[Work]:
+        """Return the episode, simulated once to draw it and once for its loss."""
+        return [Work(self.env, 2)]
 
     def compute(self, watch: Watch) -> EpisodeSummary:
         """Simulate the episode, draw it and return what came out.

@@ -14,6 +14,7 @@ from ..landscapes.storage.checkpoint import Checkpoint
 from ..landscapes.storage.files import tidy
 from ..landscapes.storage.records import write_record
 from .folder import Results
+from .plan import Work
 from .studies import going_on
 from .watch import Watch, resumable
 
@@ -44,12 +45,17 @@ class Job(abc.ABC, Generic[Found]):
     def kept(self) -> str:
         """Say how much of it is on disk."""
 
+    def work(self) -> list[Work]:
+        """Return what it has to simulate."""
+        return []
+
     def run(self, watch: Watch | None = None) -> Found:
         """Compute what is missing; draw, write and return what was found.
 
         Raises Stopped where it is interrupted, and DiskFullError; the same job continues from what is kept then.
         """
         watch = watch or Watch()
+        watch.plan(self.work())
         with self.holding(watch):
             found = self.compute(watch)
             files = self.write(found)

@@ -13,6 +13,7 @@ from ..landscapes.measures.sensitivity import Design, Pair, default_samples, exp
 from ..landscapes.storage.checkpoint import Checkpoint
 from .folder import PAIRS, ROOT, folder_named
 from .job import CheckpointedJob
+from .plan import Work
 from .scene import SceneSpec, provenance
 from .watch import PREPARING, Watch
 
@@ -119,6 +120,13 @@ class PairsJob(CheckpointedJob[PairRanking]):
             env=env, design=Design.sobol(env.space, samples, seed=seed), identity=identity, checkpoint=checkpoint,
             folder=folder, options=scene.options, command=command,
         )  # fmt: skip
+
+    def work(self) -> list[Work]:
+        """Return its design, which has gradients at the base points."""
+        base = len(self.design.base)
+        return [
+            Work(self.env, self.design.episodes - base, base, 8.0 * self.design.episodes * (2 + self.env.space.dim))
+        ]
 
     def compute(self, watch: Watch) -> PairRanking:
         """Evaluate what is missing, and return the ranking."""

@@ -23,7 +23,7 @@ from ..landscapes.capacity import size
 from ..landscapes.convert import to_json
 from ..landscapes.cost import duration, seconds_per_episode
 from ..landscapes.identity import with_stride
-from ..landscapes.lattice import check_gradients
+from ..landscapes.lattice import check_gradients, count_gradients
 from ..landscapes.measures.unresolved import probes, stored_unresolved
 from ..landscapes.objective import BoxedObjective, Objective, Status, failed
 from ..landscapes.plain import digest
@@ -41,6 +41,7 @@ from ..landscapes.storage.tiles import Tile
 from ..landscapes.verification import verify_dataset, verify_store
 from .folder import ROOT, SLICE, SUMMARY
 from .job import Job
+from .plan import Work
 from .scene import provenance
 from .slice_place import default_folder, identity_of
 from .slice_summary import SliceSummary, barrier_of, count_statuses, flat_points, look_between, range_of
@@ -174,6 +175,14 @@ class SliceJob(Job[SliceSummary]):
             prints=prints,
             refinement=refinement,
         )
+
+    def work(self) -> list[Work]:
+        """Return its samples, and what looks between them."""
+        shape, grad = self.plane.resolution, self.store.grad
+        having = count_gradients(shape, self.store.every if grad else 0)
+        losses = math.prod(shape) - having + probes(math.prod(shape), grad=grad and self.store.every == 1)
+        need = need_of(shape, self.plane.dim, grad=grad)
+        return [Work(self.objective, losses, having, need.disk, need.memory)]
 
     def cost(self) -> SliceCost:
         """Estimate what is left; workers that compute it do, which warms them, and leaves a GPU of theirs alone."""

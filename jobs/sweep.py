@@ -20,10 +20,11 @@ from ..landscapes.capacity import size
 from ..landscapes.convert import to_json
 from ..landscapes.cost import duration
 from ..landscapes.identity import with_stride
-from ..landscapes.lattice import check_gradients
+from ..landscapes.lattice import check_gradients, count_gradients
 from ..landscapes.objective import BoxedObjective, Objective, failed
 from ..landscapes.plain import plain_name
 from ..landscapes.sampling.fill import Progress, sample
+from ..landscapes.storage.arrays import need_of as slice_need
 from ..landscapes.storage.files import discard, tidy, visible_files, write_json
 from ..landscapes.storage.ownership import refuse_others
 from ..landscapes.storage.paths import check_replaceable, filling_path, slice_exists
@@ -31,6 +32,7 @@ from ..landscapes.storage.store import SliceStore
 from .folder import ROOT, SWEEP, folder_named
 from .job import Job
 from .motion import HORIZON, SMOOTHING, Motion, refuse_too_large
+from .plan import Work
 from .scene import provenance
 from .slice import SliceCost, estimate_cost, kind_of
 from .slice_place import MOST
@@ -189,6 +191,16 @@ class SweepJob(Job[SweepSummary]):
         objective, made = self._sampled(last)
         cost = estimate_cost(objective, self.stores[last], self.executor, made)
         return SliceCost(sum(pending.values()), cost.seconds * sum(work.values()) / work[last], cost.memory)
+
+    def work(self) -> list[Work]:
+        """Return the samples of each slice."""
+        works = []
+        for number, (store, plane) in enumerate(zip(self.stores, self.motion.planes, strict=True)):
+            having = count_gradients(plane.resolution, store.every if store.grad else 0)
+            need = slice_need(plane.resolution, plane.dim, grad=store.grad)
+            env = self.motion.env_at(number)
+            works.append(Work(env, math.prod(plane.resolution) - having, having, need.disk, need.memory))
+        return works
 
     def compute(self, watch: Watch) -> SweepSummary:
         """Sample what is missing, film it and return the summary."""

@@ -5,8 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from ..landscapes.storage.disk import until_full
+
+if TYPE_CHECKING:
+    from .plan import Work
 
 Advance = Callable[..., None]  # advance(done, said=""): so much is done, and what is said beside the bar
 AdvanceOne = Callable[[str, int, str], None]  # advance(name, done, said): the same, of one of several
@@ -25,6 +29,14 @@ class Stopped(KeyboardInterrupt):
     def __init__(self, said: str, *, kept: bool = True) -> None:
         super().__init__(said)
         self.kept = kept
+
+
+class Planned(Exception):  # noqa: N818 -- no error, but where a job would begin
+    """Say what a job would have to simulate, where it would begin."""
+
+    def __init__(self, works: Sequence[Work]) -> None:
+        super().__init__(f"{len(works)} parts of a job are planned, not done")
+        self.works = works
 
 
 @contextmanager
@@ -47,6 +59,9 @@ class Watch:
 
     def note(self, text: str) -> None:
         """Take a line that is worth keeping: what a job will cost, a warning, what it has left out."""
+
+    def plan(self, works: Sequence[Work]) -> None:
+        """Take what a job is about to simulate; a watch that only plans raises Planned."""
 
     def finish(self, folder: Path, files: Sequence[str], said: str = "") -> None:
         """Take where a job has left which files, and in a line what came out."""

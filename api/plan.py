@@ -1,0 +1,66 @@
+"""`gs.plan`: what another verb takes, before anyone starts."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from inspect import signature
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from ..jobs.watch import Planned, Watch
+from .call import calling, current, verb
+from .options import ARGUMENT
+
+if TYPE_CHECKING:
+    from ..jobs.plan import Plan, Work
+
+
+class _Planner(Watch):
+    """Take the work of the job that is about to begin, and stop it there."""
+
+    def plan(self, works: Sequence[Work]) -> None:
+        """Take what a job would do."""
+        raise Planned(works)
+
+
+@verb
+def plan(verb: Annotated[Callable[..., Any], ARGUMENT], *given: Any, **named: Any) -> Plan:
+    """Predict the episodes, time, memory and disk of another verb before computing it.
+
+    A plan is arithmetic: the episodes of the job times what an episode takes here, timed now on a few, and the bytes of
+    its files by formula. What search methods and pictures take themselves is not in it. For a CUDA device that is not
+    here, it uses rates that `landscape study fidelity` stored. It writes no file.
+
+    Raises ValueError for what the verb refuses, and where nothing is known of a device that is not here.
+
+    Example: landscape plan slice fluid --dims 6 8 --resolution 48 --fidelity standard
+
+    Parameters
+    ----------
+    verb
+        The verb to plan, followed by its own arguments and options: in Python the function, such as `gradscape.slice`.
+    """
+    call, parameters = current(), signature(verb).parameters
+    elsewhere = _elsewhere(named)
+    with tempfile.TemporaryDirectory() as folder:
+        if "out" in parameters:
+            named["out"] = str(Path(folder) / "planned")
+        try:
+            with calling(replace(call, watch=_Planner())):
+                verb(*given, **named | ({"device": "cpu"} if elsewhere else {}))
+        except Planned as planned:
+            from ..jobs.plan import plan_work
+
+            return plan_work(planned.works, call.command, call.watch, device=elsewhere)
+    raise ValueError(f"{verb.__name__} simulates nothing that could be planned: what it writes is there in seconds")
+
+
+def _elsewhere(named: dict[str, Any]) -> str | None:
+    """Return the device that is asked for and not here."""
+    if named.get("device") != "cuda":
+        return None
+    from ..envs.engines.runtime import cuda_available
+
+    return None if cuda_available() else "cuda"
