@@ -15,16 +15,19 @@ def show(found: Plan, console: Console) -> None:
     from ..landscapes.capacity import size
     from ..landscapes.cost import duration
 
-    rows = table("environment", "losses", "gradients", "s a loss", "s a gradient", "simulating", "memory", "disk")
+    rows = table("environment", "episodes", "with gradients", "time", "memory", "disk")
     for part in found.parts:
-        each = (f"{seconds:.3g}" if seconds else "" for seconds in (part.seconds_per_loss, part.seconds_per_gradient))
         name = " · ".join(filter(None, (part.env, part.fidelity, part.device)))
         memory = size(part.memory) + (f", {size(part.gpu_memory)} of the GPU" if part.gpu_memory else "")
-        counts = (str(part.losses), str(part.gradients))
-        rows.add_row(name, *counts, *each, duration(part.seconds), memory, size(part.disk))
+        counts = (str(part.losses + part.gradients), str(part.gradients))
+        rows.add_row(name, *counts, duration(part.seconds), memory, size(part.disk))
     console.print(rows)
+    for part in found.parts:
+        each = {"a loss": part.seconds_per_loss, "a gradient": part.seconds_per_gradient}
+        said = ", ".join(f"{seconds:.3g} s {what}" for what, seconds in each.items() if seconds)
+        console.print(f"{part.env}: {said}, {part.rate}", highlight=False)
     console.print(
         f"{found.episodes} episodes, {duration(found.seconds)} of simulation, {size(found.disk)} on disk; "
-        f"rates {'; '.join(dict.fromkeys(part.rate for part in found.parts))}",
+        "what pictures and search methods take is not in it",
         soft_wrap=True,
     )

@@ -123,16 +123,13 @@ class CensusJob(CheckpointedJob["Census"]):
     def work(self) -> list[Work]:
         """Return the samples of all slices, and what their noise is measured by."""
         without, having = self.design.samples
-        tasks, noise = self.tasks, NOISE_POINTS * (1 + REPEATS)
-        works = []
-        for env, count in (
-            (self.env, sum(not task.other for task in tasks)),
-            (self.other, sum(t.other for t in tasks)),
-        ):
-            if env is not None:
-                bytes_ = 8.0 * count * (without + having + having * env.space.dim)
-                works.append(Work(env, count * without + (noise if env is self.env else 0), count * having, bytes_))
-        return works
+        again = sum(task.other for task in self.tasks)
+        counts = [(self.env, len(self.tasks) - again, NOISE_POINTS * (1 + REPEATS)), (self.other, again, 0)]
+        return [
+            Work(env, count * without + noise, count * having, 8.0 * count * (without + having * (1 + env.space.dim)))
+            for env, count, noise in counts
+            if env is not None
+        ]
 
     def compute(self, watch: Watch) -> Census:
         """Survey what is missing, and return the census."""

@@ -123,10 +123,8 @@ class PairsJob(CheckpointedJob[PairRanking]):
 
     def work(self) -> list[Work]:
         """Return its design, which has gradients at the base points."""
-        base = len(self.design.base)
-        return [
-            Work(self.env, self.design.episodes - base, base, 8.0 * self.design.episodes * (2 + self.env.space.dim))
-        ]
+        base, episodes = len(self.design.base), self.design.episodes
+        return [Work(self.env, episodes - base, base, 8.0 * episodes * (2 + self.env.space.dim))]
 
     def compute(self, watch: Watch) -> PairRanking:
         """Evaluate what is missing, and return the ranking."""

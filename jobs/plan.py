@@ -107,15 +107,22 @@ def plan_work(works: Sequence[Work], command: str, watch: Watch, *, device: str 
     A `device` that is not here is planned by the rates that a study of the fidelities has kept of it. Raises ValueError
     where none is kept.
     """
-    rates: dict[tuple[int, bool], float] = {}
     parts = []
-    for work in works:
-        with watch.busy(f"{work.objective.name}: {PREPARING}"):
-            parts.append(_plan_part(work, rates, device))
+    for same in {id(work.objective): work.objective for work in works}.values():
+        mine = [work for work in works if work.objective is same]
+        whole = Work(
+            same,
+            losses=sum(work.losses for work in mine),
+            gradients=sum(work.gradients for work in mine),
+            disk=sum(work.disk for work in mine),
+            memory=max(work.memory for work in mine),
+        )
+        with watch.busy(f"{same.name}: {PREPARING}"):
+            parts.append(_plan_part(whole, device))
     return Plan(command, tuple(parts))
 
 
-def _plan_part(work: Work, rates: dict[tuple[int, bool], float], device: str | None) -> PlannedWork:
+def _plan_part(work: Work, device: str | None) -> PlannedWork:
     from .slice import peak_memory
 
     objective, identity = work.objective, work.objective.identity()
@@ -129,11 +136,7 @@ def _plan_part(work: Work, rates: dict[tuple[int, bool], float], device: str | N
         each, rate = {False: kept.forward, True: kept.with_gradient}, f"kept in {path}"
     else:
         objective.prepare()
-        for grad, count in counts.items():
-            if count and (id(objective), grad) not in rates:
-                x = objective.space.uniform(min(objective.preferred_batch, count), seed=0)
-                rates[id(objective), grad] = seconds_per_episode(objective, x, grad=grad, count=count)
-        each = {grad: rates.get((id(objective), grad), 0.0) for grad in counts}
+        each = {grad: _seconds(objective, count, grad=grad) for grad, count in counts.items()}
     episodes = objective.memory() * objective.preferred_batch
     on_gpu = (device or objective.device) == "cuda"
     return PlannedWork(
@@ -149,3 +152,11 @@ def _plan_part(work: Work, rates: dict[tuple[int, bool], float], device: str | N
         gpu_memory=episodes if on_gpu else 0,
         disk=round(work.disk),
     )
+
+
+def _seconds(objective: Objective, count: int, *, grad: bool) -> float:
+    """Return what one of so many episodes takes [s], 0 where there is none."""
+    if not count:
+        return 0.0
+    x = objective.space.uniform(min(objective.preferred_batch, count), seed=0)
+    return seconds_per_episode(objective, x, grad=grad, count=count)
