@@ -23,7 +23,6 @@ import numpy as np
 import gradscape as gs
 from gradscape.jobs.report_tables import markdown
 from gradscape.optim.comparison import LEVEL, holm, rank_test, win_probability
-from gradscape.optim.processes import processes
 from gradscape.optim.race import Competitor, race
 from gradscape.optim.registry import optimizer_class
 from gradscape.optim.runs.store import RunStore
@@ -50,8 +49,7 @@ def measure(scene: str, seeds: int, budget: int) -> dict[str, Any]:
     """Return the best loss of each run, by variant."""
     env = gs.make(scene, fidelity="standard", device="cpu")
     competitors = [_competitor(env, name, seed, budget) for name in (*VARIANTS, RANDOM) for seed in range(seeds)]
-    with processes(2):
-        race(env, competitors, budget=budget)
+    race(env, competitors, budget=budget, workers=2)
     best: dict[str, list[float]] = {}
     for one in competitors:
         best.setdefault(one.method, []).append(float(one.run.best_loss))

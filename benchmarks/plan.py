@@ -105,7 +105,6 @@ def race_ratios(folder: Path) -> dict[str, float]:
     from gradscape.jobs.race import RaceJob
     from gradscape.jobs.scene import SceneSpec
     from gradscape.landscapes.threads import one_torch_thread
-    from gradscape.optim.processes import processes
     from gradscape.optim.race import race
 
     scene, workers = SceneSpec("bounce", "draft", device="cpu"), cores()
@@ -113,8 +112,8 @@ def race_ratios(folder: Path) -> dict[str, float]:
     env = scene.make()
     job = RaceJob.of(env, RACERS, budget=BUDGET, seeds=SEEDS, command="", out=folder / "race")
     timed, began = Timed(env), time.perf_counter()
-    with one_torch_thread(), processes(workers):
-        race(timed, job.competitors, budget=BUDGET, gradient_cost=1.0)
+    with one_torch_thread():
+        race(timed, job.competitors, budget=BUDGET, gradient_cost=1.0, workers=workers)
     wall = time.perf_counter() - began
     return {
         "work": (plan.simulating + plan.searching) / wall,

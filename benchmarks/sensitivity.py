@@ -28,7 +28,6 @@ from gradscape.landscapes.storage.records import write_record
 from gradscape.landscapes.threads import one_torch_thread
 from gradscape.optim.bootstrap import interval
 from gradscape.optim.comparison import difference
-from gradscape.optim.processes import processes
 from gradscape.optim.race import Competitor, race
 from gradscape.optim.runs.store import RunStore
 
@@ -48,7 +47,7 @@ def settings_of(varied: Sequence[str]) -> dict[str, dict[str, str]]:
 
 
 def best_losses(
-    env: Environment, method: str, settings: dict[str, dict[str, str]], budget: int, seeds: int
+    env: Environment, method: str, settings: dict[str, dict[str, str]], budget: int, seeds: int, workers: int
 ) -> dict[str, list[float]]:
     """Return the best loss of every seed with each setting, NaN where none succeeded."""
     identity = {"objective": env.name, "method": method}
@@ -63,7 +62,7 @@ def best_losses(
         for name, options in settings.items()
     ]
     with one_torch_thread():
-        race(env, field, budget=budget)
+        race(env, field, budget=budget, workers=workers)
     return {name: [one.run.best_loss for one in field if one.method == name] for name in settings}
 
 
@@ -100,8 +99,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     settings = settings_of(asked.vary or VARIED)
     for name in asked.env:
         env = make(name, fidelity=asked.fidelity, device=asked.device)
-        with processes(asked.workers):
-            found = best_losses(env, asked.method, settings, asked.budget, asked.seeds)
+        found = best_losses(env, asked.method, settings, asked.budget, asked.seeds, asked.workers)
         record: dict[str, Any] = {**vars(asked), "out": str(asked.out), "env": name, "best": found}
         asked.out.mkdir(parents=True, exist_ok=True)
         write_record(asked.out / f"{name}.json", record)

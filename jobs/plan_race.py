@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING, Any
 from ..landscapes.cost import duration, seconds_per_episode
 from ..landscapes.space import as_whole
 from ..landscapes.threads import one_torch_thread
+from ..optim.dry_run import BLOCK, DryRun, dry_run
 from ..optim.memory import SearchSize, run_need
-from ..optim.processes import worth_starting
-from ..optim.race import ABREAST
+from ..optim.processes import workers_worth
+from ..optim.race import MAX_ABREAST
 from ..optim.registry import optimizer_class
-from ..optim.rehearsal import BLOCK, Rehearsal, rehearse
 from .methods import able_methods, check_methods, require_room
 from .plan import HERE, make_here
 from .scene import SceneSpec
@@ -42,25 +42,22 @@ class Rate:
 
 
 @dataclass(frozen=True)
-class Own:
-    """What a method takes itself over all its runs [s]: `here`, one run after another, and `apart`, beside each other.
+class MethodOverhead:
+    """The time a method takes itself over all its runs [s]: `serial`, and `parallel`, shared by so many `processes`."""
 
-    `beside` of its runs at most are computed at once, each by a process.
-    """
-
-    here: float
-    apart: float
-    beside: int
+    serial: float
+    parallel: float
+    processes: int
 
     @property
     def wall(self) -> float:
-        """What passes meanwhile [s]."""
-        return self.here + self.apart / self.beside
+        """The wall time [s]."""
+        return self.serial + self.parallel / self.processes
 
 
 @dataclass(frozen=True)
-class Load:
-    """Say what a race simulates: episodes without gradient and with, and in how many batches, each of so many rows."""
+class Workload:
+    """What a race simulates: episodes without gradient and with, number of batches and rows per batch."""
 
     forward: int
     gradient: int
@@ -72,15 +69,15 @@ class Load:
         return -(-self.forward // self.batches), -(-self.gradient // self.batches)
 
     @classmethod
-    def of(cls, rehearsed: Mapping[str, Rehearsal], left: Mapping[str, Sequence[int]]) -> Load:
+    def of(cls, seen: Mapping[str, DryRun], left: Mapping[str, Sequence[int]]) -> Workload:
         """Add up what the runs of methods have `left`: in lockstep, so that the one with most proposals lasts longest.
 
-        No more than `ABREAST` runs go on at a time.
+        At most `MAX_ABREAST` runs go on at a time.
         """
         whole = {method: sum(left[method]) for method in left}
-        gradient = sum(round(whole[method] * rehearsed[method].gradients) for method in left)
-        waves = -(-sum(map(len, left.values())) // ABREAST)
-        longest = max(max(left[method], default=0) / rehearsed[method].together for method in left)
+        gradient = sum(round(whole[method] * seen[method].gradient_share) for method in left)
+        waves = -(-sum(map(len, left.values())) // MAX_ABREAST)
+        longest = max(max(left[method], default=0) / seen[method].proposal_size for method in left)
         return cls(sum(whole.values()) - gradient, gradient, max(1, waves * round(longest)))
 
 
@@ -92,9 +89,9 @@ class RacePlan:
     runs included. `memory` is of the host, `gpu` of the device, `disk` what results take.
     """
 
-    load: Load
+    load: Workload
     rate: Rate
-    own: Mapping[str, Own]
+    own: Mapping[str, MethodOverhead]
     start: float = 0.0
     memory: int = 0
     gpu: int = 0
@@ -216,21 +213,21 @@ def plan_race(
 
     `makers` make each method. Raises ValueError where nothing is known of a `device` other than the environment's.
     """
-    workers = worth_starting(workers, max((max(runs, default=0) for runs in left.values()), default=0))
+    workers = workers_worth(workers, max((max(runs, default=0) for runs in left.values()), default=0))
     with TemporaryDirectory() as folder:
-        rehearsed = {}
+        seen = {}
         for method, make in makers.items():
             (Path(folder) / method).mkdir()
-            rehearsed[method] = rehearse(env, make, budget, Path(folder) / method)
-    load = Load.of(rehearsed, left)
+            seen[method] = dry_run(env, make, budget, Path(folder) / method)
+    load = Workload.of(seen, left)
     rate, gpu = _rate(env, load, device or env.device)
     need = run_need(env.space.dim, budget).times(sum(map(len, left.values())))
     size = SearchSize(env.space.dim, env.decisions, budget)
     model = max(type(made).memory(asdict(made.options), size) for made in (make() for make in makers.values()))
     processes = peak_memory() * (
-        workers if workers > 1 and any(pace.apart for one in rehearsed.values() for pace in one.paces) else 0
+        workers if workers > 1 and any(step.parallel for one in seen.values() for step in one.steps) else 0
     )
-    own = {method: own_time(rehearsed[method], left[method], budget, workers) for method in left}
+    own = {method: own_time(seen[method], left[method], budget, workers) for method in left}
     memory = round(peak_memory() + need.memory + workers * model) + processes
     return RacePlan(load, rate, own, start, memory, gpu, round(need.disk))
 
@@ -263,13 +260,14 @@ def worth_rehearsing(left: Mapping[str, Sequence[int]]) -> bool:
     return bool(left) and sum(map(sum, left.values())) >= 4 * BLOCK * len(left)
 
 
-def own_time(rehearsed: Rehearsal, left: Sequence[int], budget: int, workers: int) -> Own:
+def own_time(seen: DryRun, left: Sequence[int], budget: int, workers: int) -> MethodOverhead:
     """Return what a method's runs take of their own, that have so many episodes left of a budget."""
-    parts = [rehearsed.seconds(budget - episodes, budget) for episodes in left]
-    return Own(sum(here for here, _ in parts), sum(apart for _, apart in parts), max(1, min(workers, len(left))))
+    parts = [seen.seconds(budget - episodes, budget) for episodes in left]
+    processes = max(1, min(workers, len(left)))
+    return MethodOverhead(sum(serial for serial, _ in parts), sum(parallel for _, parallel in parts), processes)
 
 
-def _rate(env: Environment, load: Load, device: str) -> tuple[Rate, int]:
+def _rate(env: Environment, load: Workload, device: str) -> tuple[Rate, int]:
     """Return what an episode takes in the batches of a race on a device, and the device's memory for one."""
     from .tolerance import find_variant
 
