@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -263,14 +262,12 @@ def _abreast(env: Environment) -> int:
 
 
 def _survey(env: Any, group: Sequence[tuple[str, Plane]], how: Mapping[str, Any]) -> list[Piece]:
-    """Survey slices, what all of them ask simulated in one batch, and return what their pieces hold."""
+    """Survey slices, their points simulated in one batch, and return what their pieces hold."""
     from ..landscapes.measures.census import survey
-    from ..optim.meeting import Meeting, work_abreast
+    from ..landscapes.sampling.memory import MemoryBound
 
-    def work(piece: str, plane: Plane, meeting: Meeting) -> Piece:
-        return piece, survey(meeting, plane, **how).arrays()
-
-    return work_abreast(env, [partial(work, *one) for one in group])
+    found = survey(MemoryBound(env), [plane for _, plane in group], **how)
+    return [(piece, one.arrays()) for (piece, _), one in zip(group, found, strict=True)]
 
 
 def _survey_there(there: bytes, group: Sequence[tuple[str, Plane]], how: Mapping[str, Any]) -> list[Piece]:

@@ -20,7 +20,7 @@ from ..landscapes.storage.locks import check_free
 from ..landscapes.storage.ownership import refuse_others
 from ..landscapes.threads import one_torch_thread
 from ..optim.claims import Claims, check_claims
-from ..optim.processes import processes, worth_starting
+from ..optim.processes import workers_worth
 from ..optim.race import Competitor, Race, name_seeds, race
 from ..optim.registry import optimizer_class
 from ..optim.runs.store import RunStore
@@ -159,9 +159,8 @@ class RaceJob:
             if self.executor:
                 self._distribute(self.executor, ratio, follow)
                 return
-            most = max(map(self._count_left, self.competitors))
-            with processes(worth_starting(self.workers, most)):
-                race(self.env, self.competitors, budget=self.budget, gradient_cost=ratio, progress=follow)
+            workers = workers_worth(self.workers, max(map(self._count_left, self.competitors)))
+            race(self.env, self.competitors, budget=self.budget, gradient_cost=ratio, workers=workers, progress=follow)
 
     def _distribute(
         self, executor: Executor, ratio: float | None, follow: Callable[[Competitor, SearchProgress], None]

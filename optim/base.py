@@ -18,10 +18,11 @@ from torch import Tensor
 from ..landscapes.objective import Evaluation, Objective
 from ..landscapes.options import NoOptions as NoOptions
 from ..landscapes.space import ParameterSpace, as_whole
+from .lockstep import Asking, answer_alone
 from .memory import FLOAT, SearchSize
 
 Points = NDArray[np.float64]
-COMMON = {"space", "seed", "options", "random", "worst", "_told_any"}  # attributes of every optimiser
+COMMON = {"space", "seed", "options", "random", "worst", "objective", "_told_any"}  # attributes of every optimiser
 
 
 class Kind(IntEnum):
@@ -67,6 +68,7 @@ class Optimizer(abc.ABC):
         self.random = np.random.default_rng(seed)
         self.worst = 0.0  # the largest finite loss so far
         self._told_any = False
+        self.objective: Objective | None = None
         self._setup()
 
     @classmethod
@@ -79,13 +81,20 @@ class Optimizer(abc.ABC):
         """Estimate what a search takes at most [bytes]; `options` holds a value for each of the method's options."""
         return 100 * FLOAT * size.dim
 
-    def attach(self, objective: Objective) -> None:  # noqa: B027 -- most methods need no more than its box
+    def attach(self, objective: Objective) -> None:
         """Take the objective in hand, for methods that ask it for more; `search` calls it, after a restart too."""
+        self.objective = objective
 
     @final
     def ask(self) -> Proposal:
         """Return the points to evaluate next, inside the box."""
-        proposal = self._ask()
+        return answer_alone(self.asking(), self.objective)
+
+    @final
+    def asking(self) -> Asking[Proposal]:
+        """Return what `ask` does, after it has yielded what has to be done before."""
+        found = self._ask()
+        proposal = found if isinstance(found, Proposal) else (yield from found)
         unit = (proposal.x.clamp(-1.0, 1.0) + 1.0) / 2.0
         x = torch.clamp(self.space.from_unit(unit), self.space.lower, self.space.upper)
         return Proposal(x, proposal.kind, proposal.grad)
@@ -166,8 +175,11 @@ class Optimizer(abc.ABC):
             setattr(self, name, value)
 
     @abc.abstractmethod
-    def _ask(self) -> Proposal:
-        """Propose points of the scaled box; those beyond it are moved to its border before they are evaluated."""
+    def _ask(self) -> Proposal | Asking[Proposal]:
+        """Propose points of the scaled box; those beyond it are moved to its border before they are evaluated.
+
+        A generator may yield requests before it returns the proposal: heavy computations, and looks at episodes.
+        """
 
     @abc.abstractmethod
     def _tell(self, z: Points, loss: Points, grad: Points | None) -> None:

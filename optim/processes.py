@@ -1,103 +1,56 @@
-"""Processes that methods compute in, beside each other: Python runs one thread at a time, whatever the cores."""
+"""Worker processes for the computations of methods: Python runs one thread at a time, whatever the cores."""
 
 from __future__ import annotations
 
-import itertools
 import multiprocessing
 import os
 import signal
 import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, TypeVar
-
-from .turns import aside
-
-if TYPE_CHECKING:
-    import numpy as np
+from typing import TypeVar
 
 Result = TypeVar("Result")
 
-WORTH = 100  # episodes left of a run; processes are not started for fewer
-
-_pools: list[ProcessPoolExecutor] = []  # of one process each
-_turns = itertools.count()  # of threads that compute for the first time
-_seat = threading.local()  # of each thread: its turn
-_seconds = 0.0  # see `seconds_computed`
+MIN_EPISODES = 100  # left of a run; processes are not started for fewer
 
 
-@contextmanager
-def processes(count: int) -> Iterator[None]:
-    """Let what is handed to `compute` meanwhile be computed by so many processes, which start as they are needed.
+class WorkerProcesses:
+    """Processes of one thread each, which start as they are needed; none where `count` is one.
 
-    Each thread has its process, which remembers what it has computed for it. With one, it is computed where it is
-    called. Results are the same to the last bit.
+    A search always has the same process, which remembers what it has computed for it.
     """
-    if count == 1 or _pools:
-        yield
-        return
-    context = multiprocessing.get_context("spawn")
-    _pools.extend(ProcessPoolExecutor(1, context, initializer=_begin) for _ in range(count))
-    try:
-        yield
-    finally:
-        pools = _pools.copy()
-        _pools.clear()
-        for pool in pools:
+
+    def __init__(self, count: int) -> None:
+        context = multiprocessing.get_context("spawn")
+        many = range(count if count > 1 else 0)
+        self._pools = [ProcessPoolExecutor(1, context, initializer=_prepare_process) for _ in many]
+        self._turns: dict[int, int] = {}  # by search, in the order in which they computed first
+
+    def __enter__(self) -> WorkerProcesses:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for pool in self._pools:
             pool.shutdown(wait=False, cancel_futures=True)
-        for pool in pools:
+        for pool in self._pools:
             pool.shutdown()
 
-
-def worth_starting(count: int, episodes: int) -> int:
-    """Return how many of `count` processes are worth starting for runs that have so many episodes left at most."""
-    return count if episodes > WORTH else 1
-
-
-def compute(function: Callable[..., Result], *arguments: Any) -> Result:
-    """Return what a function of a module returns, computed by a process if there are any, and here otherwise."""
-    global _seconds
-    if _pools:
-        found = _pool().submit(function, *arguments)
-        with aside():
-            return found.result()
-    began = time.perf_counter()
-    result = function(*arguments)
-    _seconds += time.perf_counter() - began
-    return result
+    def submit(self, search: int, function: Callable[[], Result]) -> Callable[[], Result]:
+        """Let a function be computed for a search; return what waits for its result, or computes it here."""
+        if not self._pools:
+            return function
+        turn = self._turns.setdefault(search, len(self._turns))
+        return self._pools[turn % len(self._pools)].submit(function).result
 
 
-def _pool() -> ProcessPoolExecutor:
-    """Return the process of the thread that calls this."""
-    if not hasattr(_seat, "turn"):
-        _seat.turn = next(_turns)
-    return _pools[int(_seat.turn) % len(_pools)]
+def workers_worth(workers: int, episodes: int) -> int:
+    """Return how many of so many workers are worth starting for runs that have so many episodes left at most."""
+    return workers if episodes > MIN_EPISODES else 1
 
 
-def seconds_computed() -> float:
-    """Return how long `compute` has taken here [s]: what processes would take over. It is of one thread's calls."""
-    return _seconds
-
-
-def compute_drawing(random: np.random.Generator, function: Callable[..., Result], *arguments: Any) -> Result:
-    """Return what function(*arguments, random) returns, by `compute`; `random` draws the same numbers wherever."""
-    result: Result
-    result, drawn = compute(_draw, random, function, arguments)
-    random.bit_generator.state = drawn
-    return result
-
-
-def _draw(
-    random: np.random.Generator, function: Callable[..., Result], arguments: tuple[Any, ...]
-) -> tuple[Result, Any]:
-    result = function(*arguments, random)
-    return result, random.bit_generator.state
-
-
-def _begin() -> None:
-    """Prepare a process: one thread, deaf to an interrupt, which the first process answers, and gone with that one.
+def _prepare_process() -> None:
+    """Prepare a process: one thread, deaf to an interrupt, which its parent answers, and gone with its parent.
 
     Linear algebra of scipy, not loaded yet, would wait for threads of its own at every step of L-BFGS.
     """
@@ -106,11 +59,11 @@ def _begin() -> None:
 
     torch.set_num_threads(1)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_follow_the_first, daemon=True).start()
+    threading.Thread(target=_follow_parent, daemon=True).start()
 
 
-def _follow_the_first() -> None:
-    first = multiprocessing.parent_process()
-    if first is not None:
-        first.join()
+def _follow_parent() -> None:
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
         os._exit(1)

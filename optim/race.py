@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
@@ -17,10 +18,10 @@ from ..landscapes.cost import episode_cost
 from ..landscapes.objective import Objective
 from .base import Optimizer
 from .curves import Tables, final_losses
-from .meeting import Meeting, work_abreast
+from .lockstep import Lockstep
 from .runs.run import Run
 from .runs.store import RunStore
-from .search import SearchProgress, search
+from .search import SearchProgress, fill
 from .statistics import RaceStatistics
 from .targets import hits
 
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
     from ..landscapes.draw.figures.page import Picture
 
 
-ABREAST = 200  # runs at most that go on in lockstep: each has a thread, and its folder is open
+MAX_ABREAST = 200  # runs that go on in lockstep: the folder of each is open
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,20 +50,20 @@ def race(
     *,
     budget: int,
     gradient_cost: float | None = None,
+    workers: int = 1,
     progress: Callable[[Competitor, SearchProgress], None] | None = None,
 ) -> None:
     """Let every competitor search until its run holds `budget` episodes; runs that do already are not touched.
 
     Runs go on in lockstep: all propose, what they propose is evaluated in one batch, and all are told. So a simulator
     that is quicker at many points at once is used well, and what comes out is what each run gives alone but for the
-    seconds, given an objective whose rows do not depend on their batch. Each run has a thread, `ABREAST` of them at
-    most at a time; the objective is only used by the thread that calls this, `progress` by any. `gradient_cost`, what
-    an episode with gradient costs in episodes without, is measured if a run needs it. Stop it at any instant: the same
-    call goes on.
+    seconds, given an objective whose rows do not depend on their batch. `MAX_ABREAST` runs go on at a time. Methods
+    compute in so many processes, `workers`. `gradient_cost`, what an episode with gradient costs in episodes without,
+    is measured if a run needs it. Stop it at any instant: the same call goes on.
     """
     left = [one for one in competitors if one.run.count < budget]
-    for start in range(0, len(left), ABREAST):
-        _run_abreast(objective, left[start : start + ABREAST], budget, gradient_cost, progress)
+    for start in range(0, len(left), MAX_ABREAST):
+        _run_abreast(objective, left[start : start + MAX_ABREAST], budget, gradient_cost, workers, progress)
 
 
 def _run_abreast(
@@ -70,21 +71,23 @@ def _run_abreast(
     left: Sequence[Competitor],
     budget: int,
     gradient_cost: float | None,
+    workers: int,
     progress: Callable[[Competitor, SearchProgress], None] | None,
 ) -> None:
     optimizers = [one.make() for one in left]
     objective.prepare()
-    pairs = zip(optimizers, left, strict=True)
+    pairs = list(zip(optimizers, left, strict=True))
     if gradient_cost is None and any(made.needs_grad and one.run.gradient_cost is None for made, one in pairs):
         gradient_cost = episode_cost(objective).ratio
-
-    def fill(optimizer: Optimizer, one: Competitor, meeting: Meeting) -> None:
-        follow = None if progress is None else partial(progress, one)
-        one.run.abreast = len(left)
-        how: dict[str, Any] = {"gradient_cost": gradient_cost, "progress": follow, "clock": meeting.clock}
-        search(meeting, optimizer, one.run, budget=budget, **how)
-
-    work_abreast(objective, [partial(fill, *pair) for pair in zip(optimizers, left, strict=True)])
+    searches = []
+    with ExitStack() as locks:
+        for made, one in pairs:
+            locks.enter_context(one.run.lock())
+            one.run.abreast = len(left)
+            follow = None if progress is None else partial(progress, one)
+            filling = fill(objective, made, one.run, budget=budget, gradient_cost=gradient_cost, progress=follow)
+            searches.append(filling)
+        Lockstep(objective, workers=workers).run(searches)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 from ..landscapes.cost import episode_cost
 from ..landscapes.identity import StoreError
-from ..landscapes.objective import Objective, evaluate
+from ..landscapes.objective import Objective
 from ..landscapes.space import as_whole
 from .base import Optimizer
+from .lockstep import Asking, Evaluate, Lockstep
 from .registry import optimizer_class
 from .runs.store import RunStore
 
@@ -36,37 +36,48 @@ def search(
     budget: int,
     gradient_cost: float | None = None,
     progress: Callable[[SearchProgress], None] | None = None,
-    clock: Callable[[], float] | None = None,
 ) -> RunStore:
     """Let a method evaluate `budget` episodes, not one more, and return the run; what it holds already is not repeated.
 
     A method is an optimiser or the name of one, made with the run's seed. Without a run one is made in memory. Stop it
     at any instant: the same call goes on, and the rows are those of an uninterrupted one but for their `seconds`, given
     an objective whose rows do not depend on their batch. A proposal that does not fit into the budget is cut short.
-    `gradient_cost` is what an episode with gradient costs in episodes without; it is measured if not given. `clock`
-    says which time [s] the rows' seconds are of; by default that on the wall.
+    `gradient_cost` is what an episode with gradient costs in episodes without; it is measured if not given.
 
     Raises ValueError for a budget, a method or a gradient cost that cannot be, and StoreError where the run on disk
     cannot be gone on from.
     """
     budget = as_whole(budget, "a budget", least=1)
+    run = _in_memory(objective, method, budget) if run is None else run
+    with run.lock():
+        filling = fill(objective, method, run, budget=budget, gradient_cost=gradient_cost, progress=progress)
+        Lockstep(objective).run([filling])
+    return run
+
+
+def fill(
+    objective: Objective,
+    method: Optimizer | str,
+    run: RunStore,
+    *,
+    budget: int,
+    gradient_cost: float | None = None,
+    progress: Callable[[SearchProgress], None] | None = None,
+) -> Asking[None]:
+    """Return the search that fills a locked run up to a budget, its optimiser restored; see `search`."""
     if gradient_cost is not None and not 0 < gradient_cost < math.inf:
         raise ValueError(f"search takes a gradient_cost above 0 and finite; got {gradient_cost}")
-    if run is None:
-        run = _in_memory(objective, method, budget)
-    with run.lock():
-        optimizer = _begin(objective, method, run, gradient_cost) if run.count < budget else None
-        resumed = run.count
+    optimizer = _begin(objective, method, run, gradient_cost) if run.count < budget else None
+    resumed = run.count
 
-        def report() -> None:
-            if progress is not None:
-                progress(SearchProgress(run.count, budget, resumed, run.failed, run.best_loss))
+    def report() -> None:
+        if progress is not None:
+            progress(SearchProgress(run.count, budget, resumed, run.failed, run.best_loss))
 
-        report()
-        if optimizer is not None:
-            run.extend(budget)
-            _fill(objective, optimizer, run, budget, report, clock or time.perf_counter)
-    return run
+    report()
+    if optimizer is not None:
+        run.extend(budget)
+    return _fill(optimizer, run, budget, report)
 
 
 def _in_memory(objective: Objective, method: Optimizer | str, budget: int) -> RunStore:
@@ -75,26 +86,20 @@ def _in_memory(objective: Objective, method: Optimizer | str, budget: int) -> Ru
     return RunStore.in_memory(objective.space, identity=identity, budget=budget)
 
 
-def _fill(
-    objective: Objective,
-    optimizer: Optimizer,
-    run: RunStore,
-    budget: int,
-    report: Callable[[], None],
-    clock: Callable[[], float],
-) -> None:
-    mark = clock()
-    complete, largest = True, 0
+def _fill(optimizer: Optimizer | None, run: RunStore, budget: int, report: Callable[[], None]) -> Asking[None]:
+    """Ask, have the points evaluated, tell and keep them; there is nothing to do without an optimiser."""
+    mark, complete, largest = 0.0, True, 0
+    if optimizer is None:
+        return
     while run.count < budget:
         if budget - run.count < largest:  # the next proposal may be cut short, and is proposed again by who goes on
             run.stage(optimizer.state)
-        proposal = optimizer.ask()
+        proposal = yield from optimizer.asking()
         _check(optimizer, len(proposal.x), grad=proposal.grad)
         largest = max(largest, len(proposal.x))
         x = proposal.x[: budget - run.count]
         complete = len(x) == len(proposal.x)
-        evaluation = evaluate(objective, x, grad=proposal.grad)
-        now = clock()
+        evaluation, now = yield Evaluate(x, proposal.grad)
         seconds, mark = now - mark, now
         if complete:
             optimizer.tell(x, evaluation)

@@ -19,13 +19,12 @@ from torch import Tensor
 from ..directions import orthonormal
 from ..identity import plane_of
 from ..lattice import count_gradients
-from ..objective import Objective, ObjectiveWrapper
+from ..objective import Objective, evaluate, in_box
 from ..plane import Plane
-from ..sampling.fill import sample
 from ..space import ParameterSpace
 from ..statistics import Estimate
 from .classify import Verdict, classify
-from .discontinuities import find_jumps
+from .discontinuities import EVALUATIONS_PER_PAIR, Jumps, find_jumps_abreast
 from .gradient_quality import compare_samples
 from .ruggedness import Ruggedness, ruggedness
 
@@ -151,28 +150,55 @@ class SurveyedSlice:
         return cls(arrays["loss"], arrays["measures"], arrays["halved"], words, int(arrays["episodes"]))
 
 
-def survey(objective: Objective, plane: Plane, *, deviation: float, seed: int, gradients: int = 1) -> SurveyedSlice:
-    """Sample and measure a slice; `deviation` [loss unit] is that of the losses' noise.
+def survey(
+    objective: Objective, planes: Sequence[Plane], *, deviation: float, seed: int, gradients: int = 1
+) -> list[SurveyedSlice]:
+    """Sample and measure slices, their points in one batch; `deviation` [loss unit] is that of the losses' noise.
 
     Measures are those of a report, without their intervals within the slice: what counts here is how they differ from
     slice to slice. Those of gradients are of every so many samples along each axis, `gradients`, and hold them against
-    the losses of all. Jumps are looked for in at most `STEEP` pairs of samples.
+    the losses of all. Jumps are looked for in at most `STEEP` pairs of samples of a slice.
     """
-    counted = _Counted(objective)
-    whole = sample_cut(counted, plane, gradients=gradients)
-    found, verdict = _measure(counted, whole, deviation, seed, jumps=True)
-    halved, _ = _measure(counted, thin_out(whole), deviation, seed, jumps=False)
-    loss = whole["loss"].to_numpy()
-    return SurveyedSlice(loss, found, halved, verdict.words, counted.asked)
+    wholes = sample_cuts(objective, planes, gradients=gradients)
+    rugged = [_ruggedness(whole, deviation) for whole in wholes]
+    least = [
+        max(_floor(whole, deviation), float(np.nan_to_num(found.range)) / (max(plane.resolution) - 1) / 2)
+        for plane, whole, found in zip(planes, wholes, rugged, strict=True)
+    ]
+    jumps = find_jumps_abreast(objective, wholes, least=least, most=STEEP, seed=seed)
+    surveyed = []
+    for plane, whole, found, steep in zip(planes, wholes, rugged, jumps, strict=True):
+        measures, verdict = _measure(whole, found, steep, deviation)
+        thin = thin_out(whole)
+        halved, _ = _measure(thin, _ruggedness(thin, deviation), None, deviation)
+        samples = plane.grid().reshape(-1, plane.dim)
+        asked = len(samples) if objective.beyond_box else int(in_box(objective.space, samples).sum())
+        loss, episodes = whole["loss"].to_numpy(), asked + EVALUATIONS_PER_PAIR * steep.checked
+        surveyed.append(SurveyedSlice(loss, measures, halved, verdict.words, episodes))
+    return surveyed
 
 
-def sample_cut(objective: Objective, plane: Plane, *, gradients: int = 1) -> xr.Dataset:
-    """Return losses and gradients of a slice, NaN where a sample has none; nothing else is said of it than its plane.
+def sample_cuts(objective: Objective, planes: Sequence[Plane], *, gradients: int = 1) -> list[xr.Dataset]:
+    """Return losses and gradients of slices, NaN where a sample has none; of each nothing else is said than its plane.
 
-    Gradients are at every so many samples along each axis, `gradients`. Raises what `sample` does.
+    Gradients are at every so many samples along each axis, `gradients`.
     """
-    found = sample(objective, plane, gradients=gradients)
-    return _dataset(plane, *(found[name].to_numpy() for name in ("loss", "grad", "status")))
+    grids = [plane.grid() for plane in planes]
+    having = torch.zeros(grids[0].shape[:2], dtype=torch.bool)
+    having[::gradients, ::gradients] = True
+    loss = torch.empty(len(planes), *having.shape, dtype=torch.float64)
+    status = torch.empty(loss.shape, dtype=torch.int8)
+    grad = torch.full((*loss.shape, grids[0].shape[2]), torch.nan, dtype=torch.float64)
+    for some in (having, ~having):
+        if bool(some.any()):
+            x = torch.cat([grid[some] for grid in grids])
+            found = evaluate(objective, x, grad=some is having)
+            loss[:, some] = found.loss.reshape(len(planes), -1)
+            status[:, some] = found.status.reshape(len(planes), -1)
+            if found.grad is not None:
+                grad[:, some] = found.grad.reshape(len(planes), -1, grad.shape[-1])
+    arrays = (loss.numpy(), grad.numpy(), status.numpy())
+    return [_dataset(plane, *(values[row] for values in arrays)) for row, plane in enumerate(planes)]
 
 
 def thin_out(whole: xr.Dataset) -> xr.Dataset:
@@ -195,13 +221,15 @@ def _dataset(plane: Plane, loss: Array, grad: Array, status: Array) -> xr.Datase
     return xr.Dataset(columns, attrs=about)
 
 
-def _measure(
-    objective: Objective, dataset: xr.Dataset, deviation: float, seed: int, *, jumps: bool
-) -> tuple[Array, Verdict]:
-    floor = 2 * deviation * math.sqrt(2 * math.log(dataset["loss"].size))
-    found = ruggedness(dataset, floor=floor, estimate=_alone)
-    least = max(floor, float(np.nan_to_num(found.range)) / (max(plane_of(dataset).resolution) - 1) / 2)
-    steep = find_jumps(objective, dataset, least=least, most=STEEP, seed=seed) if jumps else None
+def _ruggedness(dataset: xr.Dataset, deviation: float) -> Ruggedness:
+    return ruggedness(dataset, floor=_floor(dataset, deviation), estimate=_alone)
+
+
+def _floor(dataset: xr.Dataset, deviation: float) -> float:
+    return 2 * deviation * math.sqrt(2 * math.log(dataset["loss"].size))
+
+
+def _measure(dataset: xr.Dataset, found: Ruggedness, steep: Jumps | None, deviation: float) -> tuple[Array, Verdict]:
     cosine = compare_samples(dataset, deviation=deviation)["cosine"].isel(scale=0).to_numpy()
     share = steep.share.value if steep is not None else math.nan
     return _values(found, share, cosine), classify(found, steep, cosine)
@@ -233,18 +261,6 @@ def _values(found: Ruggedness, jumps: float, cosine: Array) -> Array:
             found.range,
         ]
     )
-
-
-class _Counted(ObjectiveWrapper):
-    """Count how many points within its box an objective is asked."""
-
-    def __init__(self, objective: Objective) -> None:
-        super().__init__(objective)
-        self.asked = 0
-
-    def evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool = True) -> Any:
-        self.asked += len(x)
-        return self.objective.evaluate(x, grad=grad)
 
 
 def ordered(measures: Sequence[Array]) -> list[int]:

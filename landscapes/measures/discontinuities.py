@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +21,7 @@ from ..statistics import Estimate, share
 from .records import JumpRecord, JumpsRecord
 
 HALVINGS = 12  # a gap between samples is looked into down to 1/4096 of it
+EVALUATIONS_PER_PAIR = 2 + HALVINGS
 PERSISTS = 3  # halvings over which a jump keeps more than half of its height, and a slope an eighth
 Count = Callable[[Tensor], Mapping[str, Tensor]]
 
@@ -92,19 +93,33 @@ def find_jumps(
     At most so many pairs, drawn at random from those that differ by as much, are bisected towards the larger half: a
     jump keeps its height, a slope loses half of it every time.
     """
-    plane = plane_of(dataset)
-    ends, neighbours = _steep_pairs(dataset, plane, least)
-    drawn = np.sort(np.random.default_rng(seed).permutation(len(ends))[:most])
-    low, high = (torch.from_numpy(ends[drawn][:, side]) for side in (0, 1))
-    low, high, gaps = _bisect(objective, plane, low, high)
-    decided = gaps.isfinite().all(dim=0)
-    last, earlier = gaps[-1], gaps[-1 - PERSISTS]
-    found = decided & (last >= least) & (last > earlier / 2)
-    place = (low + high)[found] / 2
-    counted = _differ(events, plane.lift(low[found]), plane.lift(high[found])) if events else None
-    return Jumps(
-        place, last[found], counted, least, neighbours, len(ends), len(drawn), int((~decided).sum())
-    )  # fmt: skip
+    (found,) = find_jumps_abreast(objective, [dataset], least=[least], most=most, seed=seed, events=events)
+    return found
+
+
+def find_jumps_abreast(
+    objective: Objective,
+    datasets: Sequence[xr.Dataset],
+    *,
+    least: Sequence[float],
+    most: int = 64,
+    seed: int = 0,
+    events: Count | None = None,
+) -> list[Jumps]:
+    """Return what `find_jumps` does of several slices, whose points are evaluated in one batch."""
+    planes = [plane_of(dataset) for dataset in datasets]
+    pairs = [_steep_pairs(*one) for one in zip(datasets, planes, least, strict=True)]
+    drawn = [ends[np.sort(np.random.default_rng(seed).permutation(len(ends))[:most])] for ends, _ in pairs]
+    bisected = _bisect(objective, planes, [torch.from_numpy(ends) for ends in drawn])
+    jumps = []
+    for plane, (ends, neighbours), bound, (low, high, gaps) in zip(planes, pairs, least, bisected, strict=True):
+        decided = gaps.isfinite().all(dim=0)
+        last, earlier = gaps[-1], gaps[-1 - PERSISTS]
+        found = decided & (last >= bound) & (last > earlier / 2)
+        counted = _differ(events, plane.lift(low[found]), plane.lift(high[found])) if events else None
+        place, undecided = (low + high)[found] / 2, int((~decided).sum())
+        jumps.append(Jumps(place, last[found], counted, bound, neighbours, len(ends), len(low), undecided))
+    return jumps
 
 
 def _steep_pairs(dataset: xr.Dataset, plane: Plane, least: float) -> tuple[NDArray[np.float64], int]:
@@ -123,12 +138,15 @@ def _steep_pairs(dataset: xr.Dataset, plane: Plane, least: float) -> tuple[NDArr
 
 
 def _bisect(
-    objective: Objective, plane: Plane, low: Float[Tensor, "pairs rank"], high: Float[Tensor, "pairs rank"]
-) -> tuple[Tensor, Tensor, Float[Tensor, "halvings pairs"]]:
+    objective: Objective, planes: Sequence[Plane], ends: Sequence[Float[Tensor, "pairs end rank"]]
+) -> list[tuple[Tensor, Tensor, Float[Tensor, "halvings pairs"]]]:
     """Halve every pair towards the larger difference; return its last ends and the difference after each halving."""
+    counts = [len(one) for one in ends]
+    low, high = torch.cat(list(ends)).unbind(dim=1)
 
     def losses(u: Float[Tensor, "pairs rank"]) -> Float[Tensor, " pairs"]:
-        return evaluate(objective, plane.lift(u), grad=False).loss
+        x = [plane.lift(part) for plane, part in zip(planes, u.split(counts), strict=True)]
+        return evaluate(objective, torch.cat(x), grad=False).loss
 
     below, above = losses(low), losses(high)  # anew: a slice may come from another device
     gaps = [(above - below).abs()]
@@ -139,7 +157,7 @@ def _bisect(
         high, above = torch.where(left[:, None], middle, high), torch.where(left, between, above)
         low, below = torch.where(left[:, None], low, middle), torch.where(left, below, between)
         gaps.append((above - below).abs() + 0 * between)  # NaN once a middle failed
-    return low, high, torch.stack(gaps)
+    return list(zip(low.split(counts), high.split(counts), torch.stack(gaps).split(counts, dim=1), strict=True))
 
 
 def _differ(events: Count, low: Float[Tensor, "jumps dim"], high: Float[Tensor, "jumps dim"]) -> Tensor | None:

@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 import torch
 
 from ..base import Kind, Optimizer, Points, Proposal
+from ..lockstep import Asking
 from ..memory import SearchSize
 from ..options import MethodOptions
 from .descent import Descent, DescentOptions
@@ -34,9 +35,10 @@ class BO(Optimizer):
     def _setup(self) -> None:
         self.surrogate = Surrogate(self.space.dim, self.options)
 
-    def _ask(self) -> Proposal:
+    def _ask(self) -> Asking[Proposal]:
         kind = Kind.ACQUISITION if self.surrogate.informed else Kind.RANDOM
-        return Proposal(torch.from_numpy(self.surrogate.minimise(self.random)[None]), kind, grad=self.needs_grad)
+        z = yield from self.surrogate.minimise(self.random)
+        return Proposal(torch.from_numpy(z[None]), kind, grad=self.needs_grad)
 
     def _tell(self, z: Points, loss: Points, grad: Points | None) -> None:
         self.surrogate.add(z, loss)
@@ -77,11 +79,11 @@ class BODescents(Optimizer):
         self.surrogate = Surrogate(self.space.dim, self.options)
         self.descent: Descent | None = None
 
-    def _ask(self) -> Proposal:
+    def _ask(self) -> Asking[Proposal]:
         kind = Kind.DESCENT
         if self.descent is None:
             kind = Kind.ACQUISITION if self.surrogate.informed else Kind.RANDOM
-            self.descent = Descent(self.surrogate.minimise(self.random), self.options)
+            self.descent = Descent((yield from self.surrogate.minimise(self.random)), self.options)
         return Proposal(torch.from_numpy(self.descent.at[None]), kind, grad=True)
 
     def _tell(self, z: Points, loss: Points, grad: Points | None) -> None:

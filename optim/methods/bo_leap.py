@@ -12,6 +12,7 @@ import torch
 from cma.sigma_adaptation import CMAAdaptSigmaCSA
 
 from ..base import Kind, Optimizer, Points, Proposal
+from ..lockstep import Asking
 from ..memory import SearchSize
 from ..options import MANY, number
 from .cmaes import Normal, population_memory
@@ -73,11 +74,12 @@ class BOLeap(Optimizer):
         self.descent: Descent | None = None
         self.spent = 0  # episodes, by this semi-local search
 
-    def _ask(self) -> Proposal:
+    def _ask(self) -> Asking[Proposal]:
         if self.descent is not None:
             return Proposal(torch.from_numpy(self.descent.at[None]), Kind.DESCENT, grad=True)
         if self.local is None or self.spent >= self.options.local_budget:
-            self.local, self.spent = SemiLocal(self.surrogate.minimise(self.random), self.options, self.random), 0
+            mu = yield from self.surrogate.minimise(self.random)
+            self.local, self.spent = SemiLocal(mu, self.options, self.random), 0
         return Proposal(torch.from_numpy(self.local.draw()), Kind.POPULATION)
 
     def _tell(self, z: Points, loss: Points, grad: Points | None) -> None:

@@ -32,6 +32,7 @@ from torch import Tensor
 
 from ...landscapes.objective import Objective
 from ..base import Kind, Optimizer, Points, Proposal
+from ..lockstep import Asking, Observe, answer_alone
 from ..memory import SearchSize
 from ..options import MethodOptions, number
 from .magnitude import LARGE
@@ -117,7 +118,6 @@ class PolicySearch(Optimizer):
 
     def _setup(self) -> None:
         self._model: Any = None
-        self._objective: Any = None
         self._scale: tuple[float, float] | None = None  # mean and deviation of the first episodes' losses
         self._generators = _seed_generators(int(self.random.integers(1 << 32)))
 
@@ -126,7 +126,7 @@ class PolicySearch(Optimizer):
 
         Raises ValueError where its decisions have not equally many controls.
         """
-        self._objective = objective
+        super().attach(objective)
         self.decisions = objective.decisions
         if self.space.dim % self.decisions:
             raise ValueError(
@@ -134,7 +134,7 @@ class PolicySearch(Optimizer):
                 f"got {self.space.dim} parameters for {self.decisions} decisions"
             )
         if self._model is None:
-            features = self._observe(self.space.center[None], 0).shape[1]
+            features = answer_alone(self._observe(self.space.center[None], 0), objective).shape[1]
             with self._own_randomness():
                 self._model = self._make_model(_Spaces(features, self.space.dim // self.decisions))
 
@@ -150,15 +150,16 @@ class PolicySearch(Optimizer):
     def _learn(self, rollout: Rollout, rewards: Numbers) -> None:
         """Train on episodes that ended with these rewards, shape (episode,)."""
 
-    def _play(self, episodes: int) -> Rollout:
+    def _play(self, episodes: int) -> Asking[Rollout]:
         """Play episodes side by side."""
-        if self._objective is None:
+        if self._model is None:
             raise ValueError(f"{self.name} plays in the objective itself; attach it before the first ask")
         self._refuse_diverged(self._model.policy.parameters())
         z = torch.zeros(episodes, self.decisions, self.space.dim // self.decisions, dtype=torch.float64)
         seen, actions = [], []
         for decision in range(self.decisions):
-            seen.append(self._observe(self.space.from_unit((z.flatten(start_dim=1) + 1) / 2), decision))
+            x = self.space.from_unit((z.flatten(start_dim=1) + 1) / 2)
+            seen.append((yield from self._observe(x, decision)))
             with self._own_randomness(), torch.no_grad():
                 actions.append(self._act(torch.from_numpy(seen[-1])).numpy())
             self._refuse_diverged([torch.from_numpy(actions[-1])])
@@ -184,11 +185,12 @@ class PolicySearch(Optimizer):
             self._learn(self._rollout, rewards.astype(np.float32))
         del self._rollout
 
-    def _observe(self, x: Tensor, decision: int) -> Numbers:
+    def _observe(self, x: Tensor, decision: int) -> Asking[Numbers]:
         """Return what is seen before a decision, shape (episode, feature); a zero where there is only one."""
         if self.decisions == 1:
             return np.zeros((len(x), 1), dtype=np.float32)
-        return np.asarray(self._objective.observe(x, decision).numpy(), dtype=np.float32)
+        seen, _ = yield Observe(x, decision)
+        return np.asarray(seen.numpy(), dtype=np.float32)
 
     @contextmanager
     def _own_randomness(self) -> Iterator[None]:
@@ -242,8 +244,8 @@ class PPO(PolicySearch):
             device="cpu",
         )
 
-    def _ask(self) -> Proposal:
-        self._rollout = self._play(self.options.episodes)
+    def _ask(self) -> Asking[Proposal]:
+        self._rollout = yield from self._play(self.options.episodes)
         return Proposal(torch.from_numpy(self._rollout.to_points()), Kind.POLICY)
 
     def _act(self, seen: Tensor) -> Tensor:
@@ -292,8 +294,8 @@ class SAC(PolicySearch):
             device="cpu",
         )
 
-    def _ask(self) -> Proposal:
-        self._rollout = self._play(1 if self._remembered else self.options.warmup)
+    def _ask(self) -> Asking[Proposal]:
+        self._rollout = yield from self._play(1 if self._remembered else self.options.warmup)
         kind = Kind.POLICY if self._remembered else Kind.RANDOM
         return Proposal(torch.from_numpy(self._rollout.to_points()), kind)
 

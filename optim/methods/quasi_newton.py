@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import math
-import weakref
 from collections.abc import Mapping
 from dataclasses import dataclass
-from queue import SimpleQueue
-from threading import Thread
-from typing import Any, ClassVar, TypeAlias
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -20,43 +17,22 @@ from ..options import MANY, MethodOptions, number
 from .descent import lacks
 
 MEMORY = 10  # pairs of steps and gradients that the Hessian is made of, as scipy's default has it
-THREAD = "L-BFGS-B"  # what threads are called in which scipy minimises
 INTERVAL, TARGET, FACTOR = 50, 0.5, 0.9  # of hops, of those accepted, of a hop's length: scipy's defaults
 
-Values: TypeAlias = "SimpleQueue[tuple[float, Points] | None]"  # losses with gradients, at last None
 
+class _Unknown(Exception):  # noqa: N818 -- no error: it takes control back from scipy
+    """Carry the point out of scipy whose loss is not known yet."""
 
-class _EndedError(Exception):
-    """Ends a minimisation that nobody wants any more."""
-
-
-def _minimise(start: Points, evaluations: int, asked: SimpleQueue[Any], values: Values) -> None:
-    """Minimise from `start`: put each point into `asked` and wait in `values` for its loss and gradient, None to end.
-
-    What scipy returns or raises is asked last.
-    """
-
-    def at(z: Points) -> tuple[float, Points]:
-        asked.put(z.copy())
-        if (known := values.get()) is None:
-            raise _EndedError
-        return known
-
-    how = {"maxcor": MEMORY, "maxfun": evaluations}
-    try:
-        asked.put(minimize(at, start, jac=True, method="L-BFGS-B", bounds=[(-1.0, 1.0)] * len(start), options=how))
-    except _EndedError:
-        pass
-    except Exception as error:
-        asked.put(error)
+    def __init__(self, z: Points) -> None:
+        self.z = z.copy()
 
 
 class LocalSearch:
     """Minimise by scipy's L-BFGS-B from `start`, in the scaled box: `at` is the point it asks for next, until `done`.
 
-    scipy calls a function and waits for its value, so it runs in a thread of its own, which is told the values. Where a
-    search is restored there is no such thread: a new one is told all that were known, for which it asks again in the
-    same order. `failed` says that it ended as scipy does not call a success.
+    scipy calls a function and wants its value at once, so every `tell` minimises from the start again, with the values
+    known so far, up to the first point that is not known: the points are the same every time. That takes 1 ms for a
+    point of a search of 100, 3 ms of 200 (50 parameters). `failed` says that it ended as scipy calls no success.
     """
 
     def __init__(self, start: Points, evaluations: int) -> None:
@@ -66,7 +42,6 @@ class LocalSearch:
         self.grad: list[Points] = []
         self.at, self.best, self.best_loss = self.start, self.start, math.inf
         self.done = self.failed = False
-        self._thread: tuple[SimpleQueue[Any], Values] | None = None
 
     def tell(self, loss: float, grad: Points) -> None:
         """Take in the loss and the gradient, shape (dim,), of the point asked for; raises whatever scipy raises.
@@ -80,47 +55,40 @@ class LocalSearch:
             least = int(np.argmin(self.loss))
             self.done, self.failed, self.best, self.best_loss = True, True, self.z[least], self.loss[least]
             return
-        asked, values = self._thread or self._begin()
-        values.put((loss, grad.copy()))
-        found = asked.get()
-        if isinstance(found, Exception):
-            raise found
-        if isinstance(found, np.ndarray):
-            self.at = found
+        try:
+            found = self._minimise()
+        except _Unknown as unknown:
+            self.at = unknown.z
         else:
             self.done, self.failed = True, not found.success
             self.best, self.best_loss = np.asarray(found.x), float(found.fun)
 
-    def _begin(self) -> tuple[SimpleQueue[Any], Values]:
-        """Start a thread, and bring it to where it waits for the last value."""
-        asked: SimpleQueue[Any] = SimpleQueue()
-        values: Values = SimpleQueue()
-        self._thread = asked, values
-        Thread(target=_minimise, args=(self.start, self.evaluations, asked, values), name=THREAD, daemon=True).start()
-        weakref.finalize(self, values.put, None)
-        asked.get()
-        for loss, grad in zip(self.loss[:-1], self.grad[:-1], strict=True):
-            values.put((loss, grad.copy()))
-            asked.get()
-        return asked, values
+    def _minimise(self) -> Any:
+        """Return scipy's result. Raises _Unknown at the first point whose loss is not known."""
+        known = zip(self.loss, self.grad, strict=True)
+
+        def at(z: Points) -> tuple[float, Points]:
+            for loss, grad in known:
+                return loss, grad.copy()
+            raise _Unknown(z)
+
+        options, box = {"maxcor": MEMORY, "maxfun": self.evaluations}, [(-1.0, 1.0)] * len(self.start)
+        return minimize(at, self.start, jac=True, method="L-BFGS-B", bounds=box, options=options)
 
     def state(self) -> dict[str, Any]:
         """Return where the search stands, as data."""
         dim = len(self.start)
-        return self._kept() | {
+        return vars(self) | {
             "z": np.array(self.z).reshape(-1, dim),
             "loss": np.array(self.loss),
             "grad": np.array(self.grad).reshape(-1, dim),
         }
 
-    def _kept(self) -> dict[str, Any]:
-        return {name: value for name, value in vars(self).items() if name != "_thread"}
-
     @classmethod
     def from_state(cls, state: Mapping[str, Any]) -> LocalSearch:
         """Return the search that had this state."""
         search = cls(state["start"], int(state["evaluations"]))
-        for name in search._kept():
+        for name in vars(search):
             value = state[name]
             setattr(search, name, list(value) if name in ("z", "grad") else value)
         search.loss = [float(loss) for loss in state["loss"]]

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..base import Points
+from ..lockstep import Asking, compute_drawing
 from ..memory import FLOAT, SearchSize
 from ..options import MANY, MethodOptions, number
-from ..processes import compute_drawing
 from .bound import NEAR, SPREAD, LowerBound, exclusive, least_point, unit
 from .fit import GROWTH, fitted, with_parameters
 from .magnitude import tame
@@ -97,11 +97,11 @@ class Surrogate:
         self._fitted, self._hyper = int(state["fitted"]), dict(state["hyper"])
         self._chosen, self._seen = state["chosen"], int(state["seen"])
 
-    def minimise(self, random: np.random.Generator) -> Points:
+    def minimise(self, random: np.random.Generator) -> Asking[Points]:
         """Return where mean - coefficient * standard deviation is least, shape (dim,); a random point before."""
         if not self.informed:
             return np.asarray(random.uniform(-1.0, 1.0, self.z.shape[1]))
-        least, learnt = compute_drawing(random, _minimise, self)
+        least, learnt = yield from compute_drawing(random, _minimise, self)
         self.restore(learnt)
         return least
 

@@ -13,9 +13,9 @@ from linear_operator.utils.cholesky import psd_safe_cholesky
 
 from ...landscapes.space import sobol
 from ..base import Kind, Optimizer, Points, Proposal
+from ..lockstep import Asking, compute_drawing
 from ..memory import FLOAT, SearchSize
 from ..options import MANY, MethodOptions, number
-from ..processes import compute_drawing
 from .bound import exclusive
 from .surrogate import Surrogate, SurrogateOptions, surrogate_memory
 
@@ -81,13 +81,13 @@ class TuRBO(Optimizer):
         self.succeeded = self.failed = 0
         self.first: Points = self.random.uniform(-1.0, 1.0, (2 * self.space.dim, self.space.dim))
 
-    def _ask(self) -> Proposal:
+    def _ask(self) -> Asking[Proposal]:
         if len(self.first):
             return Proposal(torch.from_numpy(self.first[: self.options.batch_size].copy()), Kind.RANDOM)
         if not np.isfinite(self.surrogate.loss).any():
             z = self.random.uniform(-1.0, 1.0, (self.options.batch_size, self.space.dim))
             return Proposal(torch.from_numpy(z), Kind.RANDOM)
-        z, learnt = compute_drawing(self.random, _sample, self.surrogate, self.options, self.length)
+        z, learnt = yield from compute_drawing(self.random, _sample, self.surrogate, self.options, self.length)
         self.surrogate.restore(learnt)
         return Proposal(torch.from_numpy(z), Kind.ACQUISITION)
 

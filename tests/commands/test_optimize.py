@@ -48,7 +48,7 @@ def test_a_method_with_gradients_says_what_they_cost(
         clock.sleep(3.0 if grad else 1.0)
         return evaluate(env, x, grad=grad)
 
-    for module in ("optim.search", "landscapes.cost"):
+    for module in ("optim.lockstep", "landscapes.cost"):
         monkeypatch.setattr(f"gradscape.{module}.time", clock)
     monkeypatch.setattr(Environment, "evaluate", slow)
     command = ["optimize", "bounce", "--method", "descents", "--budget", "8", "--out", "run", "--json"]

@@ -12,27 +12,27 @@ import pytest
 import torch
 
 import gradscape
-from gradscape.jobs.plan_race import Load, RacePlan, Rate, own_time
+from gradscape.jobs.plan_race import RacePlan, Rate, Workload, own_time
 from gradscape.jobs.search import make_optimizer
 from gradscape.landscapes.objective import Evaluation
-from gradscape.optim import rehearsal
+from gradscape.optim import dry_run as timing
 from gradscape.optim.base import Optimizer
+from gradscape.optim.dry_run import BLOCK, MIN_KNOWN, WARM_UP, DryRun, StepTime, SyntheticObjective, dry_run, places
 from gradscape.optim.methods import surrogate
 from gradscape.optim.registry import methods
-from gradscape.optim.rehearsal import BLOCK, LEAST, LOADING, MadeUp, Pace, Rehearsal, places, rehearse
 
 from ..clock import Clock
 from ..command import Said
 
 SHORT = ["plan", "branin", "--methods", "random,descents", "--seeds", "2", "--budget", "8"]
-STEADY = Rehearsal((Pace(100.0, 0.25, 0.5),), together=1.0, gradients=0.0)
+STEADY = DryRun((StepTime(100.0, 0.25, 0.5),), proposal_size=1.0, gradient_share=0.0)
 
 
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     """Let a rehearsal and what processes would compute pass on a clock of its own."""
     clock = Clock()
-    for module in ("optim.rehearsal", "optim.processes"):
+    for module in ("optim.dry_run", "optim.lockstep"):
         monkeypatch.setattr(f"gradscape.{module}.time", clock)
     return clock
 
@@ -45,24 +45,24 @@ def plan(run: Callable[..., Said], cwd: Path, *arguments: str) -> dict[str, Any]
 
 
 def test_runs_take_what_their_episodes_took_and_processes_share_what_is_apart() -> None:
-    rising = Rehearsal((Pace(0.0, 1.0, 0.0), Pace(10.0, 2.0, 20.0)), together=1.0, gradients=0.0)
-    here, apart = rising.seconds(0, 21)
-    assert here == pytest.approx(sum(1.0 + n / 10.0 for n in range(10)) + 11 * 2.0)
-    assert apart == pytest.approx(sum(2.0 * n for n in range(10)) + 11 * 20.0)
+    rising = DryRun((StepTime(0.0, 1.0, 0.0), StepTime(10.0, 2.0, 20.0)), proposal_size=1.0, gradient_share=0.0)
+    serial, parallel = rising.seconds(0, 21)
+    assert serial == pytest.approx(sum(1.0 + n / 10.0 for n in range(10)) + 11 * 2.0)
+    assert parallel == pytest.approx(sum(2.0 * n for n in range(10)) + 11 * 20.0)
     assert rising.seconds(5, 5) == (0.0, 0.0)
     first, rest = rising.seconds(0, 7), rising.seconds(7, 21)
-    assert (first[0] + rest[0], first[1] + rest[1]) == pytest.approx((here, apart))
+    assert (first[0] + rest[0], first[1] + rest[1]) == pytest.approx((serial, parallel))
     for workers, beside in ((1, 1), (2, 2), (8, 3)):  # no more than there are runs
         own = own_time(STEADY, [40, 100, 60], 100, workers)
-        assert (own.here, own.apart, own.beside) == pytest.approx((0.25 * 200, 0.5 * 200, beside))
+        assert (own.serial, own.parallel, own.processes) == pytest.approx((0.25 * 200, 0.5 * 200, beside))
         assert own.wall == pytest.approx(50.0 + 100.0 / beside)
 
 
 def test_a_race_takes_its_rounds_its_episodes_and_its_methods() -> None:
-    many = Rehearsal((Pace(100.0, 0.01, 0.0),), together=5.0, gradients=0.5)
+    many = DryRun((StepTime(100.0, 0.01, 0.0),), proposal_size=5.0, gradient_share=0.5)
     rehearsed, left = {"one": STEADY, "many": many}, {"one": [100, 100], "many": [100, 40]}
-    load = Load.of(rehearsed, left)
-    assert load == Load(forward=200 + 70, gradient=70, batches=100)  # `one` proposes a point at a time
+    load = Workload.of(rehearsed, left)
+    assert load == Workload(forward=200 + 70, gradient=70, batches=100)  # `one` proposes a point at a time
     assert load.rows == (3, 1)
     own = {method: own_time(rehearsed[method], left[method], 100, 2) for method in left}
     found = RacePlan(load, Rate(2.0, 3.0, "given"), own, start=7.0)
@@ -77,7 +77,7 @@ def test_a_race_takes_its_rounds_its_episodes_and_its_methods() -> None:
 
 def test_runs_beyond_those_that_go_abreast_wait_for_them() -> None:
     left = {"one": [10] * 401}
-    assert Load.of({"one": STEADY}, left).batches == 3 * 10
+    assert Workload.of({"one": STEADY}, left).batches == 3 * 10
 
 
 @pytest.mark.parametrize("budget", [1, 32, 200, 1000, 30_000])
@@ -85,9 +85,9 @@ def test_a_method_that_remembers_is_rehearsed_from_the_beginning_to_nearly_the_e
     found = places(budget)
     assert found == sorted(set(found))
     assert found[0] == 0
-    assert all(LEAST <= known <= budget for known in found[1:])
+    assert all(MIN_KNOWN <= known <= budget for known in found[1:])
     assert found[-1] >= budget - BLOCK or found[-1] == budget * 7 // 8
-    assert len(found) <= 2 + math.log(max(budget, LEAST) / LEAST, 3)
+    assert len(found) <= 2 + math.log(max(budget, MIN_KNOWN) / MIN_KNOWN, 3)
 
 
 def slowed(monkeypatch: pytest.MonkeyPatch, clock: Clock, method: str) -> Callable[[], Optimizer]:
@@ -114,10 +114,10 @@ def test_what_late_proposals_take_is_known_without_going_there(
     monkeypatch: pytest.MonkeyPatch, clock: Clock, tmp_path: Path
 ) -> None:
     """Of a method whose proposals take a millisecond for each point known, a whole search is known from a few."""
-    found = rehearse(gradscape.make("branin"), slowed(monkeypatch, clock, "bo"), 600, tmp_path)
-    here, apart = found.seconds(0, 600)
-    assert (found.together, found.gradients, apart) == (1.0, 0.0, 0.0)
-    assert here == pytest.approx(sum(1e-3 * known for known in range(600)), rel=0.03)
+    found = dry_run(gradscape.make("branin"), slowed(monkeypatch, clock, "bo"), 600, tmp_path)
+    serial, parallel = found.seconds(0, 600)
+    assert (found.proposal_size, found.gradient_share, parallel) == (1.0, 0.0, 0.0)
+    assert serial == pytest.approx(sum(1e-3 * known for known in range(600)), rel=0.03)
     assert sum(1 for slept in clock.slept if slept) < 300
 
 
@@ -133,19 +133,19 @@ def test_what_processes_would_compute_is_told_apart(
 
     monkeypatch.setattr(surrogate, "_minimise", slow)
     env = gradscape.make("branin")
-    found = rehearse(env, lambda: make_optimizer("bo", env), 200, tmp_path)
-    assert len(found.paces) > 2
-    for pace in found.paces[1:]:
-        assert (pace.here, pace.apart) == pytest.approx((0.0, 0.25))
+    found = dry_run(env, lambda: make_optimizer("bo", env), 200, tmp_path)
+    assert len(found.steps) > 2
+    for step in found.steps[1:]:
+        assert (step.serial, step.parallel) == pytest.approx((0.0, 0.25))
 
 
 def test_a_method_that_forgets_is_rehearsed_once_and_no_longer_than_a_moment(
     monkeypatch: pytest.MonkeyPatch, clock: Clock, tmp_path: Path
 ) -> None:
     make = slowed(monkeypatch, clock, "random")
-    found = rehearse(gradscape.make("branin"), make, 100_000, tmp_path)
-    assert len(found.paces) == 1
-    assert clock.now < 2 * rehearsal.MOMENT + LOADING
+    found = dry_run(gradscape.make("branin"), make, 100_000, tmp_path)
+    assert len(found.steps) == 1
+    assert clock.now < 2 * timing.MAX_SECONDS + WARM_UP
 
 
 def remembering() -> Iterator[str]:
@@ -159,7 +159,7 @@ def test_a_method_that_is_informed_goes_on_as_if_it_had_asked() -> None:
     env, names = gradscape.make("branin"), list(remembering())
     assert {"bo", "bo-descents", "bo-leap", "bo-gradient"} <= set(names)
     x = env.space.uniform(30, seed=1)
-    evaluation = MadeUp(env).evaluate(x)
+    evaluation = SyntheticObjective(env).evaluate(x)
     for name in names:
         one, other, blank = (make_optimizer(name, env) for _ in range(3))
         one.inform(x, evaluation)
@@ -169,15 +169,15 @@ def test_a_method_that_is_informed_goes_on_as_if_it_had_asked() -> None:
         assert not torch.equal(proposals[0], proposals[2])
 
 
-def test_made_up_slopes_are_those_of_the_losses() -> None:
-    made_up = MadeUp(gradscape.make("branin"))
-    x = made_up.space.uniform(5, seed=0).requires_grad_()
-    evaluation = made_up.evaluate(x.detach())
-    u = made_up.space.to_unit(x) - 0.3
+def test_synthetic_slopes_are_those_of_the_losses() -> None:
+    synthetic = SyntheticObjective(gradscape.make("branin"))
+    x = synthetic.space.uniform(5, seed=0).requires_grad_()
+    evaluation = synthetic.evaluate(x.detach())
+    u = synthetic.space.to_unit(x) - 0.3
     (wanted,) = torch.autograd.grad((3.0 * u.square() + 0.3 * torch.sin(9.0 * u)).sum(), x)
     torch.testing.assert_close(evaluation.grad, wanted)
-    assert made_up.evaluate(x.detach(), grad=False).grad is None
-    assert made_up.asked == {True: 5, False: 5}
+    assert synthetic.evaluate(x.detach(), grad=False).grad is None
+    assert synthetic.asked == {True: 5, False: 5}
 
 
 def test_a_race_is_planned_as_json_and_leaves_nothing_behind(run: Callable[..., Said], tmp_path: Path) -> None:

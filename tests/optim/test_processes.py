@@ -4,13 +4,17 @@ import os
 import subprocess
 import sys
 import textwrap
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
+from gradscape.optim.lockstep import Asking, Compute, Lockstep
 from gradscape.optim.methods.surrogate import Surrogate, SurrogateOptions
-from gradscape.optim.processes import compute, processes
+
+from .test_race import Bowl
 
 KNOWN = 30
 
@@ -22,24 +26,47 @@ def informed() -> Surrogate:
     return surrogate
 
 
+def proposals(surrogate: Surrogate, random: np.random.Generator) -> Asking[list[np.ndarray]]:
+    found = []
+    for _ in range(2):
+        found.append((yield from surrogate.minimise(random)))
+    return found
+
+
+def computed(function: Callable[[], Any], *, workers: int = 2) -> list[Any]:
+    """Return what a function returns for three searches."""
+
+    def asking() -> Asking[Any]:
+        value, _ = yield Compute(function, ())
+        return value
+
+    return Lockstep(Bowl(), workers=workers).run([asking() for _ in range(3)])
+
+
 @pytest.mark.parametrize("cores", [1, 2])
 def test_a_process_computes_the_same_bits_and_what_it_has_learnt_comes_back(cores: int) -> None:
     before = torch.get_num_threads()
     torch.set_num_threads(cores)
-    here, there = informed(), informed()
-    random = [np.random.default_rng(3) for _ in range(2)]
-    wanted = [here.minimise(random[0]) for _ in range(2)]
-    with processes(2):
-        assert compute(os.getpid) != os.getpid()
-        found = [there.minimise(random[1]) for _ in range(2)]
-    np.testing.assert_array_equal(found, wanted)
-    one, other = (surrogate.state() for surrogate in (here, there))
-    assert one["fitted"] == other["fitted"] == KNOWN
-    assert all(np.array_equal(one["hyper"][name], other["hyper"][name]) for name in one["hyper"])
-    assert random[0].bit_generator.state == random[1].bit_generator.state
-    assert compute(os.getpid) == os.getpid()
+    found, states = [], []
+    for workers in (1, 2):
+        surrogates, random = [informed() for _ in range(2)], [np.random.default_rng(seed) for seed in (3, 4)]
+        asking = [proposals(*one) for one in zip(surrogates, random, strict=True)]
+        found.append(Lockstep(Bowl(), workers=workers).run(asking))
+        states.append([(one.state(), drawn.bit_generator.state) for one, drawn in zip(surrogates, random, strict=True)])
+    np.testing.assert_array_equal(*found)
+    for (one, drawn), (other, redrawn) in zip(*states, strict=True):
+        assert one["fitted"] == other["fitted"] == KNOWN
+        assert all(np.array_equal(one["hyper"][name], other["hyper"][name]) for name in one["hyper"])
+        assert drawn == redrawn
     assert torch.get_num_threads() == cores
     torch.set_num_threads(before)
+
+
+def test_searches_keep_their_processes() -> None:
+    assert set(computed(os.getpid, workers=1)) == {os.getpid()}
+    first, second, third = computed(os.getpid)
+    assert os.getpid() not in (first, second)
+    assert first == third != second
 
 
 def threads() -> set[int]:
@@ -51,17 +78,16 @@ def threads() -> set[int]:
 
 
 def test_a_process_has_one_thread() -> None:
-    with processes(2):
-        assert compute(threads) == {1}
+    assert computed(threads) == 3 * [{1}]
 
 
 def test_processes_end_with_the_first() -> None:
     script = """
         import os, signal
-        from gradscape.optim.processes import compute, processes
+        from gradscape.optim.processes import WorkerProcesses
         if __name__ == "__main__":
-            with processes(2):
-                print(compute(os.getpid), flush=True)
+            with WorkerProcesses(2) as processes:
+                print(processes.submit(0, os.getpid)(), flush=True)
                 os.kill(os.getpid(), signal.SIGKILL)
     """
     command = [sys.executable, "-c", textwrap.dedent(script)]

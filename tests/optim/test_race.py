@@ -84,7 +84,7 @@ def test_runs_in_lockstep_are_those_of_each_alone():
 
 @pytest.mark.parametrize("abreast", [1, 4])
 def test_more_runs_than_go_on_abreast_take_turns(monkeypatch, abreast):
-    monkeypatch.setattr("gradscape.optim.race.ABREAST", abreast)
+    monkeypatch.setattr("gradscape.optim.race.MAX_ABREAST", abreast)
     entries = field()
     race(Bowl(), entries, budget=BUDGET, gradient_cost=2.0)
     assert bits(entries) == bits(alone())
@@ -151,8 +151,7 @@ def test_seconds_are_a_runs_own_and_its_share_of_each_batch():
     now = [0.0]
     clock = SimpleNamespace(perf_counter=lambda: now[0])
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("gradscape.optim.meeting.time", clock)
-        patch.setattr("gradscape.optim.turns.time", clock)
+        patch.setattr("gradscape.optim.lockstep.time", clock)
         entries = field()
         race(Slow(), entries, budget=BUDGET, gradient_cost=2.0)
     for entry in entries:
@@ -171,10 +170,9 @@ def test_an_interrupt_while_methods_compute_ends_them(monkeypatch):
     objective, entries = Bowl(), field()
 
     def interrupted(self):
-        self.end()
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("gradscape.optim.meeting.Meeting._wait_for_all", interrupted)
+    monkeypatch.setattr("gradscape.optim.methods.cmaes.CMAES._ask", interrupted)
     with pytest.raises(KeyboardInterrupt):
         race(objective, entries, budget=BUDGET, gradient_cost=2.0)
     assert objective.asked == 0

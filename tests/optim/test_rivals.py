@@ -1,8 +1,6 @@
 """The rivals of BO-Leap: each against its library or paper, on functions whose minima are known."""
 
-import gc
 import math
-import threading
 
 import numpy as np
 import pytest
@@ -22,7 +20,7 @@ from gradscape.optim.methods.cmaes import CMAES
 from gradscape.optim.methods.cmaes_gradient import CMAESGradient
 from gradscape.optim.methods.fit import closure_of
 from gradscape.optim.methods.process import Process, covariance_of
-from gradscape.optim.methods.quasi_newton import LBFGSB, THREAD, BasinHopping, LocalSearch
+from gradscape.optim.methods.quasi_newton import LBFGSB, BasinHopping
 from gradscape.optim.methods.sloped import Sloped
 from gradscape.optim.methods.surrogate import Surrogate, SurrogateOptions
 from gradscape.optim.methods.turbo import TuRBO, TuRBOOptions, region
@@ -317,15 +315,3 @@ def test_more_parameters_than_slopes_can_be_modelled_of_are_refused():
     space = ParameterSpace.box([f"x{n}" for n in range(50)], -1.0, 1.0)
     with pytest.raises(ValueError, match="bo-gradient models slopes of 49 parameters at most; this space has 50"):
         BOGradient(space)
-
-
-def test_a_search_that_is_dropped_leaves_no_thread() -> None:
-    before = set(threading.enumerate())
-    local = LocalSearch(np.array([0.3, -0.8]), 100)
-    local.tell(1.0, np.array([0.5, 0.2]))
-    (thread,) = (one for one in set(threading.enumerate()) - before if one.name == THREAD)
-    assert not local.done
-    del local
-    gc.collect()
-    thread.join(60)  # seconds, for a failure to end
-    assert not thread.is_alive()

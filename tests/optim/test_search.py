@@ -193,7 +193,7 @@ class Timed(Pit):
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     clock = Clock()
-    for module in ("optim.search", "landscapes.cost"):
+    for module in ("optim.lockstep", "landscapes.cost"):
         monkeypatch.setattr(f"gradscape.{module}.time", clock)
     return clock
 

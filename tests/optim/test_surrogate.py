@@ -18,7 +18,7 @@ from gradscape.optim.methods.radial import Radial
 from gradscape.optim.methods.surrogate import Surrogate, SurrogateOptions
 from gradscape.optim.runs.state import decode, encode
 
-from .states import model_of
+from .states import model_of, proposal_of
 
 
 def waves(z: np.ndarray) -> np.ndarray:
@@ -38,7 +38,7 @@ def test_the_bounds_argmin_agrees_with_a_dense_grid(count, kernel):
     surrogate = informed(count, kernel=kernel)
     axis = torch.linspace(0.0, 1.0, 201, dtype=torch.float64)
     grid = torch.cartesian_prod(axis, axis)
-    found = torch.from_numpy(surrogate.minimise(np.random.default_rng(0)) + 1.0)[None] / 2.0
+    found = torch.from_numpy(proposal_of(surrogate) + 1.0)[None] / 2.0
     bound = UpperConfidenceBound(model_of(surrogate), beta=1.0, maximize=False)
     with torch.no_grad():
         values, value = -bound(grid[:, None]), -bound(found[:, None])
@@ -124,7 +124,7 @@ def test_losses_of_another_scale_are_searched_alike():
     def least(scale: float) -> np.ndarray:
         surrogate = informed()
         surrogate.loss = scale * surrogate.loss
-        return surrogate.minimise(np.random.default_rng(0))
+        return proposal_of(surrogate)
 
     np.testing.assert_array_equal(least(2.0**-20), least(1.0))
 
@@ -132,7 +132,7 @@ def test_losses_of_another_scale_are_searched_alike():
 def test_more_exploration_goes_further_from_what_is_known():
     def distance(coefficient: float) -> float:
         surrogate = informed(15, coefficient=coefficient)
-        return np.linalg.norm(surrogate.z - surrogate.minimise(np.random.default_rng(0)), axis=1).min()
+        return np.linalg.norm(surrogate.z - proposal_of(surrogate), axis=1).min()
 
     assert distance(20.0) > 2.0 * distance(0.0)
 
@@ -149,7 +149,7 @@ def test_a_failure_counts_as_the_worst_loss():
     surrogate, plain = informed(20), informed(20)
     worst, failed = plain.loss.argmax(), plain.loss.argmin()
     surrogate.loss[failed], plain.loss[failed] = np.inf, plain.loss[worst]
-    z = [one.minimise(np.random.default_rng(0)) for one in (surrogate, plain)]
+    z = [proposal_of(one) for one in (surrogate, plain)]
     np.testing.assert_array_equal(*z)
 
 
@@ -157,7 +157,7 @@ def test_a_failure_counts_as_the_worst_loss():
 def test_few_equal_and_wildly_different_losses_are_no_obstacle(loss):
     surrogate = Surrogate(3, SurrogateOptions(initial=1))
     surrogate.add(np.random.default_rng(0).uniform(-1, 1, (len(loss), 3)), np.array(loss))
-    z = surrogate.minimise(np.random.default_rng(0))
+    z = proposal_of(surrogate)
     assert np.isfinite(z).all()
     assert (np.abs(z) <= 1.0).all()
 
@@ -168,7 +168,7 @@ def test_points_are_drawn_at_random_until_there_are_enough_and_one_has_a_loss():
         z = np.random.default_rng(1).uniform(-1.0, 1.0, (count, 2))
         surrogate.add(z, loss + waves(z))
         assert surrogate.informed == (count == 4 and loss < np.inf)
-        return [surrogate.minimise(np.random.default_rng(seed)) for seed in (0, 1)]
+        return [proposal_of(surrogate, seed) for seed in (0, 1)]
 
     np.testing.assert_array_equal(drawn(0, 0.0), drawn(3, 0.0))
     np.testing.assert_array_equal(drawn(0, 0.0), drawn(4, np.inf))
@@ -207,7 +207,7 @@ def test_its_state_is_whole_and_it_leaves_no_trace_in_global_generators_or_warni
     before = torch.get_rng_state(), np.random.get_state()[1].copy(), list(warnings.filters)
     copy = Surrogate(2, surrogate.options)
     copy.restore(decode(encode(surrogate.state())))
-    z = [one.minimise(np.random.default_rng(4)) for one in (surrogate, copy)]
+    z = [proposal_of(one, 4) for one in (surrogate, copy)]
     np.testing.assert_array_equal(*z)
     assert torch.equal(before[0], torch.get_rng_state())
     np.testing.assert_array_equal(before[1], np.random.get_state()[1])
@@ -217,7 +217,7 @@ def test_its_state_is_whole_and_it_leaves_no_trace_in_global_generators_or_warni
 def test_threads_find_what_one_alone_finds():
     def lowest(seed: int) -> list[np.ndarray]:
         surrogate = informed(30 + seed)
-        return [surrogate.minimise(np.random.default_rng(seed)) for _ in range(3)]
+        return [proposal_of(surrogate, seed) for _ in range(3)]
 
     alone = [lowest(seed) for seed in range(4)]
     with ThreadPoolExecutor(4) as executor:

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from gradscape.envs.adapters import from_torch
-from gradscape.landscapes.measures.census import MEASURES, CensusDesign, sample_cut, survey, thin_out
+from gradscape.landscapes.measures.census import MEASURES, CensusDesign, sample_cuts, survey, thin_out
 from gradscape.landscapes.measures.census_statistics import bootstrap, divide, spread, word_shares
 from gradscape.landscapes.objective import Evaluation, Objective, evaluate
 from gradscape.landscapes.plane import Plane
@@ -60,7 +60,7 @@ def test_random_directions_are_orthonormal_in_widths_of_the_box_and_nothing_is_a
         torch.testing.assert_close(unit @ unit.T, torch.eye(2, dtype=torch.float64))
     bowl = Bowl()
     planes = CensusDesign.draw(BOX, 9, along="random", resolution=8, seed=0)
-    found = [survey(bowl, planes.plane(*place), deviation=0.0, seed=0) for place in planes.places]
+    found = survey(bowl, [planes.plane(*place) for place in planes.places], deviation=0.0, seed=0)
     outside = sum(np.isnan(one.loss).sum() for one in found)
     assert 0 < outside < 9 * 64
     assert bowl.asked == sum(one.episodes for one in found)
@@ -72,7 +72,7 @@ def test_a_slice_holds_the_bits_of_its_points_evaluated_in_a_row(along: str, gra
     objective = from_torch(lambda x: (7 * x).sin().prod(dim=1) + x.exp().sum(dim=1), BOX)
     design = CensusDesign.draw(BOX, 4, along=along, resolution=19, seed=0, gradients=gradients)
     plane = design.plane(1, 1)
-    found, grid = sample_cut(objective, plane, gradients=gradients), plane.grid()
+    (found,), grid = sample_cuts(objective, [plane], gradients=gradients), plane.grid()
     wanted = evaluate(objective, grid.reshape(-1, 5), grad=True)
     assert wanted.grad is not None
     slopes = torch.full_like(grid, torch.nan)
@@ -84,18 +84,16 @@ def test_a_slice_holds_the_bits_of_its_points_evaluated_in_a_row(along: str, gra
 
 
 def test_every_second_sample_is_what_half_the_resolution_would_sample() -> None:
-    plane = Plane.through(BOX, BOX.center, (0, 3), resolution=9)
-    thin = thin_out(sample_cut(Bowl(), plane))
-    wanted = sample_cut(Bowl(), Plane.through(BOX, BOX.center, (0, 3), resolution=5))
-    np.testing.assert_allclose(thin["loss"], wanted["loss"])
-    np.testing.assert_allclose(thin["grad"], wanted["grad"])
-    even = thin_out(sample_cut(Bowl(), Plane.through(BOX, BOX.center, (0, 3), resolution=8)))
-    np.testing.assert_allclose(even["loss"], sample_cut(Bowl(), Plane.through(BOX, BOX.center, (0, 3), resolution=8))["loss"][::2, ::2])  # fmt: skip # noqa: E501
+    planes = [Plane.through(BOX, BOX.center, (0, 3), resolution=resolution) for resolution in (9, 5, 8)]
+    odd, wanted, even = (sample_cuts(Bowl(), [plane])[0] for plane in planes)
+    for name in ("loss", "grad"):
+        np.testing.assert_allclose(thin_out(odd)[name], wanted[name])
+    np.testing.assert_allclose(thin_out(even)["loss"], even["loss"][::2, ::2])
 
 
 def test_a_bowls_slices_are_very_smooth_with_good_gradients() -> None:
     design = CensusDesign.draw(BOX, 4, along="pairs", resolution=12, seed=0)
-    found = [survey(Bowl(), design.plane(*place), deviation=0.0, seed=0) for place in design.places]
+    found = survey(Bowl(), [design.plane(*place) for place in design.places], deviation=0.0, seed=0)
     assert {one.words for one in found} == {("very smooth", "gradients good")}
     assert all(one.measures[MEASURES.index("cosine")] > 0.99 for one in found)
     assert len({one.measures[MEASURES.index("notable minima")] for one in found}) == 1

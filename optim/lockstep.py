@@ -1,0 +1,179 @@
+"""Searches in lockstep: all ask, what they ask for is done together, and all are told.
+
+A search is a generator. It yields a `Request` for whatever it needs done and is sent the `Answer`. Points that several
+searches want evaluated make one batch; computations run in worker processes, side by side.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Generator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, TypeVar
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ..landscapes.objective import Objective
+from ..landscapes.sampling.memory import MemoryBound
+from .processes import WorkerProcesses
+
+if TYPE_CHECKING:
+    import numpy as np
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluate:
+    """Request losses at points, shape (count, dim), and gradients if `grad`."""
+
+    x: Float[Tensor, "count dim"]
+    grad: bool
+
+    @property
+    def kind(self) -> tuple[str, int]:
+        """What requests answered in one batch have in common; kinds are computed in this order."""
+        return "evaluate", int(self.grad)
+
+    def answer(self, objective: Objective, x: Float[Tensor, "batch dim"]) -> Callable[[slice], Any]:
+        """Return a function that returns the results of some rows of `x`, of which this request is a part."""
+        return objective.evaluate(x, grad=self.grad).rows
+
+
+@dataclass(frozen=True, eq=False)
+class Observe:
+    """Request what a policy sees at points, shape (count, dim), before a decision."""
+
+    x: Float[Tensor, "count dim"]
+    decision: int
+
+    @property
+    def kind(self) -> tuple[str, int]:
+        """What requests answered in one batch have in common; kinds are computed in this order."""
+        return "observe", self.decision
+
+    def answer(self, objective: Objective, x: Float[Tensor, "batch dim"]) -> Callable[[slice], Any]:
+        """Return a function that returns the results of some rows of `x`, of which this request is a part."""
+        return objective.observe(x, self.decision).__getitem__
+
+
+@dataclass(frozen=True, eq=False)
+class Compute:
+    """Request what a function of a module returns, wherever it is computed."""
+
+    function: Callable[..., Any]
+    arguments: tuple[Any, ...]
+
+    def result(self) -> tuple[Any, float]:
+        """Return what the function returns, and the seconds it took."""
+        began = time.perf_counter()
+        found = self.function(*self.arguments)
+        return found, time.perf_counter() - began
+
+
+class Answer(NamedTuple):
+    """What came of a request; `now` [s] is the search's own clock.
+
+    It passes while the search itself works, while something is computed for it, and by its share of each batch.
+    """
+
+    value: Any
+    now: float
+
+
+Request: TypeAlias = Evaluate | Observe | Compute
+Result = TypeVar("Result")
+Asking: TypeAlias = Generator[Request, Answer, Result]  # yields requests, and returns a result
+
+
+def compute_drawing(random: np.random.Generator, function: Callable[..., Result], *arguments: Any) -> Asking[Result]:
+    """Return what function(*arguments, random) returns; `random` draws the same numbers wherever it is computed."""
+    (result, state), _ = yield Compute(_draw, (random, function, arguments))
+    random.bit_generator.state = state
+    found: Result = result
+    return found
+
+
+def _draw(
+    random: np.random.Generator, function: Callable[..., Result], arguments: tuple[Any, ...]
+) -> tuple[Result, Any]:
+    result = function(*arguments, random)
+    return result, random.bit_generator.state
+
+
+class Lockstep:
+    """Run searches of an objective, whose rows must not depend on their batch.
+
+    Computations are spread over `workers` processes, and done here if that is one; results are the same to the last
+    bit. `computed` counts the seconds that they took.
+    """
+
+    def __init__(self, objective: Objective, *, workers: int = 1) -> None:
+        self.objective, self.workers, self.computed = objective, workers, 0.0
+        self._bound = MemoryBound(objective)
+
+    def run(self, searches: Sequence[Asking[Any]]) -> list[Any]:
+        """Return what each search returns. Whatever a search or the objective raises ends all of them."""
+        self._searches, self._clocks = searches, [0.0] * len(searches)
+        self._asked: dict[int, Request] = {}
+        self._results: dict[int, Any] = {}
+        with WorkerProcesses(self.workers) as processes:
+            for number in range(len(searches)):
+                self._advance(number, None)
+            while self._asked:
+                self._compute(processes)
+                self._evaluate()
+        return [self._results[number] for number in range(len(searches))]
+
+    def _advance(self, number: int, answer: Answer | None) -> None:
+        """Let a search go on to its next request, or to its end."""
+        began = time.perf_counter()
+        try:
+            self._asked[number] = self._searches[number].send(answer)  # type: ignore[arg-type] # None starts it
+        except StopIteration as end:
+            self._results[number] = end.value
+        self._clocks[number] += time.perf_counter() - began
+
+    def _answer(self, number: int, value: Any, seconds: float) -> None:
+        del self._asked[number]
+        self._clocks[number] += seconds
+        self._advance(number, Answer(value, self._clocks[number]))
+
+    def _compute(self, processes: WorkerProcesses) -> None:
+        """Answer computations until none is asked for."""
+        while computing := {n: one for n, one in sorted(self._asked.items()) if isinstance(one, Compute)}:
+            results = {number: processes.submit(number, one.result) for number, one in computing.items()}
+            for number, result in results.items():
+                value, seconds = result()
+                self.computed += seconds
+                self._answer(number, value, seconds)
+
+    def _evaluate(self) -> None:
+        """Answer what is asked of the objective, a batch for each kind."""
+        asked = {n: one for n, one in sorted(self._asked.items()) if not isinstance(one, Compute)}
+        answers = dict[int, tuple[Any, float]]()
+        for kind in sorted({one.kind for one in asked.values()}):
+            group = {number: one for number, one in asked.items() if one.kind == kind}
+            x, began = torch.cat([one.x for one in group.values()]), time.perf_counter()
+            take, start = next(iter(group.values())).answer(self._bound, x), 0
+            seconds = (time.perf_counter() - began) / len(x)
+            for number, one in group.items():
+                answers[number] = take(slice(start, start := start + len(one.x))), seconds * len(one.x)
+        for number in sorted(answers):
+            self._answer(number, *answers[number])
+
+
+def answer_alone(asking: Asking[Result], objective: Objective | None) -> Result:
+    """Return what a search returns that runs alone, its requests answered one by one."""
+    answer: Any = None
+    while True:
+        try:
+            request = asking.send(answer)
+        except StopIteration as end:
+            found: Result = end.value
+            return found
+        if isinstance(request, Compute):
+            answer = Answer(*request.result())
+        else:
+            assert objective is not None  # as methods see to that look at episodes
+            answer = Answer(request.answer(objective, request.x)(slice(None)), 0.0)
