@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from inspect import signature
 from pathlib import Path
@@ -20,9 +20,9 @@ if TYPE_CHECKING:
 class _Planner(Watch):
     """Take the work of the job that is about to begin, and stop it there."""
 
-    def plan(self, works: Sequence[Work]) -> None:
+    def plan(self, works: Iterable[Work]) -> None:
         """Take what a job would do."""
-        raise Planned(works)
+        raise Planned(list(works))
 
 
 @verb

@@ -2,8 +2,8 @@
 
     python -m benchmarks.plan [--tries 3] [--only "slice of bounce"]
 
-Prints predicted / taken, the medians of some tries, plan and job in turn: `seconds` of the whole command after its start,
-so what a plan leaves out counts against it, and `bytes` on the disk.
+Prints predicted / taken, the medians of some tries, plan and job in turn: `seconds` of the whole command after its
+start, so what a plan leaves out counts against it, and `bytes` on the disk.
 """
 
 from __future__ import annotations

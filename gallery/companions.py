@@ -87,7 +87,7 @@ class CompanionPart(FigurePart):
 
     def seconds_each(self) -> float:
         """Time an episode."""
-        return seconds_of_one(self._scene().make())
+        return seconds_of_one(self.scene().make())
 
     def make(self, watch: Watch) -> str:
         """Sample them, draw them beside the slice, and keep what they are."""
@@ -96,7 +96,7 @@ class CompanionPart(FigurePart):
         from ..landscapes.draw.film import lighten
         from ..landscapes.storage.store import open_slice
 
-        dataset, env = open_slice(self.folder / STORE), self._scene().make()
+        dataset, env = open_slice(self.folder / STORE), self.scene().make()
         names, cuts = points_beside(self.figure), [Cut(self.figure.through, dataset["loss"].to_numpy())]
         found = list[Companion]()
         with watch.progress(self.count_left(), "episodes") as advance:

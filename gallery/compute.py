@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import gc
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
+from ..jobs.plan import Work
 from ..jobs.watch import Stopped, Watch
 from ..jobs.workers import workers
 from ..landscapes.capacity import require
 from ..landscapes.cost import duration
+from ..landscapes.lattice import count_gradients
 from ..landscapes.storage.disk import full, is_full
 from ..landscapes.storage.files import tidy
 from .companions import CompanionPart
@@ -57,6 +59,7 @@ def compute_parts(
     if unknown := set(parts) - set(PARTS):
         raise ValueError(f"--part takes {', '.join(PARTS)}; got {', '.join(sorted(unknown))}")
     _check_device(device)
+    watch.plan(_slice_work(SlicePart(figure, root, device) for figure in figures))
     work = _Work(root, watch)
     with workers(scheduler, device) as executor:
         for name, kind in PARTS.items():
@@ -65,6 +68,16 @@ def compute_parts(
                 work.make(name, [kind(figure, root, device, executor) for figure in sound])
     tidy(root)
     return sorted(work.failed)
+
+
+def _slice_work(parts: Iterable[SlicePart]) -> Iterator[Work]:
+    """Yield what is left of the figures' slices to sample; what else the gallery shows is no part of a plan."""
+    for part in parts:
+        if left := part.count_left():
+            env, figure = part.scene().make(), part.figure
+            having = count_gradients((figure.resolution,) * len(figure.dims), figure.gradients)
+            having = round(left * having / figure.resolution ** len(figure.dims))
+            yield Work(env, left - having, having, 8.0 * left * (2 + env.space.dim))
 
 
 def change_figures(figures: Sequence[Figure], fidelity: str | None, resolution: int | None, root: Path) -> list[Figure]:

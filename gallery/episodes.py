@@ -41,13 +41,13 @@ class EpisodePart(FigurePart):
 
     def seconds_each(self) -> float:
         """Time an episode, and assume what drawing it takes."""
-        return seconds_of_one(self._scene().make()) + LONGEST * DRAWING
+        return seconds_of_one(self.scene().make()) + LONGEST * DRAWING
 
     def make(self, watch: Watch) -> str:
         """Film every episode that is not there, and clear away those of other nodes."""
         from ..landscapes.identity import plane_of
 
-        env, plane, filmed = self._scene().make(), plane_of(self._dataset), self._find_films()
+        env, plane, filmed = self.scene().make(), plane_of(self._dataset), self._find_films()
         for node in self._nodes:
             if node not in filmed:
                 with watch.busy(f"{self.figure.id}: the episode of {node.why}"):

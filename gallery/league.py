@@ -87,7 +87,7 @@ class LeaguePart(FigurePart):
     @property
     def _own_scene(self) -> SceneSpec:
         """The figure's scene with the options that it has by default."""
-        return replace(self._scene(), options={})
+        return replace(self.scene(), options={})
 
 
 def read_standings(path: Path) -> SceneStandings:

@@ -58,7 +58,7 @@ class LeagueSlicePart(FigurePart):
 
     def seconds_each(self) -> float:
         """Time an episode."""
-        return seconds_of_one(self._scene().make())
+        return seconds_of_one(self.scene().make())
 
     def make(self, watch: Watch) -> str:
         """Sample the slice, lay the median runs over it, and draw both."""

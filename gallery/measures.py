@@ -51,7 +51,7 @@ class ReportPart(FigurePart):
 
         rank = len(self.figure.dims)
         shape = (self.figure.resolution,) * rank
-        return estimate_seconds(self._scene().make(), *effort(rank, REPORT_POINTS, shape))
+        return estimate_seconds(self.scene().make(), *effort(rank, REPORT_POINTS, shape))
 
     def make(self, watch: Watch) -> str:
         """Measure the slice, in the place of a report of another one."""

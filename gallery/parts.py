@@ -109,7 +109,7 @@ class FigurePart(abc.ABC):
     def make(self, watch: Watch) -> str:
         """Make what is left and say in a line what came out."""
 
-    def _scene(self, fidelity: str | None = None) -> SceneSpec:
+    def scene(self, fidelity: str | None = None) -> SceneSpec:
         """Return the scene at the figure's fidelity or another; at its default where it does not have that one."""
         scene = self.figure.scene(self.device, fidelity)
         known = scene.fidelity in environment_class(self.figure.env).fidelities
@@ -159,7 +159,7 @@ class SlicePart(FigurePart):
         from ..jobs.slice import SliceJob
         from ..landscapes.storage.paths import is_slice
 
-        env = self._scene().make()
+        env = self.scene().make()
         return SliceJob.of(
             env,
             self.figure.plane(env),
@@ -209,7 +209,7 @@ class SweepPart(FigurePart):
     def _open(self) -> SweepJob:
         from ..jobs.sweep import SweepJob
 
-        env = self._scene(DRAFT).make()
+        env = self.scene(DRAFT).make()
         plane, over = self.figure.plane(env, COARSE), self.figure.over
         job = SweepJob.of(env, plane, over, FRAMES, gradients=APART, command=self.label())
         return replace(job, executor=self.executor)
@@ -236,7 +236,7 @@ class SearchPart(FigurePart):
         from ..jobs.race import lockstep_seconds
         from ..optim.registry import optimizer_class
 
-        env = self._scene().make()
+        env = self.scene().make()
         asking = sum(optimizer_class(method).needs_grad for method in METHODS)
         left = {0: BUDGET * (len(METHODS) - asking), 1: BUDGET * asking}
         return lockstep_seconds(env, left, len(METHODS)) / len(METHODS)
@@ -246,7 +246,7 @@ class SearchPart(FigurePart):
         from ..jobs.race import RaceJob
         from .runs import save_run
 
-        job = RaceJob.of(self._scene().make(), METHODS, budget=BUDGET, seeds=1, command=self.label(), watch=watch)
+        job = RaceJob.of(self.scene().make(), METHODS, budget=BUDGET, seeds=1, command=self.label(), watch=watch)
         runs = replace(job, executor=self.executor).run(watch).race.runs
         for method in self._missing():
             save_run(runs[method][0].data, self._file(method))
@@ -266,7 +266,7 @@ class SearchPart(FigurePart):
         from ..landscapes.storage.store import SliceStore
         from .runs import open_run, searched
 
-        fidelity, store = self._scene().fidelity, self.folder / STORE
+        fidelity, store = self.scene().fidelity, self.folder / STORE
         cut = SliceStore.open(store).identity if is_slice(store) else None
 
         def fits(run: xr.Dataset) -> bool:

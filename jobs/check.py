@@ -12,6 +12,7 @@ from ..landscapes.capacity import Need, require
 from ..landscapes.conformance.finding import Finding
 from ..landscapes.cost import duration, episode_cost
 from ..landscapes.plain import plain
+from .plan import Work
 from .scene import SceneSpec
 from .watch import PREPARING, Say, Stopped, Watch
 
@@ -113,6 +114,7 @@ class CheckJob:
         Raises Stopped where it is interrupted.
         """
         watch, count = watch or Watch(), 0
+        watch.plan(self.work())
         say: Say = lambda text: None  # noqa: E731 -- of the moment
         found = self._run(lambda check: say(f"{self.name}: {check}"))
         try:
@@ -174,13 +176,18 @@ class CheckJob:
         others = {factor: cache(partial(self.env.with_horizon, factor * own)) for factor in FACTORS[1:]}
         return {1: lambda: self.env, **others}
 
-    def _cost(self) -> str:
-        """Return what is checked and how long it will take."""
+    def work(self) -> list[Work]:
+        """Return about how many episodes all checks take."""
         from ..landscapes.conformance.suite import episodes
 
-        env, cost = self.env, episode_cost(self.env)
-        plain, sloped = episodes(env.space.dim, self.points, tuple(_lengths(self)))
-        sloped += 2 * (sum(FACTORS) + 4)  # two points over longer horizons, time steps and materials
+        losses, gradients = episodes(self.env.space.dim, self.points, tuple(_lengths(self)))
+        gradients += 2 * (sum(FACTORS) + 4)  # two points over longer horizons, time steps and materials
+        return [Work(self.env, losses, gradients)]
+
+    def _cost(self) -> str:
+        """Return what is checked and how long it will take."""
+        env, cost, (work,) = self.env, episode_cost(self.env), self.work()
+        plain, sloped = work.losses, work.gradients
         seconds = (plain * cost.forward + sloped * cost.gradient) / env.threads
         subject = f"{env.name} · {env.fidelity.name} · {env.device} · {env.engine} · {self.points} points"
         if env.precision != env.fidelity.precision:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
@@ -45,7 +45,7 @@ class Job(abc.ABC, Generic[Found]):
     def kept(self) -> str:
         """Say how much of it is on disk."""
 
-    def work(self) -> list[Work]:
+    def work(self) -> Iterable[Work]:
         """Return what it has to simulate."""
         return []
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import gc
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,12 +18,13 @@ from ..landscapes.storage.ownership import refuse_others
 from ..landscapes.storage.records import write_record
 from ..optim.claims import Claims
 from ..optim.league import League, SceneStandings
-from ..optim.memory import require_runs
+from ..optim.memory import require_runs, run_need
 from ..optim.registry import methods as all_methods
 from ..optim.registry import optimizer_class
 from ..optim.runs.journal import Journal
 from .folder import LEAGUE, ROOT, RUN_STORE, folder_named
 from .methods import check_methods, divide_methods
+from .plan import Work
 from .race import RaceJob, lockstep_seconds
 from .scene import AT, SceneSpec
 from .watch import PREPARING, Stopped, Watch, resumable
@@ -132,6 +133,7 @@ class LeagueJob:
         it is interrupted, and DiskFullError; the same job goes on from what is kept then.
         """
         watch = watch or Watch()
+        watch.plan(self.work())
         self.failed.clear()
         with resumable(self.say_kept):
             self.announce(watch)
@@ -144,6 +146,16 @@ class LeagueJob:
                     self._write(scenes)
                     watch.note(f"{fixture}: {_outcome(found)}, in {duration(time.monotonic() - began)}")
             return self._finish(scenes)
+
+    def work(self) -> Iterator[Work]:
+        """Return the budget of every run of the methods that can search each scene."""
+        for fixture in self.fixtures:
+            env = fixture.scene.make()
+            able, _ = divide_methods(env, self.methods, budget=self.budget)
+            asking = sum(optimizer_class(method).needs_grad for method in able)
+            each = self.budget * self.seeds
+            need = run_need(env.space.dim, self.budget).times(len(able) * self.seeds)
+            yield Work(env, (len(able) - asking) * each, asking * each, need.disk, need.memory)
 
     def announce(self, watch: Watch) -> None:
         """Say of each scene how many episodes are there and what the others take to simulate, and the sum."""

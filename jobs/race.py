@@ -20,6 +20,7 @@ from ..landscapes.storage.locks import check_free
 from ..landscapes.storage.ownership import refuse_others
 from ..landscapes.threads import one_torch_thread
 from ..optim.claims import Claims, check_claims
+from ..optim.memory import run_need
 from ..optim.processes import workers_worth
 from ..optim.race import Competitor, Race, name_seeds, race
 from ..optim.registry import optimizer_class
@@ -27,6 +28,7 @@ from ..optim.runs.store import RunStore
 from ..optim.search import SearchProgress
 from .folder import RACE, RACE_FIGURES, ROOT, RUN_STORE, folder_named
 from .methods import able_methods, check_methods, require_room
+from .plan import Work
 from .race_summary import RaceSummary
 from .scene import provenance
 from .search import make_optimizer, open_run_store
@@ -129,6 +131,7 @@ class RaceJob:
         and DiskFullError; the same job goes on from what is kept then.
         """
         watch = watch or Watch()
+        watch.plan(self.work())
         runs = [one.run for one in self.competitors]
         with resumable(self.say_kept), one_torch_thread(), filling(self.env, runs, self.folder, watch):
             self._search(watch)
@@ -231,18 +234,24 @@ class RaceJob:
 
         Of workers, all episodes of a method that asks for gradients are counted with.
         """
-        from .plan_race import outlook
-
         grad = left[1] > 0
         if self.executor is not None:
             (alone,) = run_tasks(self.executor, _cost_there, [(cloudpickle.dumps(recipe(self.env)), grad)])
             whole = left[0] * alone.forward + (left[1] * alone.gradient if grad else 0.0)
             by = workers_of(self.executor)
             return alone, f"{duration(whole)} one by one, by {by} workers, and what the methods take"
-        runs = [one for one in self.competitors if self._count_left(one)]
-        counts = {one.method: [self._count_left(other) for other in runs if other.method == one.method] for one in runs}
-        makers = {one.method: one.make for one in runs}
-        return episode_cost(self.env, grad=grad), outlook(self.env, makers, counts, self.budget, workers=self.workers)
+        abreast = sum(self._count_left(one) > 0 for one in self.competitors)
+        seconds = lockstep_seconds(self.env, left, abreast)
+        return episode_cost(self.env, grad=grad), f"{duration(seconds)} to simulate, and what the methods take"
+
+    def work(self) -> list[Work]:
+        """Return the budget of every run, with gradients where its method asks for them."""
+        losses, gradients = (
+            sum(self.budget for one in self.competitors if optimizer_class(one.method).needs_grad == way)
+            for way in (False, True)
+        )
+        need = run_need(self.env.space.dim, self.budget).times(len(self.competitors))
+        return [Work(self.env, losses, gradients, need.disk, need.memory)]
 
     def _count_left(self, one: Competitor) -> int:
         return max(0, self.budget - one.run.count)

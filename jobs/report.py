@@ -25,6 +25,7 @@ from ..landscapes.storage.records import read_json, write_record
 from ..landscapes.verification import RESAMPLE, verify_dataset
 from . import growth
 from .folder import REPORT, REPORTS, ROOT, SLICE_STORE, folder_named, store_in
+from .plan import Work
 from .report_record import ARRAYS, MEASURES, PICTURE, RECORD, PaperRecord, Quoted, Report, ReportKey, Reports
 from .report_tables import slices_markdown
 from .scene import environment_of
@@ -218,7 +219,9 @@ def measure(env: Environment, dataset: xr.Dataset, points: int, seed: int, watch
     """Announce what measuring a slice of an environment costs, and measure it."""
     from ..landscapes.measures.profile import PRECISION, effort, measure_profile
 
-    total = sum(effort(dataset["loss"].ndim, points, dataset["loss"].shape))
+    losses, gradients = effort(dataset["loss"].ndim, points, dataset["loss"].shape)
+    total = losses + gradients
+    watch.plan([Work(env, losses, gradients + growth.effort(env))])
     _announce(env, dataset, points, watch)
     objective = BoxedObjective(env) if stored_identity(dataset).get("boxed") else env
     with watch.progress(total) as advance:

@@ -16,13 +16,14 @@ from ..landscapes.storage.files import clear, tidy, write_json
 from ..landscapes.storage.locks import check_free
 from ..landscapes.threads import one_torch_thread
 from ..optim.base import Kind
-from ..optim.memory import SearchSize, require_method, require_runs
+from ..optim.memory import SearchSize, require_method, require_runs, run_need
 from ..optim.registry import optimizer_class
 from ..optim.runs.arrays import FORWARD_EQUIVALENTS, stored_record
 from ..optim.runs.run import Run
 from ..optim.runs.store import RunStore
 from ..optim.search import SearchProgress, search
 from .folder import ROOT, RUN, SUMMARY, folder_named
+from .plan import Work
 from .scene import provenance
 from .studies import filling
 from .watch import PREPARING, Watch, resumable
@@ -136,6 +137,7 @@ class SearchJob:
         and DiskFullError; the same job goes on from what is kept then.
         """
         watch, start = watch or Watch(), time.monotonic()
+        watch.plan(self.work())
         with (
             resumable(self.say_kept, lambda: self._on_disk().picture()),
             one_torch_thread(),
@@ -152,6 +154,12 @@ class SearchJob:
             write_json(self.folder / SUMMARY, summary.record())
             tidy(self.folder)
         return summary
+
+    def work(self) -> list[Work]:
+        """Return the budget, with gradients if the method asks for them."""
+        counts = (0, self.budget) if self.optimizer.needs_grad else (self.budget, 0)
+        need = run_need(self.env.space.dim, self.budget)
+        return [Work(self.env, *counts, need.disk, need.memory)]
 
     def result(self) -> Run:
         """Return the run as one works with it."""

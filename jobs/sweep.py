@@ -7,7 +7,7 @@ import math
 import re
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -192,15 +192,13 @@ class SweepJob(Job[SweepSummary]):
         cost = estimate_cost(objective, self.stores[last], self.executor, made)
         return SliceCost(sum(pending.values()), cost.seconds * sum(work.values()) / work[last], cost.memory)
 
-    def work(self) -> list[Work]:
+    def work(self) -> Iterator[Work]:
         """Return the samples of each slice."""
-        works = []
         for number, (store, plane) in enumerate(zip(self.stores, self.motion.planes, strict=True)):
             having = count_gradients(plane.resolution, store.every if store.grad else 0)
             need = slice_need(plane.resolution, plane.dim, grad=store.grad)
             env = self.motion.env_at(number)
-            works.append(Work(env, math.prod(plane.resolution) - having, having, need.disk, need.memory))
-        return works
+            yield Work(env, math.prod(plane.resolution) - having, having, need.disk, need.memory)
 
     def compute(self, watch: Watch) -> SweepSummary:
         """Sample what is missing, film it and return the summary."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -60,7 +60,7 @@ class Watch:
     def note(self, text: str) -> None:
         """Take a line that is worth keeping: what a job will cost, a warning, what it has left out."""
 
-    def plan(self, works: Sequence[Work]) -> None:
+    def plan(self, works: Iterable[Work]) -> None:
         """Take what a job is about to simulate; a watch that only plans raises Planned."""
 
     def finish(self, folder: Path, files: Sequence[str], said: str = "") -> None:
