@@ -174,8 +174,8 @@ def _slots(function: Callable[..., Any] | None, kinds: Sequence[Any] = tuple(typ
     slots = []
     for slot in signature(function).parameters.values() if function else ():
         hint, kind = _hint(function, slot.annotation), slot.kind
-        if kind not in kinds:
-            continue
+        if kind not in kinds or kind is Slot.VAR_POSITIONAL or (kind is Slot.VAR_KEYWORD and hint is Any):
+            continue  # of a plan: the words of another verb
         if slot.default is None or slot.default is False or slot.default == ():
             hint = Annotated[hint, Parameter(show_default=False)]
         if ARGUMENT in getattr(hint, "__metadata__", ()):
@@ -250,7 +250,10 @@ def make_app(only: Sequence[str] = (), *, planned: bool = False) -> App:
     """Make the command with all verbs, or with those of `only` these words, which may be `planned` and not done."""
     panels = {heading: Group(heading, sort_key=number) for number, heading in enumerate(GROUPS, 1)}
     look: Any = {"default_parameter": WORDS, "help_format": "plaintext"}
-    app = App(name="landscape", help=ABOUT, version=f"gradscape {__version__}", help_flags=["--help", "-h"], **look)
+    app = App(
+        name="landscape", help=ABOUT, version=f"gradscape {__version__}", suppress_keyboard_interrupt=False, **look
+    )
+    app.suppress_keyboard_interrupt = False
     gallery = App(name="gallery", help=GALLERY, group=panels["Publish"], **look)
     for heading, group in GROUPS.items():
         for words in group:

@@ -55,6 +55,8 @@ def overlay(
     device: Device = "auto",
     figure_width_mm: FigureWidth = (),
     out: Out = None,
+    spawn: bool = False,
+    serve: bool = False,
 ) -> Overlay:
     """Draw runs over a slice, with their distance from its plane.
 
@@ -82,6 +84,10 @@ def overlay(
         Sample a new slice along the two principal directions of the runs: pca.
     resolution
         Number of points along each axis of a new slice. The default is that of SLICE.
+    spawn
+        Open the overlay in the rerun viewer.
+    serve
+        Serve the overlay to a browser on this machine, until Ctrl-C.
     """
     several = [runs] if isinstance(runs, str | Path) or not isinstance(runs, Sequence) else list(runs)
     from ..landscapes.storage.paths import refuse_missing
@@ -96,7 +102,8 @@ def overlay(
 
         refuse_unknown(env)
     from ..jobs.foreign import tables_over
-    from ..jobs.overlay import Cut, OverlayJob
+    from ..jobs.overlay import STREAM, Cut, OverlayJob
+    from .view import check_display, show_recording
 
     call, cut = current(), Cut.of(through, plane, resolution)  # type: ignore[arg-type] # one number for both axes
     beneath = as_slice(slice, env=env)
@@ -104,4 +111,10 @@ def overlay(
         beneath, tables_over(beneath, several, call.watch), command=call.command, cut=cut, device=device,
         out=as_path(out), prints=as_widths(figure_width_mm), watch=call.watch,
     )  # fmt: skip
-    return job.run(call.watch)
+    recording = job.folder / STREAM
+    if spawn and not serve:
+        check_display(recording, "leave out --spawn, or take --serve to look at it in a browser")
+    drawn = job.run(call.watch)
+    if spawn or serve:
+        show_recording(recording, serve=serve)
+    return drawn

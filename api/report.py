@@ -87,6 +87,8 @@ def _refuse_words(what: Any, everything: bool, keywords: SceneKeywords, env: Sce
         raise ValueError("report takes a slice's folder, an environment, or --all for every figure of the gallery")
     if isinstance(what, str) and not Path(what).exists():
         spec_of(what, keywords)
+    elif (isinstance(what, str | Path) or what is None) and (more := set(keywords) - {"device"}):
+        raise ValueError(f"{', '.join(sorted(more))} are of an environment to sample; a slice is there: leave them out")
     if isinstance(env, str):
         refuse_unknown(env)
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import os
 import shlex
+import subprocess
 import sys
 import time
-import webbrowser
 from pathlib import Path
 from typing import Annotated
 
@@ -84,8 +84,17 @@ def _open(path: Path, *, serve: bool) -> None:
         raise ValueError(f"--serve shows recordings (.rrd) in a browser; {path} is none")
     check_display(path, f"serve it to a browser: {serving}" if path.name == SITE else "copy it to where one is")
     current().watch.note(f"opening {path}")
-    if not webbrowser.open(resolve(path).as_uri()):
+    if not launch(resolve(path)):
         raise OSError(f"no program of this system opens {path}; open it with one of your own")
+
+
+def launch(path: Path) -> bool:
+    """Open a file with this system's program for it, and say whether there is one."""
+    program = "open" if sys.platform == "darwin" else "xdg-open"
+    try:
+        return subprocess.run([program, str(path)], capture_output=True, check=False).returncode == 0
+    except FileNotFoundError:
+        return False
 
 
 def _choose(path: Path, *, serve: bool) -> Path:

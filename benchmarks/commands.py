@@ -36,7 +36,7 @@ from gradscape.cli import app
 VALID = """
 envs branin
 info
-slice branin --dims 0 1 --resolution 3 --through center --extent 0.5 --out made
+slice branin --dims 0 1 --resolution 3 --through center --window 0.5 --out made
 slice ackley --dims x0 x1 --set dim=3 --no-gradients --json --resolution 3
 slice branin --dims 0 1 --resolution 17 --refine 10% --budget 100
 slice bounce --dims 0 1 --resolution 3 --fidelity draft --tolerance 20%
@@ -57,7 +57,7 @@ replay bounce --params point.json --no-film
 export run --to csv --out made.csv
 export cut --to netcdf --out made.nc
 view cut
-bounce --axis y --resolution 3 --extent 0:1 --fidelity draft
+bounce --axis y --resolution 3 --window 0:1 --fidelity draft
 bench branin --batch 2 --seconds 0
 check branin --points 2
 tradeoff bounce --points 2 --variants precision
@@ -220,7 +220,7 @@ def _value(chance: random.Random, after: str, places: Sequence[str]) -> str:
     if after in ("--set", "--option") and chance.randrange(4):
         return f"{chance.choice(NAMES)}={chance.choice([*NUMBERS, *WORDS])}"
     numeric = ("--resolution", "--frames", "--budget", "--seed", "--seeds", "--points", "--samples", "--top", "--batch")
-    numeric += ("--seconds", "--workers", "--port", "--print", "--extent", "--tolerance")
+    numeric += ("--seconds", "--workers", "--port", "--figure-width-mm", "--window", "--tolerance")
     if after in numeric and chance.randrange(5):
         return chance.choice(SIZES if chance.randrange(3) else NUMBERS)
     return chance.choice(chance.choice([NUMBERS, WORDS, places]))

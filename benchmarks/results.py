@@ -111,7 +111,7 @@ KINDS = {
     "kept extremes": Kind(f"{TURN} {MADE}", ("envs bounce",), where="home/gradscape"),
     "report": Kind(
         f"report cut --points 2 --out {MADE} --json",
-        (f"report cut --points 2 --out {MADE} --print 85",),
+        (f"report cut --points 2 --out {MADE} --figure-width-mm 85",),
         needs=(f"{CUT} cut",),
     ),
     "overlay": Kind(

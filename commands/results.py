@@ -22,7 +22,6 @@ SHOWN = {
     "League": "league:show",
     "list[Entry]": "environments:show_entries",
     "list[Method]": "environments:show_methods",
-    "Overlay": "overlay:show",
     "PairRanking": "pairs:show",
     "Plan": "plan:show",
     "Race": "race:show",

@@ -2,17 +2,14 @@
 
 import subprocess
 import sys
-from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 import pytest
-import typer
 from benchmarks.results import leave_blank
 
-from gradscape.cli import app, main
+from gradscape.cli import main
 
 needs_taichi = pytest.mark.skipif(find_spec("taichi") is None, reason="Taichi has no wheels past Python 3.12")
 NO_BROWSER = "there is no Chromium here: `apt-get install -y chromium` (or your system's) lets them run"
@@ -24,18 +21,6 @@ class Said:
     returncode: int
     stdout: str
     stderr: str
-
-
-def verbs() -> dict[str, Any]:
-    """Return every verb of the command by what is typed after `landscape`."""
-    return dict(_leaves(typer.main.get_command(app), ()))
-
-
-def _leaves(command: Any, words: tuple[str, ...]) -> Iterator[tuple[str, Any]]:
-    for name, inner in getattr(command, "commands", {}).items():
-        yield from _leaves(inner, (*words, name))
-    if not hasattr(command, "commands"):
-        yield " ".join(words), command
 
 
 def make(folder: Path, *commands: str) -> Path:

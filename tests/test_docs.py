@@ -14,10 +14,9 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
-import typer
 
-from gradscape.cli import app, main
-from gradscape.commands import view
+from gradscape.cli import main, verbs
+from gradscape.api import view
 from gradscape.gallery.files import DATA
 from gradscape.jobs.workers import workers
 
@@ -29,7 +28,6 @@ PAGES = [ROOT / "README.md", *(one for one in sorted((ROOT / "docs").rglob("*.md
 README = PAGES[0].read_text()
 TEXT = "\n".join(page.read_text() for page in PAGES)
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-COMMANDS = typer.main.get_command(app).commands  # type: ignore[attr-defined]
 BLOCKS = [
     block
     for block in re.findall(r"```python\n(.*?)```", TEXT, flags=re.DOTALL)
@@ -135,19 +133,18 @@ ONCE = list({tuple(sorted(small(command))): command for command in reversed(RUN)
 def test_there_are_commands_of_both_kinds() -> None:
     assert len(RUN) > 35
     assert len(FORMS) > 15
-    assert {verb_of(shlex.split(command)) for command in RUN} >= {*COMMANDS, "gallery build"} - {
-        "gallery", "envs", "info", "bench",
+    assert {verb_of(shlex.split(command)) for command in RUN} >= {*verbs()} - {
+        "gallery compute", "gallery list", "gallery serve", "envs", "info", "bench",
     }  # fmt: skip
 
 
 @pytest.mark.parametrize("command", FORMS)
 def test_forms_name_verbs_and_options_there_are(command: str) -> None:
     words = re.split(r"[\s|\\]+", command)
-    verbs = (
-        [COMMANDS["gallery"].commands[verb] for verb in words[2:]] if words[1] == "gallery" else [COMMANDS[words[1]]]
-    )
+    known = verbs()
+    named = [known[f"gallery {verb}"] for verb in words[2:]] if words[1] == "gallery" else [known[words[1]]]
     for option in (word for word in words if word.startswith("--")):
-        assert option in {one for verb in verbs for param in verb.params for one in param.opts}
+        assert option in {name for verb in named for one in verb.options for name in one.names}
 
 
 @pytest.fixture(scope="module")
@@ -201,7 +198,7 @@ def test_every_command_runs(
 
     monkeypatch.setenv("XDG_DATA_HOME", str(desk / "data"))
     monkeypatch.setattr("http.server.ThreadingHTTPServer.serve_forever", stop)
-    monkeypatch.setattr(view, "show_recording", lambda path, bars, *, serve: opened.append(path))
+    monkeypatch.setattr(view, "show_recording", lambda path, *, serve: opened.append(path))
     for name, value in (("REPETITION", 0.01), ("LARGEST", 0.01), ("RESAMPLES", 9)):
         monkeypatch.setattr(f"gradscape.landscapes.measures.fidelity.{name}", value)
     if "taichi" in command.split() and find_spec("taichi") is None:

@@ -15,14 +15,13 @@ from typing import Any
 import numcodecs.pickles
 import numpy as np
 import pytest
-import typer
 import zarr
 from benchmarks import results
 from benchmarks.damage import Trial, files
 from benchmarks.results import KINDS
 
 from gradscape import Environment
-from gradscape.cli import app, main
+from gradscape.cli import main, verbs
 
 from .processes import alone
 
@@ -151,6 +150,5 @@ def test_a_trap_is_sprung_by_who_unpickles_it(tmp_path: Path, monkeypatch: pytes
 
 def test_every_verb_that_reads_a_folder_is_tried() -> None:
     tried = {command.split()[0] for kind in KINDS.values() for command in (kind.make, *kind.reads)}
-    verbs = typer.main.get_command(app).commands  # type: ignore[attr-defined]
-    folders = {name for name, verb in verbs.items() if any("--out" in one.opts for one in verb.params)}
+    folders = {name for name, verb in verbs().items() if any("--out" in one.names for one in verb.options)}
     assert tried >= folders

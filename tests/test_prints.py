@@ -1,4 +1,4 @@
-"""`--print`: pictures for print beside those for a screen, drawn again without computing anything."""
+"""`--figure-width-mm`: pictures for print beside those for a screen, drawn again without computing anything."""
 
 import json
 from collections.abc import Callable
@@ -46,7 +46,7 @@ def test_a_command_repeated_with_print_draws_and_computes_nothing(
     first = run(*command, cwd=tmp_path)
     assert first.returncode == 0, first.stderr
     assert not {name for name in json.loads(first.stdout)["files"] if name.endswith((".pdf", ".svg"))}
-    again = run(*command, "--print", "85", "--print", "170", cwd=tmp_path)
+    again = run(*command, "--figure-width-mm", "85", "--figure-width-mm", "170", cwd=tmp_path)
     assert again.returncode == 0, again.stderr
     assert resumed in again.stderr
     wanted = prints(picture, 85, 170)
@@ -58,7 +58,7 @@ def test_a_command_repeated_with_print_draws_and_computes_nothing(
 
 
 def test_what_begins_anew_leaves_no_print_of_what_was(run: Run, tmp_path: Path) -> None:
-    run(*SLICE, "--print", "85", cwd=tmp_path)
+    run(*SLICE, "--figure-width-mm", "85", cwd=tmp_path)
     done = run(*SLICE, "--force", "--resolution", "4", "--json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert not list((tmp_path / "cut").glob("*.pdf"))
@@ -76,7 +76,7 @@ def test_overlays_comparisons_surfaces_and_replays_are_printed_too(run: Run, tmp
         ("episode", ("replay", "bounce", "--no-film", "--device", "cpu", "--out", "episode")),
     ):
         for _ in range(2):  # the second time into a folder that has prints
-            done = run(*command, "--print", "85", cwd=tmp_path)
+            done = run(*command, "--figure-width-mm", "85", cwd=tmp_path)
             assert done.returncode == 0, done.stderr
             assert whole(tmp_path / name, prints(name, 85))
             assert prints(name, 85)[-1] in done.stderr
@@ -85,7 +85,7 @@ def test_overlays_comparisons_surfaces_and_replays_are_printed_too(run: Run, tmp
 def test_a_report_is_printed_from_what_it_kept(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run(*SLICE, cwd=tmp_path)
     command = ("report", "cut", "--points", "2", "--out", "told")
-    first = run(*command, "--print", "85", cwd=tmp_path)
+    first = run(*command, "--figure-width-mm", "85", cwd=tmp_path)
     assert first.returncode == 0, first.stderr
     name = prints("gradient-quality", 85)[0]
     before = (tmp_path / "told" / name).read_bytes()
@@ -95,25 +95,25 @@ def test_a_report_is_printed_from_what_it_kept(run: Run, tmp_path: Path, monkeyp
         raise AssertionError("it is measured again")
 
     monkeypatch.setattr("gradscape.jobs.report.measure", compute)
-    again = run(*command, "--print", "85", cwd=tmp_path)
+    again = run(*command, "--figure-width-mm", "85", cwd=tmp_path)
     assert again.returncode == 0, again.stderr
     assert (tmp_path / "told" / name).read_bytes() == before
     for file in (tmp_path / "told").iterdir():
         (tmp_path / "cut" / file.name).write_bytes(file.read_bytes())
-    beside = run("report", "cut", "--points", "2", "--out", "copied", "--print", "85", cwd=tmp_path)
+    beside = run("report", "cut", "--points", "2", "--out", "copied", "--figure-width-mm", "85", cwd=tmp_path)
     assert "copied is copied from cut" in beside.stderr
     assert (tmp_path / "copied" / name).read_bytes() == before
     (tmp_path / "told/gradient-quality.npz").unlink()
-    older = run(*command, "--print", "85", cwd=tmp_path)
+    older = run(*command, "--figure-width-mm", "85", cwd=tmp_path)
     assert older.returncode == 2
     assert older.stderr.splitlines()[-1].endswith("delete it to measure it anew")
 
 
 @pytest.mark.parametrize("width", ["40", "wide"])
 def test_no_page_is_so_wide(run: Run, tmp_path: Path, width: str) -> None:
-    done = run(*SLICE, "--print", width, cwd=tmp_path)
+    done = run(*SLICE, "--figure-width-mm", width, cwd=tmp_path)
     assert done.returncode == 2
-    assert "--print" in done.stderr
+    assert "--figure-width-mm" in done.stderr
     assert not (tmp_path / "cut").exists()
 
 

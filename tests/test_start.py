@@ -19,7 +19,7 @@ from gradscape import __main__ as command
 from .command import modules, verbs
 
 PROJECT = tomllib.loads((Path(__file__).parent.parent / "pyproject.toml").read_text())["project"]
-TOLD = {"typer", "rich"}  # a command's words, and its tables
+TOLD = {"cyclopts", "rich"}  # a command's words, and its tables
 SLICED = TOLD | {"numpy", "torch", "jaxtyping", "xarray", "pandas", "pyarrow", "zarr", "scipy", "matplotlib"}
 BROUGHT = {"torchgen", "mpl_toolkits", "cloudpickle"}  # by torch, matplotlib and pyarrow
 BOWL = """
@@ -58,7 +58,7 @@ def packages(loaded: set[str]) -> set[str]:
 REFUSED = (
     *("slice nosuch --dims 0 1", "check own.py:Bowls", "check missing.py:Bowl", "replay nosuch", "tradeoff nosuch"),
     *("slice branin --dims 7 8", "slice fluid --dims 0 --along gradient", "slice fluid --along nowhere"),
-    *("slice fluid --dims 0 --resolution x", "slice fluid --dims 0 --extent x", "slice fluid --dims 0 --refine x"),
+    *("slice fluid --dims 0 --resolution x", "slice fluid --dims 0 --window x", "slice fluid --dims 0 --refine x"),
     *("slice fluid --dims 0 --tolerance x", "slice fluid --dims 0 --tolerance 5% --fidelity draft"),
     *("slice bounce --dims 0 --set nosuch", "slice bounce --dims 0 --fidelity nosuch"),
     *("slice bounce --dims 0 --device nosuch", "slice bounce --dims 0 --engine nosuch", "bounce --axis w"),
@@ -104,7 +104,7 @@ def test_what_the_project_depends_on_is_found_by_the_names_it_is_imported_by() -
 def test_no_help_imports_more_than_what_reads_the_command() -> None:
     each = [[*name.split(), "--help"] for name in verbs()]
     assert len(each) > 20
-    assert packages(modules(["--help"], *each)) == {"typer"}
+    assert packages(modules(["--help"], *each)) == TOLD
 
 
 @pytest.mark.parametrize("verb", ["envs", "methods"])

@@ -9,12 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import typer
 from rich.progress import Progress
 
 import gradscape
 from gradscape import Environment
-from gradscape.cli import app
+from gradscape.cli import Option, verbs
 from gradscape.commands.terminal import Console, Described
 from gradscape.envs.registry import make
 from gradscape.landscapes.storage.files import make_folder, resolve
@@ -40,15 +39,12 @@ replay bounce --no-film
 export cut
 view cut
 bounce --axis y --resolution 3
-plan branin
 bench branin --batch 2 --seconds 0
 check branin --points 2
-tradeoff bounce --points 2 --variants dt
-extremes bounce --points 4 --knobs dt
 pairs ackley --samples 2 --top 3
 census ackley --slices 1 --resolution 6
 card --scene control --resolution 3
-report cut --points 2
+report cut --points-per-axis 2
 gallery compute --only bounce --part reports
 gallery list
 gallery build
@@ -56,19 +52,13 @@ gallery serve
 """.strip().splitlines()
 
 
-def leaves() -> dict[tuple[str, ...], Any]:
-    top = typer.main.get_command(app).commands  # type: ignore[attr-defined]
-    found = {(name,): command for name, command in top.items() if name not in ("gallery", "info")}
-    return found | {("gallery", name): command for name, command in top["gallery"].commands.items()}
-
-
-VERBS = leaves()
+VERBS = {tuple(words.split()): verb for words, verb in verbs().items() if words not in ("info", "plan", "study")}
 WORDS = {verb: next(words for line in BASE if (words := line.split())[: len(verb)] == [*verb]) for verb in VERBS}
 PATHS = [  # of what a verb says that it is a file or a folder
-    pytest.param(verb, param, id=f"{' '.join(verb)} {param.name}")
-    for verb, command in VERBS.items()
-    for param in command.params
-    if param.type_descriptor.annotation in (str, list[str]) and re.search(r"(?i)file|folder", param.help or "")
+    pytest.param(verb, option, id=f"{' '.join(verb)} {option.names[0]}")
+    for verb, one in VERBS.items()
+    for option in one.options
+    if re.search(r"(?i)file|folder", option.help)
 ]
 
 
@@ -86,23 +76,19 @@ def desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def _is_option(param: Any) -> bool:
-    return bool(param.opts[0].startswith("-"))
-
-
-def said_with(verb: tuple[str, ...], param: Any, value: str) -> list[str]:
-    """Return a verb's words with a value in the place of an option's or an argument's."""
+def said_with(verb: tuple[str, ...], option: Option, value: str) -> list[str]:
+    """Return a verb's words with a value for an option, or for one of its arguments."""
     words = list(WORDS[verb])
-    if _is_option(param):
-        return [*words, param.opts[0], value]
-    places = [other.name for other in VERBS[verb].params if not _is_option(other)]
-    at = len(verb) + places.index(param.name)
+    if option.names[0].startswith("-"):
+        return [*words, option.names[0], value]
+    places = [other.names[0] for other in VERBS[verb].options if not other.names[0].startswith("-")]
+    at = len(verb) + places.index(option.names[0])
     return [*words[:at], value, *words[at + 1 :]]
 
 
 @pytest.mark.parametrize(("verb", "param"), PATHS)
 def test_a_path_nobody_meant_ends_with_a_message(
-    run: Callable[..., Said], desk: Path, verb: tuple[str, ...], param: Any
+    run: Callable[..., Said], desk: Path, verb: tuple[str, ...], param: Option
 ) -> None:
     for value in HOSTILE:
         done = run(*said_with(verb, param, value), cwd=desk)
@@ -111,7 +97,9 @@ def test_a_path_nobody_meant_ends_with_a_message(
         assert "\\[" not in done.stdout + done.stderr
 
 
-@pytest.mark.parametrize("verb", [verb for verb in VERBS if any(p.opts == ["--set"] for p in VERBS[verb].params)])
+@pytest.mark.parametrize(
+    "verb", [verb for verb in VERBS if any(one.names == ("--set",) for one in VERBS[verb].options)]
+)
 def test_an_option_of_a_scene_is_not_called_as_what_every_scene_has(
     run: Callable[..., Said], desk: Path, verb: tuple[str, ...]
 ) -> None:

@@ -104,7 +104,7 @@ def test_axes_of_pictures_show_decades(map_of_spring: gs.Slice) -> None:
     assert labels_of(figure.axes[1].xaxis) == ["0.01", "1", "100", "10⁴", "10⁶"]
     assert figure.axes[1].get_xlabel() == "k [N/m]"
     assert labels_of(figure.axes[1].yaxis)[0].startswith("0")
-    line = gs.slice(Spring(), ("k",), resolution=5, extent=(1, 100), out=map_of_spring.folder.parent / "line")  # type: ignore[union-attr]
+    line = gs.slice(Spring(), ("k",), resolution=5, window=(1, 100), out=map_of_spring.folder.parent / "line")  # type: ignore[union-attr]
     figure = profile_figure(line.data)
     figure.draw_without_rendering()
     assert labels_of(figure.axes[-1].xaxis) == ["1", "10", "100"]

@@ -83,7 +83,7 @@ def test_what_raised_is_counted_and_said_and_a_loss_without_gradient_is_no_failu
 
 
 def test_a_point_and_an_extent_cut_what_they_say() -> None:
-    line = gs.slice(bowl(), ("b",), resolution=3, through=torch.tensor([0.5, 0.0]), extent=(-0.5, 0.5))
+    line = gs.slice(bowl(), ("b",), resolution=3, through=torch.tensor([0.5, 0.0]), window=(-0.5, 0.5))
     np.testing.assert_array_equal(line.data["loss"], [0.5, 0.25, 0.5])
     assert "1 points" not in repr(line)
     with pytest.raises(ValueError, match="has no example 'aim'; it has none"):

@@ -68,7 +68,7 @@ def test_options_are_those_of_b(run: Run, desk: Path) -> None:
 
 
 def test_what_lies_off_the_box_is_left_out_of_b_where_it_is_of_a(run: Run, tmp_path: Path) -> None:
-    cut = "slice bounce --along random:3 --through random:1 --resolution 5 --extent 1.5 --device cpu --out a"
+    cut = "slice bounce --along random:3 --through random:1 --resolution 5 --window 1.5 --device cpu --out a"
     assert run(*cut.split(), cwd=tmp_path).returncode == 0
     done = run(*STANDARD.split(), "--json", cwd=tmp_path)
     said = json.loads(done.stdout)

@@ -57,7 +57,7 @@ def test_a_study_leaves_a_record_a_picture_and_the_margin(run: Command, tmp_path
         "stability: not measured; `landscape extremes stepping` measures it"
         in run("envs", "stepping", cwd=tmp_path).stdout
     )
-    done = run(*TURN, "--grid", "3", "--json", "--print", "85", cwd=tmp_path)
+    done = run(*TURN, "--grid", "3", "--json", "--figure-width-mm", "85", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     report = json.loads(done.stdout)
     assert {**read_json(tmp_path / "turned/extremes.json"), "folder": "turned"} == report

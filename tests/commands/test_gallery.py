@@ -279,7 +279,7 @@ def test_without_a_checkout_s_data_results_go_to_the_folder_where_one_stands(
 def test_view_opens_the_site(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert gallery("build", "--data", str(data), "--out", str(tmp_path / "my site")) == 0
     opened: list[str] = []
-    monkeypatch.setattr("typer.launch", lambda path: opened.append(path) or 0)
+    monkeypatch.setattr("gradscape.api.view.launch", lambda path: opened.append(str(path)) or True)
     monkeypatch.setenv("DISPLAY", ":0")
     with pytest.raises(SystemExit) as left:
         main(["view", str(tmp_path / "my site")])

@@ -3,48 +3,57 @@
 from __future__ import annotations
 
 import re
-from typing import Any
 
 import pytest
-import typer
 
-from gradscape.cli import app, main
-
-
-def verbs() -> dict[str, Any]:
-    """Return every verb of the command by its name."""
-    top = typer.main.get_command(app).commands  # type: ignore[attr-defined]
-    found = {name: command for name, command in top.items() if name != "gallery"}
-    return found | {f"gallery {name}": command for name, command in top["gallery"].commands.items()}
-
+from gradscape.cli import GROUPS, main, verbs
 
 VERBS = verbs()
 
 
-@pytest.mark.parametrize("name", VERBS)
-def test_a_verb_has_a_sentence_and_an_example(name: str) -> None:
-    text = str(VERBS[name].help)
-    first = text.split("\n\n")[0].strip()
-    assert first[0].isupper()
-    assert first.endswith(".")
-    assert len(first.split()) <= 25
-    assert f"Example: landscape {name}" in " ".join(text.split())
+def test_a_verb_has_a_sentence_and_an_example() -> None:
+    for name, verb in VERBS.items():
+        text = verb.help()
+        first = text.split("\n\n")[0]
+        assert re.match(r"[A-Z].*\.$", first), name
+        assert len(first.split()) <= 25, name
+        assert f"Example: landscape {name}" in text
 
 
-def test_help_lists_every_verb_once_in_four_groups_with_its_whole_sentence(capsys: pytest.CaptureFixture[str]) -> None:
+def test_help_lists_every_verb_in_four_groups_with_its_whole_sentence(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "200")
     with pytest.raises(SystemExit):
         main(["--help"])
-    text = capsys.readouterr().out
-    assert re.findall(r"^(\w+):$", text, re.MULTILINE) == ["Options", "Look", "Measure", "Search", "Publish"]
-    top = typer.main.get_command(app).commands  # type: ignore[attr-defined]
-    listed = re.findall(r"^  (\w+) +([A-Z].+(?:\n {4,}.+)*)$", text.partition("Look:")[2], re.MULTILINE)
-    assert len(listed) == len(top)
-    assert {name: " ".join(said.split()) for name, said in listed} == {
-        name: " ".join(verb.help.partition("\n\n")[0].split()) for name, verb in top.items()
-    }
+    text = " ".join(capsys.readouterr().out.split())
+    places = [text.index(f"─ {heading} ─") for heading in GROUPS]
+    assert places == sorted(places)
+    for name, verb in VERBS.items():
+        if not name.startswith("gallery"):
+            assert f"│ {name} {verb.help().split(chr(10))[0]}" in re.sub(r" +", " ", text), name
 
 
 @pytest.mark.parametrize("name", VERBS)
 def test_every_argument_and_option_is_explained_in_sentences(name: str) -> None:
-    said = {param.name: str(param.help) for param in VERBS[name].params if not param.hidden}
+    said = {one.names[0]: one.help for one in VERBS[name].options}
     assert {one: text for one, text in said.items() if not re.match(r"[A-Z][^;]*(;[^;]*)?\.$", text, re.DOTALL)} == {}
+
+
+@pytest.mark.parametrize(
+    ("words", "today"),
+    [
+        ("tradeoff bounce", "landscape study fidelity"),
+        ("extremes bounce", "landscape study extremes"),
+        ("slice branin --extent 0.5", "--window"),
+        ("slice branin --print=85", "--figure-width-mm"),
+        ("bench branin --against taichi", "--second-engine"),
+        ("race branin --report", "--claims"),
+        ("plan fluid --dims 6 8", "landscape plan slice fluid"),
+    ],
+)
+def test_an_earlier_spelling_ends_with_todays(words: str, today: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as left:
+        main(words.split())
+    assert left.value.code == 2
+    assert today in capsys.readouterr().err

@@ -34,7 +34,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.drawn
 def test_the_parts_of_a_model_are_printed_drawn_and_kept(run: Command, tmp_path: Path) -> None:
-    done = run(*TRADE, "--json", "--print", "85", cwd=tmp_path)
+    done = run(*TRADE, "--json", "--figure-width-mm", "85", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     report = json.loads(done.stdout)
     assert {**read_json(tmp_path / "parts/model.json"), "folder": "parts"} == report

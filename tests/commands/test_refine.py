@@ -114,7 +114,7 @@ def test_a_job_that_is_stopped_keeps_what_it_has_and_draws_it(tmp_path: Path) ->
     with pytest.raises(Stopped, match="of 1089 points are kept"):
         job("two").run(Impatient())
     assert (tmp_path / "two" / "landscape.png").exists()
-    kept, patient = job("two").say_kept(), Noted()
+    kept, patient = job("two").kept(), Noted()
     rest = job("two").run(patient)
     assert f"{rest.resumed} of 1089 points are kept" in kept
     assert f"up to {1089 - rest.resumed} episodes with gradients to compute, {rest.resumed} are there" in patient.said

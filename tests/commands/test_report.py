@@ -34,7 +34,7 @@ def cut(sampled: Path, tmp_path: Path) -> Path:
 
 @pytest.mark.drawn
 def test_a_slice_is_reported_in_numbers_and_words(run: Run, cut: Path, tmp_path: Path) -> None:
-    done = run("report", "cut", "--points", "2", "--out", "told", "--json", cwd=tmp_path)
+    done = run("report", "cut", "--points-per-axis", "2", "--out", "told", "--json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     record = json.loads(done.stdout)
     assert record == {**read_json(tmp_path / "told/report.json"), "folder": "told"}
@@ -47,16 +47,16 @@ def test_a_slice_is_reported_in_numbers_and_words(run: Run, cut: Path, tmp_path:
     named = read_json(tmp_path / "told/measures.json")
     assert named["Local minima deeper than 1 % of the range"] == "3"
     assert (tmp_path / "told/gradient-quality.png").read_bytes().startswith(b"\x89PNG")
-    again = run("report", "cut", "--points", "2", "--out", "told", cwd=tmp_path)
+    again = run("report", "cut", "--points-per-axis", "2", "--out", "told", cwd=tmp_path)
     assert "there already" in again.stderr
     assert "smooth with local minima: minima deeper than 1 % of the range: 3" in again.stdout
-    other = run("report", "cut", "--points", "3", "--out", "told", cwd=tmp_path)
+    other = run("report", "cut", "--points-per-axis", "3", "--out", "told", cwd=tmp_path)
     assert other.returncode == 2
     assert "holds another report (points 2 there, 3 here)" in other.stderr
 
 
 def test_an_environment_without_figures_is_sampled_first(run: Run, tmp_path: Path) -> None:
-    done = run("report", "beale", "--points", "2", "--json", cwd=tmp_path)
+    done = run("report", "beale", "--points-per-axis", "2", "--json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     record = json.loads(done.stdout)
     assert record["env"] == "beale"
@@ -69,7 +69,7 @@ def test_all_makes_a_table_with_the_papers_words(run: Run, tmp_path: Path) -> No
     plane = ("slice", "pinball-2", "--dims", "0", "1", "--resolution", "5", "--out", "data/pinball-2-0-1")
     for cut in (line, plane):
         run(*cut, "--fidelity", "draft", "--device", "cpu", cwd=tmp_path)
-    command = ("report", "--all", "--data", "data", "--points", "2", "--out", "all", "--device", "cpu")
+    command = ("report", "--all", "--data", "data", "--points-per-axis", "2", "--out", "all", "--device", "cpu")
     done = run(*command, "--json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     summary = json.loads(done.stdout)
@@ -102,7 +102,7 @@ def test_one_slice_that_fails_does_not_lose_the_others(
         return measure(*parts)
 
     monkeypatch.setattr(job, "measure", failing)
-    command = ("report", "--all", "--data", "data", "--points", "2", "--out", "all")
+    command = ("report", "--all", "--data", "data", "--points-per-axis", "2", "--out", "all")
     done = run(*command, "--json", cwd=tmp_path)
     assert done.returncode == 1
     assert done.stderr.splitlines()[-1] == "not reported: bounce-x: RuntimeError: out of memory"
@@ -117,24 +117,24 @@ def test_one_slice_that_fails_does_not_lose_the_others(
 
 
 def test_a_report_measured_on_another_device_is_taken_and_named(run: Run, cut: Path, tmp_path: Path) -> None:
-    run("report", "cut", "--points", "2", "--out", "told", cwd=tmp_path)
+    run("report", "cut", "--points-per-axis", "2", "--out", "told", cwd=tmp_path)
     file = tmp_path / "told/report.json"
     write_record(file, {**read_json(file), "device": "cuda"})
-    done = run("report", "cut", "--points", "2", "--out", "told", cwd=tmp_path)
+    done = run("report", "cut", "--points-per-axis", "2", "--out", "told", cwd=tmp_path)
     assert done.returncode == 0
     assert "told is there already, measured on cuda" in done.stderr
 
 
 def test_a_report_beside_its_slice_is_copied_unless_it_is_another(run: Run, cut: Path, tmp_path: Path) -> None:
-    run("report", "cut", "--points", "2", "--out", "told", cwd=tmp_path)
+    run("report", "cut", "--points-per-axis", "2", "--out", "told", cwd=tmp_path)
     for file in (tmp_path / "told").iterdir():
         shutil.copyfile(file, cut / file.name)
-    same = run("report", "cut", "--points", "2", "--out", "same", cwd=tmp_path)
+    same = run("report", "cut", "--points-per-axis", "2", "--out", "same", cwd=tmp_path)
     assert "same is copied from cut" in same.stderr
     assert "episodes" not in same.stderr
     for file in (tmp_path / "told").iterdir():
         assert (tmp_path / "same" / file.name).read_bytes() == file.read_bytes()
-    other = run("report", "cut", "--points", "3", "--out", "other", cwd=tmp_path)
+    other = run("report", "cut", "--points-per-axis", "3", "--out", "other", cwd=tmp_path)
     assert "copied" not in other.stderr
     assert json.loads((tmp_path / "other/report.json").read_text())["key"]["points"] == 3
 
@@ -184,7 +184,7 @@ def test_a_slice_of_another_model_is_reported_with_a_warning(
     run: Run, cut: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(Function, "model_version", 99)
-    done = run("report", "cut", "--points", "2", "--out", "told", cwd=tmp_path)
+    done = run("report", "cut", "--points-per-axis", "2", "--out", "told", cwd=tmp_path)
     assert "warning: cut was sampled otherwise (model_version 1 there, 99 here" in done.stderr
 
 
@@ -195,7 +195,7 @@ def test_a_slice_of_another_model_is_reported_with_a_warning(
         (["branin", "--all"], "a slice's folder, an environment, or --all"),
         (["brannin"], "did you mean branin?"),
         (["--all", "--data", "nowhere"], "holds no figures yet"),
-        (["branin", "--points", "1"], "--points"),
+        (["branin", "--points-per-axis", "1"], "--points-per-axis"),
     ],
 )
 def test_bad_input_is_refused(run: Run, tmp_path: Path, arguments: list[str], said: str) -> None:

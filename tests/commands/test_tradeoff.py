@@ -109,7 +109,7 @@ def test_a_tradeoff_is_printed_without_being_measured_again(
     assert run(*TRADE, "--variants", "precision", cwd=tmp_path).returncode == 0
     simulate, rows = Converging._evaluate, list[int]()
     monkeypatch.setattr(Converging, "_evaluate", lambda *x, grad: rows.append(len(x[1])) or simulate(*x, grad=grad))
-    done = run(*TRADE, "--variants", "precision", "--print", "85", cwd=tmp_path)
+    done = run(*TRADE, "--variants", "precision", "--figure-width-mm", "85", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "tradeoff-85mm.pdf, tradeoff-85mm.svg" in done.stderr
     assert (tmp_path / "trade/tradeoff-85mm.pdf").read_bytes().startswith(b"%PDF")

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from gradscape.commands import view
+from gradscape.api import view
 from gradscape.landscapes.draw.recordings import viewer
 
 from ..command import Said
@@ -56,10 +56,10 @@ def test_a_picture_opens_in_the_systems_own_program(
 ) -> None:
     monkeypatch.setenv("DISPLAY", ":1")
     launched: list[str] = []
-    monkeypatch.setattr("typer.launch", lambda path: launched.append(path) or 0)
+    monkeypatch.setattr("gradscape.api.view.launch", lambda path: launched.append(str(path)) or True)
     assert run(*command.split(), cwd=desk).returncode == 0
     assert launched == [str((desk / opened).resolve())]
-    monkeypatch.setattr("typer.launch", lambda path: 1)
+    monkeypatch.setattr("gradscape.api.view.launch", lambda path: False)
     refused = run(*command.split(), cwd=desk)
     assert (refused.returncode, "no program of this system opens" in refused.stderr) == (1, True)
 

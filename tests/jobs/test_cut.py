@@ -77,7 +77,7 @@ def test_from_a_corner_that_a_direction_points_out_of_it_covers_half_a_width():
 
 
 def test_what_is_off_the_box_is_left_out(tmp_path):
-    cut = gs.slice(WELLS, along="random:1", through="random:2", resolution=12, extent=1.5, out=tmp_path / "cut")
+    cut = gs.slice(WELLS, along="random:1", through="random:2", resolution=12, window=1.5, out=tmp_path / "cut")
     status, plane = cut.data.status.to_numpy(), Plane.from_record(json.loads(cut.data.attrs["identity"])["plane"])
     u, v = plane.axes()
     unit = SPACE.to_unit(plane.lift(torch.stack(torch.meshgrid(u, v, indexing="xy"), dim=-1))).numpy()
@@ -113,9 +113,9 @@ def test_a_slice_that_was_begun_goes_on_along_its_own_directions(tmp_path, monke
 
 def test_the_command_and_python_go_on_with_the_same_slice(run, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    words = ["--along", "random:1", "--extent", "0.5", "--resolution", "2", "--device", "cpu", "--json"]
+    words = ["--along", "random:1", "--window", "0.5", "--resolution", "2", "--device", "cpu", "--json"]
     said = json.loads(run("slice", "bounce", *words, cwd=tmp_path).stdout)
-    found = gs.slice("bounce", along="random:1", extent=0.5, resolution=2, device="cpu")
+    found = gs.slice("bounce", along="random:1", window=0.5, resolution=2, device="cpu")
     assert found.folder == Path(said["folder"])
 
 

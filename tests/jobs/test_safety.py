@@ -57,7 +57,7 @@ def test_what_needs_no_new_evaluation_works(planted: Path) -> None:
 def test_a_simulator_that_is_given_is_the_one_that_is_asked(planted: Path) -> None:
     space = gs.ParameterSpace({"x": (-1, 1), "y": (-1, 1)})
     f = gs.from_torch(lambda x: (x**2).sum(1), space, name="another name")
-    assert gs.report("slice", env=f, points=2).words
+    assert gs.report("slice", env=f, points_per_axis=2).words
     assert gs.open_slice("slice", env=f).report(points=2).verdict.words
     with pytest.raises(ValueError, match="whose losses are others now"):
         gs.open_slice("slice", env=gs.from_torch(lambda x: (x**4).sum(1), space)).report(points=2)
