@@ -67,7 +67,7 @@ STOPPED = 130  # the exit code of what Ctrl-C has ended
 LONG_PATH = 200  # characters of a path that an error shows
 DIMS = "--dims"
 JSON = Annotated[bool, Parameter(show_default=False, help="Print the result as one JSON object on standard output.")]
-WORDS = Parameter(negative_bool=(), negative_iterable=())
+WORDS = Parameter(negative_bool=(), negative_iterable=(), allow_repeating=True)
 
 
 @dataclass(frozen=True)

@@ -73,5 +73,8 @@ def _second(given: str | Path | Slice | Scene, keywords: SceneKeywords) -> Slice
     if _is_scene(given):
         return environment(given, keywords)
     if keywords:
-        raise ValueError(f"{', '.join(keywords)} are of an environment to sample; {given} is there: leave them out")
+        name = given if isinstance(given, str | Path) else "b"
+        raise ValueError(
+            f"{', '.join(keywords)} are of an environment to sample; {name} is there already: leave them out"
+        )
     return as_slice(given)

@@ -260,7 +260,7 @@ def _workers(workers: int | None, scheduler: str | None) -> int:
     if workers and scheduler:
         raise ValueError(f"--scheduler has workers of its own, so --workers is left out; got {workers}")
     if workers is not None and workers < 1:
-        raise ValueError(f"--workers is a number of processes, 1 or more; got {workers}")
+        raise ValueError(f"a number of workers is a whole number of at least 1; got {workers}")
     if workers is None and current().on_disk:  # the command, which starts no script again
         from ..envs.engines.runtime import cores
 

@@ -76,7 +76,7 @@ def sweep(
         Range to cover: a fraction of the box around the point, or the values LOW:HIGH. The default is the whole box.
     """
     if over is None:
-        raise ValueError("a sweep takes --over: a third parameter, horizon or smoothing; got none")
+        raise ValueError("a sweep takes over: a third parameter, horizon or smoothing; got none")
     from ..jobs.cut import cut, describe_cut, refuse_cut
 
     refuse_cut(dims, along)

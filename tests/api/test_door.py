@@ -39,7 +39,7 @@ def test_a_type_checker_sees_what_is_imported_when_used() -> None:
         if isinstance(node, ast.ImportFrom)
         for name in node.names
     }
-    assert seen == gradscape._HOMES
+    assert seen == gradscape._HOME_OF
     assert sorted(gradscape.__all__) == sorted([*seen, "__version__"])
 
 

@@ -60,10 +60,10 @@ def test_a_sweep_along_directions_is_the_slices_at_its_points(
 
 
 def test_a_sweep_says_how_it_is_made_again(tmp_path: Path) -> None:
-    how = {"through": "random:1", "extent": 0.5, "gradients": False, "frames": 2, "resolution": 3}
+    how = {"through": "random:1", "window": 0.5, "gradients": False, "frames": 2, "resolution": 3}
     found = sweep("bounce", (0, 1), 2, out=tmp_path / "far", device="cpu", **how)
     command = stored_provenance(found.slices[0])["command"]
-    again = eval(command.replace("resolution=3", f"resolution=3, out={str(tmp_path / 'again')!r}"))
+    again = eval(command.replace(str(tmp_path / "far"), str(tmp_path / "again")))
     for one, other in zip(found.slices, again.slices, strict=True):
         xr.testing.assert_equal(one, other)
     assert "grad" not in again.slices[0]

@@ -44,7 +44,7 @@ def test_two_slices_are_compared_and_nothing_is_sampled(run: Run, desk: Path) ->
     assert (said["points"], said["compared"]) == (25, 25)
     assert set(said["differing"]) == {"fidelity", "settings.dt"}
     assert "fidelity: 'draft' in A, 'standard' in B" in done.stderr
-    assert "both: compare.png, compare.json" in done.stderr
+    assert "both: compare.json, compare.png" in done.stderr
 
 
 def test_an_environment_is_sampled_on_the_slices_own_plane_as_it_would_be_by_itself(run: Run, desk: Path) -> None:

@@ -31,7 +31,7 @@ def test_a_league_of_the_command_is_that_of_python(
 
 
 def test_it_prints_ranks_and_the_papers_claims(run: Callable[..., Said], tmp_path: Path) -> None:
-    done = run("league", "branin", "--methods", "random", "--budget", "6", "--seeds", "1", "--report", cwd=tmp_path)
+    done = run("league", "branin", "--methods", "random", "--budget", "6", "--seeds", "1", "--claims", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     for shown in ("mean ranks", "branin (exact)", "all scenes", "branin: least loss", "compares no optimisers"):
         assert shown in done.stdout

@@ -109,7 +109,6 @@ def test_a_folder_of_other_files_is_left_alone(run: Callable[..., Said], tmp_pat
     ("arguments", "said"),
     [
         (["optimize", "brannin", "--method", "random"], "did you mean branin?"),
-        (["optimize", "branin"], "--method"),
         (["optimize", "branin", "--method", "cma"], "no method is called 'cma'; did you mean cma-es?"),
         (["optimize", "branin", "--method", "random", "--budget", "0"], "--budget"),
         (["optimize", "branin", "--method", "random", "--seed", "-1"], "--seed"),

@@ -58,7 +58,7 @@ def test_more_seeds_methods_and_episodes_go_on_where_the_race_ended(run: Callabl
 
 
 def test_race_prints_ranks_and_what_the_paper_claims(run: Callable[..., Said], tmp_path: Path) -> None:
-    done = run(*RACE, "--report", cwd=tmp_path)
+    done = run(*RACE, "--claims", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     for shown in (
         "branin · exact · 40 episodes · 3 seeds",
@@ -71,7 +71,7 @@ def test_race_prints_ranks_and_what_the_paper_claims(run: Callable[..., Said], t
 
 def test_report_holds_the_papers_claims_against_the_race(run: Callable[..., Said], tmp_path: Path) -> None:
     command = ["race", "cartpole", "--methods", "random,descents", "--budget", "8", "--seeds", "2"]
-    done = run(*command, "--report", cwd=tmp_path)
+    done = run(*command, "--claims", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     lines = [line for line in done.stdout.splitlines() if " better than " in line and "│" in line]
     by_claim = {line.split("│")[1].strip(): line.split("│")[2].strip() for line in lines}

@@ -105,7 +105,7 @@ def test_one_slice_that_fails_does_not_lose_the_others(
     command = ("report", "--all", "--data", "data", "--points-per-axis", "2", "--out", "all")
     done = run(*command, "--json", cwd=tmp_path)
     assert done.returncode == 1
-    assert done.stderr.splitlines()[-1] == "not reported: bounce-x: RuntimeError: out of memory"
+    assert "not reported: bounce-x: RuntimeError: out of memory" in done.stderr.splitlines()
     summary = json.loads(done.stdout)
     assert [record["name"] for record in summary["reports"]] == ["bounce-y"]
     assert list(summary["failed"]) == ["bounce-x"]
