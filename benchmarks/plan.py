@@ -1,9 +1,9 @@
-"""Hold what `landscape plan` predicts against what jobs then take, everything in a process of its own.
+"""Hold what `landscape plan` predicts against what jobs then take, each in a process of its own.
 
-    python benchmarks/plan.py [--tries 5] [--json] [--only "race of bounce"]
+    python -m benchmarks.plan [--tries 5] [--json] [--only "race of bounce"]
 
 Prints predicted / taken, the medians of some tries, plan and job in turn: `wall` from start to end, `work` without the
-start, `memory` of the host at its peak, `bytes` and `files` on the disk. Of a race, planned and run in one process:
+start, `memory` of the host at its peak, `bytes` and `files` on the disk. Of a race, planned and run in this process:
 `work`, its parts `simulating` and `methods`, and `bytes`.
 """
 
@@ -43,10 +43,10 @@ class Taken:
 
 
 def run(command: str, folder: Path) -> Taken:
-    """Run a command in a folder and in a process of its own."""
+    """Run a command in a folder and in a process of its own. Raises RuntimeError where it fails."""
     said, began = folder / "said.json", time.perf_counter()
     arguments = [sys.executable, "-m", "gradscape", *command.split(), "--json", "--device", "cpu"]
-    with said.open("w") as out, Popen(arguments, stdout=out, stderr=sys.stderr, cwd=folder) as process:
+    with said.open("w") as out, Popen(arguments, stdout=out, cwd=folder) as process:
         _, code, used = os.wait4(process.pid, 0)
         process.returncode = os.waitstatus_to_exitcode(code)
     if process.returncode:
@@ -57,10 +57,9 @@ def run(command: str, folder: Path) -> Taken:
 
 def ratios(job: str, folder: Path) -> dict[str, float]:
     """Plan a job, do it, and return what was predicted by what it took."""
-    _, _, what = job.partition(" ")
-    planned, taken = run(f"plan {what}", folder).said, run(f"{job} --out made", folder)
     from gradscape.jobs.rehearsal import room_of
 
+    planned, taken = run(f"plan {job.partition(' ')[2]}", folder).said, run(f"{job} --out made", folder)
     room = room_of(folder / "made")
     return {
         "wall": planned["wall"] / taken.wall,
@@ -69,33 +68,6 @@ def ratios(job: str, folder: Path) -> dict[str, float]:
         "bytes": planned["disk"]["bytes"] / room.bytes,
         "files": planned["disk"]["files"] / (room.files - 1),  # all that is in the folder
     }
-
-
-def tried(find: Callable[[Path], dict[str, float]], tries: int) -> dict[str, float]:
-    """Return the median of each ratio."""
-    found = []
-    for _ in range(tries):
-        with tempfile.TemporaryDirectory() as folder:
-            found.append(find(Path(folder)))
-    return {name: median(one[name] for one in found) for name in found[0]}
-
-
-class Timed:
-    """An objective that counts the seconds in which it is asked for losses."""
-
-    def __init__(self, objective: Any) -> None:
-        self._objective, self.space, self.seconds = objective, objective.space, 0.0
-
-    def __getattr__(self, name: str) -> Any:
-        """Return what else the objective says of itself."""
-        return getattr(self._objective, name)
-
-    def evaluate(self, x: Any, *, grad: bool = True) -> Any:
-        """Return what the objective returns."""
-        began = time.perf_counter()
-        found = self._objective.evaluate(x, grad=grad)
-        self.seconds += time.perf_counter() - began
-        return found
 
 
 def race_ratios(folder: Path) -> dict[str, float]:
@@ -112,16 +84,35 @@ def race_ratios(folder: Path) -> dict[str, float]:
     plan = RacePlanJob(scene, RACERS, SEEDS, BUDGET, workers).run().plan
     env = scene.make()
     job = RaceJob.of(env, RACERS, budget=BUDGET, seeds=SEEDS, command="", out=folder / "race")
-    timed, began = Timed(env), time.perf_counter()
+    evaluate, simulating = env.evaluate, 0.0
+
+    def timed(*given: Any, **options: Any) -> Any:
+        nonlocal simulating
+        began = time.perf_counter()
+        found = evaluate(*given, **options)
+        simulating += time.perf_counter() - began
+        return found
+
+    env.evaluate = timed  # type: ignore[method-assign]
+    began = time.perf_counter()
     with one_torch_thread(), processes(workers):
-        race(timed, job.competitors, budget=BUDGET, gradient_cost=1.0)
+        race(env, job.competitors, budget=BUDGET, gradient_cost=1.0)
     wall = time.perf_counter() - began
     return {
         "work": (plan.simulating + plan.searching) / wall,
-        "simulating": plan.simulating / timed.seconds,
-        "methods": plan.searching / (wall - timed.seconds),
+        "simulating": plan.simulating / simulating,
+        "methods": plan.searching / (wall - simulating),
         "bytes": plan.disk / sum(512 * one.stat().st_blocks for one in (folder / "race").rglob("*")),
     }
+
+
+def tried(find: Callable[[Path], dict[str, float]], tries: int) -> dict[str, float]:
+    """Return the median of each ratio."""
+    found = []
+    for _ in range(tries):
+        with tempfile.TemporaryDirectory() as folder:
+            found.append(find(Path(folder)))
+    return {name: median(one[name] for one in found) for name in found[0]}
 
 
 def main() -> None:
@@ -131,8 +122,7 @@ def main() -> None:
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--only", help="the name of one job")
     given = parser.parse_args()
-    finders: dict[str, Callable[[Path], dict[str, float]]] = {name: partial(ratios, job) for name, job in JOBS.items()}
-    finders["race of bounce"] = race_ratios
+    finders = {**{name: partial(ratios, job) for name, job in JOBS.items()}, "race of bounce": race_ratios}
     chosen = finders if given.only is None else {given.only: finders[given.only]}
     found = {name: tried(find, given.tries) for name, find in chosen.items()}
     if given.json:

@@ -1,289 +1,213 @@
-"""Make random results with one checkout and with another, and say whether they have the same bits.
+"""Make results with two checkouts, and compare what they stored bit for bit.
 
-    python -m benchmarks.same_bits make --out OLD [--count 100] [--seed 0]    # in the old checkout, then in the new
-    python -m benchmarks.same_bits compare OLD NEW                            # in any
-    python -m benchmarks.same_bits reuse OLD WORKED                           # in the new
+    python -m benchmarks.same_bits make OLD          # in the old checkout, then `make NEW` in the new one
+    python -m benchmarks.same_bits compare OLD NEW   # in either
 
-`make` runs random command lines (`benchmarks.seeded`), each in a process of its own, and lists how they ended; besides
-it interrupts some, so that unfinished results are there. `compare` holds every stored array, record and table of two
-such folders against each other, bit for bit, and pictures by their pixels, where they were drawn; pictures do not
-decide the exit code. `reuse` copies a folder and works with the results in it: opens and exports slices and runs, lays
-runs over slices, reports, gives every command again. Each of it works, or is refused in one line with exit code 2, and
-nothing finished may change. Exit code 1 says that anything differed, is missing or ended otherwise.
+`make` runs the command lines of commands.txt, each in a process of its own; a blank line there waits for what stands
+above it. `compare` reads arrays, records and tables with zarr, NumPy and JSON alone, and pictures by their pixels. Exit
+code 1 says that a command failed, a value differs or a result is missing; pictures and names of values do not decide.
+Results are matched by their folders, so an option may be renamed in the new checkout's commands.txt. To see whether a
+checkout works with older results, copy their folder and `make` it again: each command keeps what is there, or refuses
+it in one line.
 
-Left out is what is measured in seconds and what follows from it (`seconds`, `gradient_cost`, `forwards` of runs that
-take gradients), and what names the code, the day and the command line.
+What is measured in seconds is not compared, nor what names the code, the day or the command line.
 """
 
 from __future__ import annotations
 
 import argparse
+import csv
+import hashlib
+import io
 import json
+import math
 import os
-import re
 import shlex
-import shutil
+import subprocess
 import sys
-import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import asdict, dataclass, replace
-from functools import partial
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from benchmarks import forked, results, seeded, stored
-from benchmarks.forked import Limits
-from benchmarks.seeded import Command
+import numpy as np
+import zarr
+from numpy.typing import NDArray
 
-LIST, SAID, WORKED = "list.json", "said.json", "worked"
-SUMMARY = "summary.json"  # says what the last command line did, not only what is there
-LIMITS = Limits(cpu=200, clock=600, memory=8e9)
-ALL_THERE = re.compile(r"\ball \d+ .*there already|is there already|\b0 rungs to measure")
-READS = ("open", "export", "overlay", "report")  # what always has to work
-FINE = ("works", "goes on", "all there", "refused in one line")
+COMMANDS = Path(__file__).with_name("commands.txt")
+OWN = """
+import torch
 
-
-@dataclass(frozen=True)
-class Done:
-    """A command line and how it ended: its exit code, its last words, and the seconds it took."""
-
-    command: Command
-    code: int
-    said: str
-    seconds: float
-
-    @property
-    def outcome(self) -> str:
-        """Say in a few words how it ended."""
-        if self.code == 2:
-            one = self.said.startswith("landscape: ") and len(self.said.strip().splitlines()) == 1
-            return "refused in one line" if one else "refused in other words"
-        if self.code:
-            return f"exit code {self.code}"
-        if ALL_THERE.search(self.said):
-            return "all there"
-        return "goes on" if "there already" in self.said else "works"
+from gradscape import Environment, Evaluation, Fidelity, ParameterSpace
 
 
-def run(command: Command, folder: Path, before: Callable[[], object] | None = None) -> Done:
-    """Run a command line in a folder and print how it ended."""
-    began = time.monotonic()
-    quick = before or (None if command.drawn else results.small)
-    ended = forked.landscape(command.words, folder, limits=LIMITS, before=quick)
-    if command.verb == "check" and ended.code in (0, 1):  # which leaves nothing else
-        (folder / command.name).mkdir()
-        (folder / command.name / SAID).write_text(ended.out)
-    said = ended.err if ended.code in (0, 2) else forked.last_words(ended.err)
-    done = Done(command, ended.code, said.replace(str(folder), ""), time.monotonic() - began)
-    print(f"{done.seconds:5.1f} s  {done.outcome}: {shlex.join(command.words)}", file=sys.stderr, flush=True)
-    return done
+class Bowl(Environment):
+    name, space = "bowl", ParameterSpace.box(["a", "b", "c"], -1.0, 2.0)
+    fidelities = {"exact": Fidelity("exact", 0.0, "float64")}
+
+    def _evaluate(self, x, *, grad):
+        return Evaluation((x**2).sum(dim=1), 2 * x if grad else None, torch.ones(len(x), dtype=torch.int64))
+"""
+Value = str | NDArray[Any]
+VOLATILE = {"seconds", "gradient_cost", "forwards", "batch"}  # measured, or following from it
+VOLATILE |= {"created", "command", "versions", "folder", "history", "source", "gradscape", "checksum", "key"}
+TIMED = ("forward", "with_gradient", "batch")  # arrays of studies
+EMBEDDED = ("identity", "provenance")  # attributes that may be JSON in text
 
 
-def make(folder: Path, count: int, seed: int) -> int:
-    """Make so many results in a new folder, and a few unfinished ones; return how many failed."""
-    folder.mkdir(parents=True)
-    (folder / "own.py").write_text(seeded.OWN)
-    done = [run(command, folder) for command in seeded.commands(count, seed)]
-    failed = [one for one in done if one.code not in ((0, 1) if one.command.verb == "check" else (0,))]
-    for command in seeded.unfinished():
-        done.append(run(command, folder, partial(_interrupt, f"{command.name}/{command.stop}")))
-        if done[-1].code != 130:
-            failed.append(done[-1])
-    _write_list(folder, done, count=count, seed=seed)
-    _name_bad(failed)
-    print(f"{len(done)} command lines, {len(failed)} failed; {sum(one.seconds for one in done):.0f} s")
-    return len(failed)
+def make(folder: Path, workers: int) -> int:
+    """Run all command lines in a folder, and return how many failed."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "own.py").write_text(OWN)
+    failed = 0
+    with ThreadPoolExecutor(workers) as pool:
+        for group in COMMANDS.read_text().strip().split("\n\n"):
+            failed += sum(pool.map(lambda line: run(line, folder), group.splitlines()))
+    return failed
 
 
-def _interrupt(pattern: str) -> None:
-    """Let Ctrl-C come with the first evaluation after something is on disk."""
-    from gradscape import Environment
-
-    results.small()
-    evaluate = Environment.evaluate
-
-    def evaluate_or_stop(self: Environment, *given: object, **options: object) -> object:
-        if next(Path().glob(pattern), None):
-            raise KeyboardInterrupt
-        return evaluate(self, *given, **options)
-
-    Environment.evaluate = evaluate_or_stop  # in this process alone, which the command ends
-
-
-def _write_list(folder: Path, done: Iterable[Done], **about: object) -> None:
-    import gradscape
-
-    whole = {"gradscape": gradscape.__file__, **about, "commands": [asdict(one) for one in done]}
-    (folder / LIST).write_text(json.dumps(whole, indent=1))
+def run(line: str, folder: Path) -> bool:
+    """Run a command line, `words > NAME` where it prints its result, and say whether it failed."""
+    words, _, printed = line.partition(" > ")
+    environment = os.environ | {"OMP_NUM_THREADS": "1", "XDG_DATA_HOME": str(folder / "home")}
+    done = subprocess.run(
+        [sys.executable, "-m", "gradscape", *shlex.split(words)],
+        cwd=folder, env=environment, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    if printed and done.returncode in (0, 1):
+        (folder / printed).mkdir(exist_ok=True)
+        (folder / printed / "said.json").write_text(done.stdout)
+    refused = done.returncode == 2 and len(done.stderr.strip().splitlines()) == 1
+    failed = done.returncode not in ((0, 1) if printed else (0,))
+    if failed:
+        print(f"{done.returncode}: landscape {words}\n  {done.stderr.strip()[-500:]}", file=sys.stderr, flush=True)
+    return failed and not refused
 
 
-def read_list(folder: Path) -> list[Done]:
-    """Return the command lines that made a folder's results."""
-    whole = json.loads((folder / LIST).read_text())["commands"]
-    return [Done(_command(one["command"]), one["code"], one["said"], one["seconds"]) for one in whole]
-
-
-def _command(found: dict[str, Any]) -> Command:
-    made: dict[str, Any] = {name: tuple(one) if isinstance(one, list) else one for name, one in found.items()}
-    return Command(**made)
-
-
-def compare(old: Path, new: Path, *, again: bool = False) -> int:
-    """Print how many results of two folders are equal, different and missing; return how many are not equal.
-
-    Where commands were given `again`, pictures may be drawn anew and summaries say what was done then.
-    """
-    counts, pictures, values = Counter[str](), Counter[str](), 0
-    theirs = {one.command.name: one for one in read_list(new)} if (new / LIST).exists() else {}
-    for one in read_list(old):
-        if one.command.stop:
+def compare(old: Path, new: Path) -> int:
+    """Print how many results of two folders are equal, or not; return how many hold other values or are missing."""
+    counts, values, pictures = Counter[str](), 0, Counter[bool]()
+    for name in [shlex.split(line)[-1] for line in COMMANDS.read_text().splitlines() if line]:
+        if not (old / name).exists():
             continue
-        name, other = one.command.name, theirs.get(one.command.name)
-        without = (SUMMARY,) if again else ()
-        wanted, found = (stored.contents(root / name, without=without) for root in (old, new))
-        differ = _differences(one, other, wanted, found)
-        drawn = stored.pixels(old / name) if one.command.drawn and not again else {}
-        other_pixels = stored.pixels(new / name) if drawn else {}
-        unlike = [file for file in drawn if drawn[file] != other_pixels.get(file)]
-        pictures.update(equal=len(drawn) - len(unlike), different=len(unlike))
-        outcome = "missing" if other is None or not (new / name).exists() else "different" if differ else "equal"
+        wanted, found = contents(old / name), contents(new / name)
+        differ, keys = differences(wanted, found), sorted(wanted.keys() ^ found.keys())
+        outcome = "missing" if not found else "other values" if differ else "other keys" if keys else "equal"
         counts[outcome] += 1
         values += len(wanted)
+        drawn, redrawn = pixels(old / name), pixels(new / name)
+        pictures.update(drawn[file] == redrawn.get(file) for file in drawn)
         if outcome != "equal":
-            print(f"{outcome}: {name}: {'; '.join(differ[:5])}{f'; {len(differ) - 5} more' if differ[5:] else ''}")
-        if unlike:
-            print(f"pictures that differ: {name}: {', '.join(unlike)}")
-    print(f"{counts['equal']} equal, {counts['different']} different, {counts['missing']} missing; {values} values and "
-          f"arrays compared; pictures: {pictures['equal']} equal, {pictures['different']} different")  # fmt: skip
-    return counts["different"] + counts["missing"]
+            said = differ or [f"{key} is {'gone' if key in wanted else 'new'}" for key in keys]
+            print(f"{outcome}: {name}: {'; '.join(said[:5])}{f'; {len(said) - 5} more' if said[5:] else ''}")
+    print(", ".join(f"{count} {outcome}" for outcome, count in counts.items()))
+    print(f"{values} values and arrays; {pictures[False]} of {pictures.total()} pictures differ")
+    return counts["other values"] + counts["missing"]
 
 
-def _differences(
-    one: Done, other: Done | None, wanted: dict[str, stored.Value], found: dict[str, stored.Value]
-) -> list[str]:
-    if other is None:
-        return ["its command line was not run"]
-    differ = [] if one.command == other.command else [f"another command line: {shlex.join(other.command.words)}"]
-    differ += [] if one.code == other.code else [f"exit code {one.code} / {other.code}: {other.said.strip()[-200:]}"]
-    return differ + stored.differences(wanted, found)
+def contents(folder: Path) -> dict[str, Value]:
+    """Return what a folder's files hold, by file and name; nothing where there is no folder."""
+    found: dict[str, Value] = {}
+    for path in sorted(folder.rglob("*")):
+        inside = path.relative_to(folder).parts
+        if not any(part.endswith(".zarr") or part.startswith(".") for part in inside[:-1]):
+            found |= {f"{'/'.join(inside)} {name}": value for name, value in _values(path)}
+    return found
 
 
-def reuse(old: Path, folder: Path) -> int:
-    """Work with results of another checkout in a copy of their folder; return how often it did not go as it must."""
-    shutil.copytree(old, folder, symlinks=True, ignore=shutil.ignore_patterns("home", "tmp"))
-    (folder / WORKED).mkdir()
-    made = [one for one in read_list(old) if one.code == 0]
-    found = list(_work(made, folder))
-    _write_list(folder / WORKED, _beneath(done for _, done in found))
-    counts = Counter((what, done.outcome) for what, done in found)
-    again = list(_gone_on(read_list(old), folder))
-    counts.update((what, done.outcome) for what, done in again)
-    bad = [done for what, done in (*found, *again) if done.outcome not in (FINE[:1] if what in READS else FINE)]
-    _name_bad(bad)
-    for what in dict.fromkeys(what for what, _ in counts):
-        said = ", ".join(f"{count} {outcome}" for (kind, outcome), count in counts.items() if kind == what)
-        print(f"{what}: {said}")
-    reported = list(_other_numbers(found, old, folder))
-    print(*(f"other numbers: {line}" for line in reported), sep="\n", end="\n" if reported else "")
-    print("finished results of before, once all was done:")
-    return len(bad) + len(reported) + compare(old, folder, again=True)
+def _values(path: Path) -> Iterator[tuple[str, Value]]:
+    if path.suffix == ".zarr":
+        yield from _stored(path)
+    elif path.suffix == ".npz":
+        with np.load(path, allow_pickle=False) as found:
+            yield from ((name, found[name]) for name in found if name not in TIMED)
+    elif path.suffix == ".json":
+        yield from _leaves(json.loads(path.read_text()))
+    elif path.suffix == ".csv":
+        rows = list(csv.DictReader(io.StringIO(path.read_text())))
+        for column in rows[0] if rows else ():
+            if not column.startswith(("seconds", "forwards")):
+                yield column, " ".join(str(row[column]) for row in rows)
 
 
-def _beneath(found: Iterable[Done]) -> list[Done]:
-    """Return what was made beside the results of before, by its place there, so that it can be compared, too."""
-    begin = f"{WORKED}/"
-    ours = [one for one in found if one.command.name.startswith(begin)]
-    return [replace(one, command=replace(one.command, name=one.command.name.removeprefix(begin))) for one in ours]
+def _stored(path: Path) -> Iterator[tuple[str, Value]]:
+    """Yield arrays with their dimensions, and attributes."""
+    group = zarr.open_group(path, mode="r")
+    found = {name: np.asarray(array[:]) for name, array in group.arrays()}
+    timed = {"seconds"} | ({"forwards"} if np.isfinite(found.get("grad", np.nan)).any() else set())
+    for name, array in group.arrays():
+        if name not in timed:
+            yield name, found[name]
+        yield f"{name} dims", f"{array.metadata.dimension_names} {array.chunks}"  # type: ignore[union-attr]
+        yield from ((f"{name} {where}", value) for where, value in _leaves(array.attrs.asdict()))
+    attributes = {
+        name: json.loads(value) if name in EMBEDDED and isinstance(value, str) else value
+        for name, value in group.attrs.asdict().items()
+    }
+    yield from ((f"attribute {where}", value) for where, value in _leaves(attributes))
 
 
-def _work(made: Iterable[Done], folder: Path) -> Iterator[tuple[str, Done]]:
-    """Open, export, overlay and report finished slices and runs."""
-    made = list(made)
-    runs = [one.command for one in made if one.command.verb == "run"]
-    for command in (one.command for one in made):
-        if command.verb in ("slice", "run"):
-            yield "open", _opened(command, folder)
-            yield "export", run(_reading(command, "export", command.name, file="table.csv"), folder)
-        if command.plane and (over := [one.name for one in runs if one.env == command.env]):
-            yield "overlay", run(_reading(command, "overlay", command.name, *over[:2], *_source(command)), folder)
-        if command.verb == "report":
-            yield "report", run(_reading(command, "report", *command.words[1:-2]), folder)
+def _leaves(value: Any, name: str = "") -> Iterator[tuple[str, str]]:
+    """Yield every number and word in a JSON value, with its place; numbers are written out to the last bit."""
+    if isinstance(value, dict):
+        for key, inner in value.items():
+            if key not in VOLATILE:
+                yield from _leaves(inner, f"{name}.{key}" if name else str(key))
+    elif isinstance(value, list):
+        yield f"{name} length", str(len(value))
+        for number, inner in enumerate(value):
+            yield from _leaves(inner, f"{name}[{number}]")
+    else:
+        yield name, json.dumps(value)
 
 
-def _source(command: Command) -> tuple[str, ...]:
-    return ("--env", command.env[0]) if command.env[0].startswith("own.py") else ()
+def pixels(folder: Path) -> dict[str, str]:
+    """Return a digest of the pixels of every picture."""
+    from matplotlib.image import imread
+
+    return {
+        str(path.relative_to(folder)): hashlib.sha256(np.ascontiguousarray(imread(path)).tobytes()).hexdigest()
+        for path in sorted(folder.rglob("*.png"))
+    }
 
 
-def _reading(command: Command, verb: str, *words: str, file: str = "") -> Command:
-    """Return a command line that reads a result and writes beside it."""
-    name = f"{WORKED}/{verb}-{command.name}"
-    return Command(name, verb, (verb, *words, "--out", f"{name}/{file}" if file else name), command.env)
+def differences(wanted: dict[str, Value], found: dict[str, Value]) -> list[str]:
+    """Name what both have with other bits, arrays first."""
+    arrays, words = list[str](), list[str]()
+    for name in sorted(wanted.keys() & found.keys()):
+        one, other = wanted[name], found[name]
+        if isinstance(one, str) or isinstance(other, str):
+            words += [f"{name}: {str(one)[:80]} / {str(other)[:80]}"] if str(one) != str(other) else []
+        elif (one.shape, one.dtype, one.tobytes()) != (other.shape, other.dtype, other.tobytes()):
+            arrays.append(f"{name}: {_off(one, other)}")
+    return arrays + words
 
 
-def _opened(command: Command, folder: Path) -> Done:
-    """Open a slice or a run in Python, in a process of its own, and hold it against its arrays on disk."""
-    ended = forked.alone(_open, command.verb, command.name, folder=folder, limits=LIMITS)
-    return Done(command, ended.code, forked.last_words(ended.err), 0.0)
-
-
-def _open(verb: str, name: str) -> None:
-    import gradscape
-
-    path = Path(name, f"{verb}.zarr")
-    found = (gradscape.open_slice if verb == "slice" else gradscape.open_run)(path)
-    dataset = getattr(found, "data", found)  # a noun of the package may hold the dataset
-    raw = stored.arrays(path)
-    wrong = [one for one in ("loss", "status", "grad", "x", "u", "v") if one in raw and not stored.same(
-        raw[one], dataset[one].to_numpy())]  # fmt: skip
-    if wrong:
-        raise RuntimeError(f"{path} is read otherwise than it is on disk: {', '.join(wrong)}")
-
-
-def _gone_on(made: Iterable[Done], folder: Path) -> Iterator[tuple[str, Done]]:
-    """Give every command again that made a result, finished or not; a check keeps nothing."""
-    for one in made:
-        if one.command.verb != "check":
-            what = "unfinished, again" if one.command.stop else f"finished {one.command.verb}, again"
-            yield what, run(replace(one.command, drawn=False), folder)
-
-
-def _other_numbers(found: Iterable[tuple[str, Done]], old: Path, folder: Path) -> Iterator[str]:
-    """Name the reports of old slices that say other numbers than they said before."""
-    for what, done in found:
-        if what == "report" and done.code == 0:
-            before = stored.contents(old / done.command.name.removeprefix(f"{WORKED}/report-"))
-            if differ := stored.differences(before, stored.contents(folder / done.command.name)):
-                yield f"{done.command.name}: {'; '.join(differ[:5])}"
-
-
-def _name_bad(bad: Iterable[Done]) -> None:
-    for one in bad:
-        print(f"{one.outcome}: landscape {shlex.join(one.command.words)}\n  {one.said.strip()[-700:]}")
+def _off(one: NDArray[Any], other: NDArray[Any]) -> str:
+    """Say by how much arrays differ."""
+    if one.shape != other.shape or one.dtype != other.dtype:
+        return f"{one.shape} {one.dtype} / {other.shape} {other.dtype}"
+    if one.dtype.kind != "f":
+        return f"{int((one != other).sum())} of {one.size} differ"
+    equal = (one == other) | (np.isnan(one) & np.isnan(other))
+    largest = float(np.nanmax(np.abs(one - other)[~equal], initial=0.0))
+    return f"{math.prod(one.shape) - int(equal.sum())} of {one.size} differ, by up to {largest:.3g}"
 
 
 def main() -> None:
-    """Do what is asked, in words or numbers on standard output."""
+    """Do what is asked."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     verbs = parser.add_subparsers(dest="verb", required=True)
-    making = verbs.add_parser("make")
-    making.add_argument("--out", type=Path, required=True)
-    making.add_argument("--count", type=int, default=100)
-    making.add_argument("--seed", type=int, default=0)
-    for name in ("compare", "reuse"):
-        other = verbs.add_parser(name)
-        other.add_argument("old", type=Path)
-        other.add_argument("new", type=Path)
+    making, comparing = verbs.add_parser("make"), verbs.add_parser("compare")
+    making.add_argument("folder", type=Path)
+    making.add_argument("--workers", type=int, default=2, help="commands that run at once")
+    comparing.add_argument("old", type=Path)
+    comparing.add_argument("new", type=Path)
     given = parser.parse_args()
-    forked.load()
-    os.environ["OMP_NUM_THREADS"] = "1"
     if given.verb == "make":
-        bad = make(given.out.resolve(), given.count, given.seed)
-    elif given.verb == "compare":
-        bad = compare(given.old.resolve(), given.new.resolve())
-    else:
-        bad = reuse(given.old.resolve(), given.new.resolve())
-    sys.exit(int(bool(bad)))
+        sys.exit(int(bool(make(given.folder.resolve(), given.workers))))
+    sys.exit(int(bool(compare(given.old, given.new))))
 
 
 if __name__ == "__main__":

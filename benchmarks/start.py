@@ -1,19 +1,16 @@
-"""What the start of a command costs beside what it simulates, and whether a change made it shorter.
+"""What the start of a command costs, and whether a change made it shorter.
 
-    python benchmarks/start.py [pinball-2] [--repetitions 5] [--against OTHER/src]
+    python -m benchmarks.start [pinball-2] [--repetitions 5] [--against OTHER/src]
 
-One command, `landscape slice ENV --dims 0 1`, is run again and again, each time in a process and a folder of its own on
-caches that a first time has filled. Its parts are shares of the command's own time: what Python spends on importing, by
-package; making kernels ready; simulating; drawing. Drawing and the rest are without what they import.
-
-With `--against` the same command of another checkout is run in turn with it, so that what else the machine does falls
-on both: the ratio is that of the medians. Times of different runs are not to be divided by each other.
+`landscape slice ENV --dims 0 1` is run again and again on warm caches, each time in a process and a folder of its own.
+Printed are the share of its time that importing takes, and the share of each package in that. With
+`--against` the same command of another checkout runs in turn with it, so that what else the machine does falls on both;
+the ratio is that of the medians. Times of different runs are not to be divided by each other.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import re
 import resource
@@ -27,86 +24,34 @@ from pathlib import Path
 from statistics import median
 
 HERE = Path(__file__).resolve().parent.parent / "src"
-LINE = re.compile(r"import time:\s*(\d+) \|\s*\d+ \|\s*(\S+)")
-MOST = 8  # packages that are named
-# Run in the process of the command: it times what a part calls, by the clock, less what is imported meanwhile.
-PROGRAM = """
-import atexit, importlib, json, sys, time
-began, inside, parts = time.perf_counter(), [0.0], dict.fromkeys(("kernels", "simulating", "drawing"), 0.0)
-find = importlib._bootstrap._find_and_load
-depth = [0]
-def importing(*given):
-    depth[0] += 1
-    start = time.perf_counter()
-    try:
-        return find(*given)
-    finally:
-        depth[0] -= 1
-        if not depth[0]:
-            inside[0] += time.perf_counter() - start
-importlib._bootstrap._find_and_load = importing
-def watch(owner, name, part):
-    plain = getattr(owner, name)
-    def timed(*given, **named):
-        start, before = time.perf_counter(), inside[0]
-        try:
-            return plain(*given, **named)
-        finally:
-            parts[part] += time.perf_counter() - start - (inside[0] - before)
-    setattr(owner, name, timed)
-def say():
-    whole = {"whole": time.perf_counter() - began, "importing": inside[0], **parts}
-    print("PARTS" + json.dumps(whole), file=sys.stderr)
-atexit.register(say)
-from gradscape import __main__ as command
-from gradscape.envs.base import Environment
-from gradscape.jobs.slice import SliceJob
-watch(Environment, "prepare", "kernels")
-watch(Environment, "evaluate", "simulating")
-watch(SliceJob, "_save", "drawing")
-command.main()
-"""
+LINE = re.compile(r"import time:\s*(\d+) \|\s*\d+ \|\s*(\S+)")  # of `python -X importtime` [µs]
+MAX_PACKAGES = 8
 
 
 @dataclass(frozen=True)
 class Spent:
-    """Hold the seconds of a command by the clock and of processors, and what it wrote to standard error."""
+    """Seconds of a command by the clock, of processors, and of importing by package where that was asked."""
 
     clock: float
     processor: float
-    said: str
+    importing: Counter[str]
 
 
 def run(words: list[str], source: Path, *how: str) -> Spent:
-    """Run Python on words with one checkout in an empty folder. Raises RuntimeError where that fails."""
-    environment = os.environ | {"PYTHONPATH": str(source)}
+    """Run a command of a checkout in an empty folder. Raises RuntimeError where that fails."""
+    command = [sys.executable, *how, "-m", "gradscape", *words]
     before, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
-        done = subprocess.run(
-            [sys.executable, *how, *words], cwd=folder, env=environment, capture_output=True, text=True
-        )
+        environment = os.environ | {"PYTHONPATH": str(source)}
+        done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
     clock, after = time.perf_counter() - start, resource.getrusage(resource.RUSAGE_CHILDREN)
     if done.returncode:
         raise RuntimeError(f"the command failed with {source}: {done.stderr[-2000:]}")
+    importing = Counter[str]()
+    for own, name in LINE.findall(done.stderr):
+        importing[name.partition(".")[0]] += int(own) / 1e6
     processor = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-    return Spent(clock, processor, done.stderr)
-
-
-def parts(words: list[str], source: Path) -> dict[str, float]:
-    """Return the shares of a command's time that its parts take."""
-    said = run(["-c", PROGRAM, *words], source).said
-    seconds: dict[str, float] = json.loads(said.rpartition("PARTS")[2])
-    whole = seconds.pop("whole")
-    shares = {name: one / whole for name, one in seconds.items()}
-    return shares | {"rest": 1 - sum(shares.values())}
-
-
-def packages(words: list[str], source: Path) -> dict[str, float]:
-    """Return the shares of packages in the time that a command imports for, the largest first."""
-    seconds: Counter[str] = Counter()
-    for own, name in LINE.findall(run(["-m", "gradscape", *words], source, "-X", "importtime").said):
-        seconds[name.partition(".")[0]] += int(own)
-    return {name: one / seconds.total() for name, one in seconds.most_common(MOST)}
+    return Spent(clock, processor, importing)
 
 
 def main() -> None:
@@ -119,12 +64,14 @@ def main() -> None:
     words = ["slice", given.env, "--dims", "0", "1"]
     sources = [HERE] + ([given.against.resolve()] if given.against else [])
     for source in sources:
-        run(["-m", "gradscape", *words], source)  # fills the caches
-    found = [parts(words, HERE) for _ in range(given.repetitions)]
-    print("of the whole:", ", ".join(f"{name} {median(one[name] for one in found):.0%}" for name in found[0]))
-    print("of importing:", ", ".join(f"{name} {one:.0%}" for name, one in packages(words, HERE).items()))
+        run(words, source)  # fills the caches
+    found = [run(words, HERE, "-X", "importtime") for _ in range(given.repetitions)]
+    print(f"importing: {median(one.importing.total() / one.clock for one in found):.0%} of the command, of which")
+    packages = [f"{name} {one / found[-1].importing.total():.0%}" for name, one in
+                found[-1].importing.most_common(MAX_PACKAGES)]  # fmt: skip
+    print("  " + ", ".join(packages))
     if given.against:
-        turns = [[run(["-m", "gradscape", *words], source) for source in sources] for _ in range(given.repetitions)]
+        turns = [[run(words, source) for source in sources] for _ in range(given.repetitions)]
         for kind in ("clock", "processor"):
             here, there = (median(getattr(turn[k], kind) for turn in turns) for k in range(2))
             print(f"{kind}: {here / there:.2f} of the other checkout's, {len(turns)} times in turn")

@@ -9,19 +9,18 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from benchmarks.peers import __main__ as driver
+from benchmarks.peers.__main__ import HEAD, REQUIREMENTS, Pair, best, markdown, row
 from benchmarks.peers.difftaichi import check as check_source
-from benchmarks.peers.environments import REQUIREMENTS, InstallError, interpreter, needed
 from benchmarks.peers.ours_chain import build as build_chain
 from benchmarks.peers.ours_mpm import build as build_cube
 from benchmarks.peers.protocol import gradient_error
 from benchmarks.peers.scenes import Chain, Cube
-from benchmarks.peers.table import HEAD, Pair, best, markdown, row
 
 CPU = argparse.Namespace(device="cpu")
 
 
 def record(**changes):
-    check = {"error": 1e-4, "step": 0.01, "errors": {}}
+    check = {"error": 1e-4, "step": 0.01}
     found = {"version": "peer 1.0", "precision": "float32", "material": "neo-Hookean", "grid": "64^3", "why": None}
     found |= {"particles": 8, "substeps": 10, "work": 8_000_000, "loss": -1.0, "forward": 2.0, "gradient": 8.0}
     found |= {"memory_forward": 10_000_000, "memory_gradient": 40_000_000, "check": check, "differs": ["It has walls."]}
@@ -32,8 +31,6 @@ def test_a_gradient_that_is_right_is_found_to_be():
     at = np.array([0.3, -0.7, 1.1])
     found = gradient_error(lambda x: float(np.sin(x).sum()), np.cos(at), at)
     assert found.error < 1e-7
-    assert found.error == min(found.errors.values())
-    assert found.errors[f"{found.step:g}"] == found.error
 
 
 def test_a_gradient_that_is_half_of_it_is_off_by_half():
@@ -63,7 +60,7 @@ def test_a_peer_without_gradient_says_why():
 
 @pytest.mark.parametrize("error", [0.3, float("nan")])
 def test_a_wrong_gradient_is_called_wrong(error):
-    wrong = record(check={"error": error, "step": 0.1, "errors": {}})
+    wrong = record(check={"error": error, "step": 0.1})
     assert "Its gradient is wrong" in markdown([Pair("other", wrong, record())])
     assert "wrong" not in markdown([Pair("other", record(), record())])
 
@@ -85,7 +82,10 @@ def test_a_peer_that_is_not_there_is_refused_by_name(capsys):
     assert "no peer 'taichi'; there are genesis" in capsys.readouterr().err
     with pytest.raises(SystemExit):
         driver.main(["--python", "genesis"])
-    assert "--python takes PEER=PATH; got 'genesis'" in capsys.readouterr().err
+    assert (
+        "--python takes PEER=PATH of genesis, rewarped, difftaichi, newton, mjx; got 'genesis'"
+        in capsys.readouterr().err
+    )
 
 
 @pytest.mark.parametrize(
@@ -108,7 +108,7 @@ def test_a_peer_is_asked_for_the_same_size_as_ours(monkeypatch):
     calls = []
 
     def measure(python, script, how, limit):
-        calls.append((script, dict(zip(how[::2], how[1::2], strict=True))))
+        calls.append((script, dict(one.split("=") for one in how)))
         return record()
 
     monkeypatch.setattr(driver, "measure", measure)
@@ -119,15 +119,10 @@ def test_a_peer_is_asked_for_the_same_size_as_ours(monkeypatch):
 
 
 def test_every_peer_has_pinned_versions():
-    for name in driver.PEERS:
-        files = needed(name, "cpu")
-        assert files, name
-        for path, _ in files:
-            lines = [line.split("#")[0].strip() for line in path.read_text().splitlines()]
-            assert all("==" in line for line in lines if line), path.name
+    for path in REQUIREMENTS.iterdir():
+        lines = [line.split("#")[0].strip() for line in path.read_text().splitlines()]
+        assert all("==" in line for line in lines if line), path.name
     assert {path.name.split(".")[0] for path in REQUIREMENTS.iterdir()} == set(driver.PEERS)
-    with pytest.raises(InstallError, match="no requirements of nobody"):
-        interpreter("nobody", "cpu", print)
 
 
 def test_another_file_than_the_pinned_one_is_refused(tmp_path: Path):

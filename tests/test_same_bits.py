@@ -1,20 +1,21 @@
-"""What `benchmarks.same_bits` compares: one bit that differs anywhere is named; what is measured in seconds is not."""
+"""`benchmarks.same_bits` names one bit that differs anywhere, and nothing that is measured in seconds."""
 
 import json
+import shlex
 from pathlib import Path
 
 import numpy as np
 import pytest
 import zarr
-from benchmarks import seeded, stored
+from benchmarks.same_bits import COMMANDS, Value, contents, differences
 
 
-def made(folder: Path, loss: float, seconds: float = 1.0, lowest: float = 0.5) -> dict[str, stored.Value]:
+def made(folder: Path, loss: float, seconds: float = 1.0, lowest: float = 0.5) -> dict[str, Value]:
     group = zarr.create_group(folder / "run.zarr")
     for name, values in {"loss": [1.0, loss, np.nan], "seconds": [seconds, 2.0, 3.0]}.items():
         group.create_array(name, data=np.array(values))
     (folder / "summary.json").write_text(json.dumps({"loss": {"lowest": lowest}, "seconds": seconds}))
-    return stored.contents(folder)
+    return contents(folder)
 
 
 @pytest.mark.parametrize(
@@ -26,20 +27,21 @@ def made(folder: Path, loss: float, seconds: float = 1.0, lowest: float = 0.5) -
     ],
 )
 def test_one_bit_is_seen(tmp_path, other, names):
-    found = stored.differences(made(tmp_path / "old", 2.0), made(tmp_path / "new", **other))
+    found = differences(made(tmp_path / "old", 2.0), made(tmp_path / "new", **other))
     assert [line.partition(":")[0] for line in found] == names
 
 
 def test_zero_has_a_sign(tmp_path):
-    assert stored.differences(made(tmp_path / "old", 0.0), made(tmp_path / "new", -0.0))
+    assert differences(made(tmp_path / "old", 0.0), made(tmp_path / "new", -0.0))
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_a_seed_has_its_command_lines(seed):
-    first = seeded.commands(100, seed)
-    assert first == seeded.commands(100, seed) != seeded.commands(100, seed + 1)
-    assert len({command.name for command in first}) == 100
-    done: set[str] = set()
-    for command in first:
-        assert done.issuperset(command.needs)
-        done.add(command.name)
+def test_every_command_makes_a_folder_of_its_own_after_those_it_reads():
+    names, done = [], set()
+    for group in COMMANDS.read_text().strip().split("\n\n"):
+        lines = [shlex.split(line) for line in group.splitlines()]
+        for words in lines:
+            read = [word.removeprefix("best:") for word in words[:-1]]
+            assert done.issuperset(word for word in read if word.rpartition("-")[0] and word in {*names, *done})
+        names += [words[-1] for words in lines]
+        done |= {words[-1] for words in lines}
+    assert len(names) == len(set(names)) > 100

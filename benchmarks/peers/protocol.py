@@ -10,8 +10,8 @@ import subprocess
 import sys
 import time
 import traceback
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -43,26 +43,24 @@ class Simulation:
 
 @dataclass(frozen=True)
 class Check:
-    """Hold how far a gradient is from central differences: `error`, relative, over directions, at the best `step`."""
+    """How far a gradient is from central differences: `error`, relative, over directions, at the best `step`."""
 
     error: float
     step: float
-    errors: dict[str, float] = field(default_factory=dict)
 
 
-def gradient_error(loss: Callable[[Array], float], gradient: Array, at: Array, steps: Sequence[float] = STEPS) -> Check:
+def gradient_error(loss: Callable[[Array], float], gradient: Array, at: Array) -> Check:
     """Return how far a gradient is from central differences along a few random directions, at the best of the steps.
 
     The error is |slopes - differences| / |differences|, both vectors having one number for each direction.
     """
     lines = np.random.default_rng(0).standard_normal((DIRECTIONS, at.size))
-    slopes = lines @ gradient
-    errors = {}
-    for step in steps:
-        found = np.array([(loss(at + step * line) - loss(at - step * line)) / (2 * step) for line in lines])
-        errors[step] = float(np.linalg.norm(slopes - found) / max(float(np.linalg.norm(found)), 1e-300))
-    best = min(errors, key=lambda step: errors[step] if np.isfinite(errors[step]) else np.inf)
-    return Check(errors[best], best, {f"{step:g}": error for step, error in errors.items()})
+    slopes, found = lines @ gradient, []
+    for step in STEPS:
+        differences = np.array([(loss(at + step * line) - loss(at - step * line)) / (2 * step) for line in lines])
+        error = np.linalg.norm(slopes - differences) / max(float(np.linalg.norm(differences)), 1e-300)
+        found.append(Check(float(error), step))
+    return min(found, key=lambda one: one.error if np.isfinite(one.error) else np.inf)
 
 
 def time_calls(call: Callable[[], object], repeat: int) -> float:
@@ -105,10 +103,9 @@ def measure(simulation: Simulation, scene: Cube | Chain, repeat: int, memory: Me
     found["forward"] = time_calls(lambda: simulation.loss(at), repeat)
     found["memory_forward"] = memory.read()
     found |= {"gradient": None, "memory_gradient": None, "check": None}
-    if simulation.gradient is not None:
-        slope = simulation.gradient(at)
-        again = simulation.gradient
-        found["gradient"] = time_calls(lambda: again(at), repeat)
+    if (gradient := simulation.gradient) is not None:
+        slope = gradient(at)
+        found["gradient"] = time_calls(lambda: gradient(at), repeat)
         found["memory_gradient"] = memory.read()
         found["check"] = asdict(gradient_error(simulation.loss, slope, at))
     return found
@@ -122,17 +119,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--repeat", type=int, default=3, help="calls of which the best is taken, in each round")
 
 
-def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
-    """Return what a peer was asked for."""
+def run(kind: str, build: Callable[[Any, argparse.Namespace], Simulation]) -> None:
+    """Measure the simulation that `build` makes of a scene, and print what was found; or what went wrong."""
     parser = argparse.ArgumentParser(description="Measure one simulator; the last line is a JSON object.")
     add_options(parser)
     parser.add_argument("--source", default=None, help="a file of the peer's that is not in a package")
-    return parser.parse_args(arguments)
-
-
-def run(kind: str, build: Callable[[Any, argparse.Namespace], Simulation]) -> None:
-    """Measure the simulation that `build` makes of a scene, and print what was found; or what went wrong."""
-    asked = parse()
+    asked = parser.parse_args()
     try:
         scene = SCENES[kind](asked.particles, asked.substeps)
         memory = Memory(asked.device)
