@@ -16,5 +16,5 @@ PACKAGE = "example_package"  # a folder, to which a link leads where the reposit
 def lead_to_pages(text: str) -> str:
     """Let links to pages of the root lead to those that show them, and one to a folder to a page of its files."""
     for name, here in INCLUDED.items():
-        text = re.sub(rf"\]\(\.\./{re.escape(name)}", f"]({here}", text)
+        text = re.sub(rf"\]\(((?:\.\./)*)\.\./{re.escape(name)}", rf"](\g<1>{here}", text)
     return text.replace(f"]({PACKAGE})", f"](generated/{PACKAGE}.md)")

@@ -77,7 +77,7 @@ class Fluid(MpmScene):
     long; the syrup's own weight compresses it by 1.2 % at the floor. The ladle's speed changes over 0.04 s, because
     one that jumps by dv sends a shock of pressure (density times speed of sound times dv) through the syrup. Before
     each control step J is averaged over the grid, beyond hydrostatics: uneven J would bear load as a solid does.
-    That leaves an error of buoyancy, which a finer grid lessens (benchmarks/drag.py). Walls are slippery
+    That leaves an error of buoyancy, which a finer grid lessens (tests/envs/mpm/test_fluid.py). Walls are slippery
     (walls=stick: not) and reach up to a lid at 0.6 m, so that no syrup is lost; the ladle has no mass and stops
     where it would leave the tank; the cube is as soft as that speed of sound makes it, and still stiff beside the
     loads on it; the shell is felt over a centimetre outside it, or three quarters of a coarse grid's cell.

@@ -2,9 +2,9 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
-from benchmarks.drag import LAST, SHAPE, heights, stokes_speed, wall_factor
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -87,9 +87,36 @@ def speeds():
 
 
 def rising(scene):
-    """Return (speed upwards over the last half of 20 control steps [m/s], rise over all [m]) of the cube."""
-    start, before, end = heights(scene, 2 * LAST)
-    return (end - before) / (SPAN * LAST), end - start
+    """Return (speed upwards over the last half of 20 control steps [m/s], rise over all [m]) of the cube, no ladle."""
+    away = torch.tensor([0.0, 10.0, 0.0], dtype=torch.float64).expand(1, 21, 1, 3)
+    with scene._solvers.lend() as stage:
+        stage.solver.run(away)
+        places = [stage.solver.read_positions(step, 1).double() for step in (0, 10, 20)]
+        start, before, end = (float(scene._center(place)[0, 1]) for place in places)
+    return (end - before) / (SPAN * 10), end - start
+
+
+def known_speed(viscosity, width=0.2, depth=0.2):
+    """Return how fast a cube sinks that is 470 kg/m^3 heavier than the syrup, in the middle of a square tank [m/s].
+
+    A cube sinks 0.92 times as fast as the sphere of its volume (Pettyjohn & Christiansen 1948), of which Stokes' law
+    is known. Slippery walls reflect (Happel & Brenner 1965, chapter 7): the body has images of the same force beside
+    it, and of the opposite force below the floor and above the surface, whose velocity is a sum over waves.
+    """
+    radius = fluid.CUBE_EDGE * (3 / (4 * np.pi)) ** (1 / 3)
+    terms, blur = 40, 0.02  # of the sum; how wide the force is spread [m], to the first order of no influence
+    counts = (terms, int(terms * 2 * depth / width) + 1)
+    across, up = (
+        2 * np.pi / length * np.arange(-count, count + 1)
+        for length, count in zip((width, 2 * depth), counts, strict=True)
+    )
+    kx, ky, kz = np.meshgrid(across, up, across, indexing="ij")
+    square = kx**2 + ky**2 + kz**2
+    square[square == 0] = np.inf
+    waves = (1 - np.cos(ky * depth)) * (1 - ky**2 / square) / square * np.exp(-square * blur**2)
+    alone = 1 / (6 * np.pi**1.5 * blur)
+    walls = 1 + 6 * np.pi * radius * (waves.sum() / (2 * depth * width**2) - alone)
+    return 0.92 * walls * 2 / 9 * 470.0 * GRAVITY * radius**2 / viscosity
 
 
 def test_a_heavy_cube_sinks_and_a_light_one_rises(speeds):
@@ -103,7 +130,7 @@ def test_a_heavy_cube_sinks_and_a_light_one_rises(speeds):
 def test_a_cube_sinks_and_rises_as_fast_as_is_known_of_cubes_between_walls(speeds, viscosity):
     # Half the difference of the two is free of what a neutral cube drifts.
     half = (speeds[viscosity, 860.0][0] - speeds[viscosity, 1800.0][0]) / 2
-    assert half == pytest.approx(SHAPE * wall_factor(0.2) * stokes_speed(viscosity), rel=0.2)
+    assert half == pytest.approx(known_speed(viscosity), rel=0.2)
 
 
 def test_walls_that_stick_slow_the_syrup_along_them():

@@ -1,0 +1,241 @@
+"""Write the tables that the gallery's records fill into README and the pages, between <!-- NAME --> and <!-- /NAME -->.
+
+    python -m docs.pages.tables [--check]
+
+With --check nothing is written, and exit code 1 says that a page differs from the records. A scene without a record, or
+whose model changed since, has a row that says so.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from gradscape.envs.registry import entries, environment_class
+from gradscape.gallery.figures import read_figures
+from gradscape.gallery.files import DATA, DEVICES
+from gradscape.gallery.paper import read_paper
+from gradscape.jobs.report_record import Report
+from gradscape.jobs.report_tables import environments_markdown
+from gradscape.landscapes.measures.choice import CLAIMS, Claim, Shortfall
+from gradscape.landscapes.measures.fidelity import Comparison
+from gradscape.landscapes.storage.records import read_json
+
+from .text import table
+
+ROOT = Path(__file__).parents[2]
+UNMEASURED, MISSING = "not measured since the scene changed", "not measured"
+FAINT = 0.01  # of the range of the losses of all slices of a census
+COLUMNS = {  # of README: what a slice may be, and the words that say so, of which a slice has one at most
+    "very smooth": ("very smooth",),
+    "smooth with local minima": ("smooth with local minima",),
+    "rugged": ("rugged", "extremely rugged"),
+    "with jumps": ("discontinuous",),
+    "gradients good": ("gradients good",),
+}
+Record = Mapping[str, Any]
+
+
+def scenes() -> list[str]:
+    """Return our simulated scenes: functions have one fidelity, and engines of others promise nothing."""
+    return sorted(
+        name for name, one in entries().items() if not one.extra and len(environment_class(name).fidelities) > 1
+    )
+
+
+def present(record: Record) -> bool:
+    """Say whether a record is of its scene's model as it is now."""
+    known = record["identity"]
+    return bool(known["model_version"] == environment_class(known["objective"]).version_on(known["engine"]))
+
+
+def kept(pattern: str, scene: str, data: Path = DATA) -> list[Record] | str:
+    """Return a scene's records of its present model, such as "census/{}-{}.json", or why there are none."""
+    files = (data / pattern.format(scene, device) for device in DEVICES)
+    records = [read_json(file) for file in files if file.exists()]
+    return [one for one in records if present(one)] or (UNMEASURED if records else MISSING)
+
+
+def censuses() -> str:
+    """What many slices of a scene are like: the share of them that each word fits, and those that hardly move."""
+    rows = []
+    for scene in scenes():
+        said, found = _paper_words(scene), kept("census/{}-{}.json", scene)
+        if isinstance(found, str):
+            rows.append([f"`{scene}`", "", "", found, ", ".join(said)])
+            continue
+        words, slices = found[0]["words"], found[0]["slices"]
+        told = {word: f"{word} {_interval(one)}" for word, one in words.items()}
+        measured = [
+            told[word] for word in sorted(words, key=lambda word: -words[word]["value"]) if words[word]["value"]
+        ]
+        faint = f"{100 * faint_share(slices):.0f} %"
+        rows.append(
+            [f"`{scene}`", str(len(slices)), faint, ", ".join(measured), ", ".join(told[word] for word in said)]
+        )
+    head = ("environment", "slices", "faint", "measured: share of the slices (95 % interval)", "the paper's words")
+    return table(head, rows)
+
+
+def faint_share(slices: list[Record]) -> float:
+    """Return the share of slices along which losses move by less than `FAINT` of what they do over all of them."""
+    ends = [one["range"] for one in slices if None not in one["range"]]
+    whole = max(high for _, high in ends) - min(low for low, _ in ends)
+    return sum(high - low < FAINT * whole for low, high in ends) / len(slices)
+
+
+def short_censuses() -> str:
+    """README's: the shares alone."""
+    rows = []
+    for scene in scenes():
+        found = kept("census/{}-{}.json", scene)
+        shares = [found, *[""] * (len(COLUMNS) - 1)] if isinstance(found, str) else [
+            f"{100 * sum(found[0]['words'][word]['value'] for word in words):.0f} %" for words in COLUMNS.values()
+        ]  # fmt: skip
+        rows.append([f"`{scene}`", *shares, ", ".join(_paper_words(scene))])
+    return table(("environment", *COLUMNS, "the paper says"), rows)
+
+
+def _paper_words(scene: str) -> tuple[str, ...]:
+    words = read_paper().words
+    return words[scene].words if scene in words else ()
+
+
+def _interval(share: Record) -> str:
+    ends = f" ({100 * share['low']:.0f} to {100 * share['high']:.0f})" if share["low"] < share["high"] else ""
+    return f"{100 * share['value']:.0f} %{ends}"
+
+
+def margins() -> str:
+    """How near standard's step is to the longest that is stable, by precision."""
+    rows = []
+    for scene in scenes():
+        found = kept("extremes/{}-{}.json", scene)
+        if isinstance(found, str):
+            rows.append([f"`{scene}`", *[""] * 4, found, "", ""])
+            continue
+        limits = [(one, limit) for one in found for limit in one["limits"] if limit["knob"] == "dt"]
+        rows += [[f"`{scene}`", one["identity"]["device"], *_margin(limit)] for one, limit in limits]
+    step = ("standard's step [s]", "longest stable [s]", "margin", "beyond", "95 % error")
+    return table(("scene", "device", "precision", *step), rows)
+
+
+def _margin(limit: Record) -> list[str]:
+    base, stable = limit["base"], "" if limit["stable"] is None else f"{limit['stable']:.3g}"
+    (own,) = (rung for rung in limit["rungs"] if rung["values"] == [base])
+    error = "" if own["error"] is None else f"{100 * own['error']:.2g} %"
+    if limit["failed"] is None:
+        return [limit["precision"], f"{base:.3g}", f"at least {stable}", "", "", error]
+    margin = "" if limit["margin"] is None else f"{limit['margin']:.2f}"
+    return [limit["precision"], f"{base:.3g}", stable, margin, limit["beyond"], error]
+
+
+def fidelities() -> str:
+    """What draft and standard keep of their claims, against the reference."""
+    rows = [[f"`{scene}`", claim.name, *_fidelity(scene, claim)] for scene in scenes() for claim in CLAIMS]
+    return table(("scene", "fidelity", "device", "rank", "cosine", "95 % error", "ms", "claim"), rows)
+
+
+def _fidelity(scene: str, claim: Claim) -> list[str]:
+    """Return the cells of a fidelity, of the variant that has its settings now."""
+    found = kept("tradeoff/{}-{}.json", scene)
+    now = environment_class(scene).fidelities[claim.name].record()
+    for record in found if not isinstance(found, str) else ():
+        known = {key: record["identity"][key] for key in ("device", "engine", "options")}
+        for one in record["rungs"]:
+            if {**one["fidelity"], "name": claim.name} == now and all(
+                one[key] == value for key, value in known.items()
+            ):
+                measured = Comparison.of_record(one)
+                lack, error = Shortfall.of(measured, claim), measured.loss_error.p95_relative.value
+                return [
+                    one["device"], _number(measured.spearman.value, 3), _number(measured.gradient.cosine.value, 3),
+                    "none" if error is None else f"{100 * error:.0f} %" if error >= 0.1 else f"{100 * error:.2g} %",
+                    f"{1e3 * measured.seconds.with_gradient:.3g}", "kept" if lack.kept else f"short in {lack.by}",
+                ]  # fmt: skip
+    return [*[""] * 5, found if isinstance(found, str) else UNMEASURED]
+
+
+def accuracy() -> str:
+    """BENCHMARKS.md's: time and error of draft and standard alone."""
+    rows = []
+    for scene in scenes():
+        cells = [_fidelity(scene, claim) for claim in CLAIMS]
+        numbers = [number for _, _, _, error, ms, _ in cells for number in (ms, error)]
+        rows.append([f"`{scene}`", ", ".join(dict.fromkeys(one[0] for one in cells)), *numbers])
+    return table(("scene", "device", "draft [ms]", "error", "standard [ms]", "error"), rows)
+
+
+def parts() -> str:
+    """What each part of a scene's model is for: how far losses move without it, what it costs, and the verdict."""
+    rows = []
+    for scene in sorted(entries()):
+        found = kept("tradeoff/{}-{}.model.json", scene)
+        measured = {} if isinstance(found, str) else {one["name"]: one for one in found[0]["parts"]}
+        for part in environment_class(scene).model_parts:
+            one = measured.get(part.name)
+            cells = [*[""] * 4, UNMEASURED] if one is None or one["options"] != dict(part.options) else _part(one)
+            rows.append([f"`{scene}`", part.name, f"{part.change}{' (missing now)' if part.missing else ''}", *cells])
+    return table(("scene", "part", "changed to", "95 % of losses move by", "rank", "cosine", "time", "verdict"), rows)
+
+
+def _part(one: Record) -> list[str]:
+    found, cost = one["comparison"], one["cost"]["value"]
+    moved = found["loss_error"]["p95_relative"]["value"]
+    return [
+        "none" if moved is None else f"{100 * moved:.2g} %",
+        *(_number(value["value"], 2) for value in (found["spearman"], found["gradient"]["cosine"])),
+        "none" if cost is None else f"{100 * (cost - 1):+.0f} %",
+        f"{one['effect']}; {one['price']}",
+    ]
+
+
+def _number(value: float | None, digits: int) -> str:
+    return "none" if value is None else f"{value:.{digits}f}"
+
+
+def measured() -> str:
+    """What the gallery's slices are like, by their reports."""
+    files = [DATA / figure.id / "report.json" for figure in read_figures()]
+    return environments_markdown([Report.read(file) for file in files if file.exists()])
+
+
+TABLES: dict[tuple[str, str], Callable[[], str]] = {  # by page and name
+    ("README.md", "censuses"): short_censuses,
+    ("BENCHMARKS.md", "accuracy"): accuracy,
+    ("docs/measured.md", "measured"): measured,
+    ("docs/measured.md", "censuses"): censuses,
+    ("docs/measured.md", "margins"): margins,
+    ("docs/fidelities.md", "fidelities"): fidelities,
+    ("docs/parts.md", "parts"): parts,
+}
+
+
+def settle(*, check: bool) -> Iterator[str]:
+    """Write all tables, unless they are only checked, and yield the pages that differed."""
+    for (page, name), wanted in TABLES.items():
+        file = ROOT / page
+        marks = (f"<!-- {name} -->\n\n", f"\n<!-- /{name} -->")
+        before, rest = file.read_text().split(marks[0])
+        text, after = rest.split(marks[1])
+        if text != (found := wanted()):
+            yield f"{page}: {name}"
+            if not check:
+                file.write_text(before + marks[0] + found + marks[1] + after)
+
+
+def main() -> None:
+    """Print which tables differed from the records; exit code 1 says that one still does."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--check", action="store_true", help="write nothing")
+    asked = parser.parse_args()
+    differed = list(settle(check=asked.check))
+    print(*differed, sep="\n")
+    sys.exit(int(asked.check and bool(differed)))
+
+
+if __name__ == "__main__":
+    main()

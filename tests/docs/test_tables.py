@@ -1,0 +1,90 @@
+"""Tables of README and the pages hold what the gallery's records say, of every scene of ours."""
+
+from __future__ import annotations
+
+import copy
+from pathlib import Path
+
+import pytest
+from docs.pages import tables
+from docs.pages.tables import COLUMNS, MISSING, UNMEASURED, faint_share, kept, scenes, settle
+
+from gradscape.envs.registry import entries, environment_class
+from gradscape.gallery.files import DATA
+from gradscape.landscapes.measures.choice import CLAIMS
+from gradscape.landscapes.storage.records import read_json, write_record
+
+
+def lines(table: str) -> list[list[str]]:
+    return [[cell.strip() for cell in line.strip("|\n ").split(" | ")] for line in table.splitlines()[2:]]
+
+
+def test_pages_hold_the_records() -> None:
+    assert list(settle(check=True)) == [], "`python -m docs.pages.tables` writes the tables"
+
+
+def test_a_table_that_differs_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for page, _ in tables.TABLES:
+        (tmp_path / page).parent.mkdir(exist_ok=True)
+        (tmp_path / page).write_text((tables.ROOT / page).read_text().replace("| `torus` |", "| `taurus` |"))
+    monkeypatch.setattr(tables, "ROOT", tmp_path)
+    assert len(list(settle(check=False))) == len(tables.TABLES)
+    assert list(settle(check=True)) == []
+
+
+def test_every_scene_has_a_row_and_every_part_has_one() -> None:
+    for table, rows in ((tables.censuses(), 1), (tables.short_censuses(), 1), (tables.fidelities(), len(CLAIMS))):
+        assert [row[0].strip("`") for row in lines(table)] == [name for name in scenes() for _ in range(rows)]
+    assert {row[0].strip("`") for row in lines(tables.margins())} == set(scenes())
+    named = [(name, part.name) for name in sorted(entries()) for part in environment_class(name).model_parts]
+    assert [(row[0].strip("`"), row[1]) for row in lines(tables.parts())] == named
+
+
+def test_a_scene_that_changed_or_was_never_measured_is_said_to_be_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("census/bounce-cpu.json", "extremes/bounce-cpu.json", "tradeoff/bounce-cpu.json"):
+        record = read_json(DATA / name)
+        record["identity"]["model_version"] = 0
+        (tmp_path / name).parent.mkdir()
+        write_record(tmp_path / name, record)
+    assert kept("census/{}-{}.json", "bounce", tmp_path) == UNMEASURED
+    assert kept("census/{}-{}.json", "cartpole", tmp_path) == MISSING
+    monkeypatch.setattr(tables, "kept", lambda pattern, scene: kept(pattern, scene, tmp_path))
+    for table in (tables.censuses, tables.margins, tables.fidelities, tables.short_censuses):
+        assert all((UNMEASURED if "bounce" in row[0] else MISSING) in row for row in lines(table()))
+    assert all(row[-1] == UNMEASURED for row in lines(tables.parts()))
+
+
+def test_a_fidelity_or_a_part_whose_settings_changed_is_not_measured(monkeypatch: pytest.MonkeyPatch) -> None:
+    def edited(pattern: str, scene: str) -> list[tables.Record] | str:
+        found = copy.deepcopy(kept(pattern, scene))
+        for one in (*found[0].get("rungs", ()), *found[0].get("parts", ())) if not isinstance(found, str) else ():
+            one["options"] = {"horizon": 7.0}
+        return found
+
+    monkeypatch.setattr(tables, "kept", edited)
+    for table in (tables.fidelities, tables.parts):
+        assert {row[-1] for row in lines(table())} == {UNMEASURED}
+
+
+def test_a_claim_that_breaks_is_named_with_what_it_lacks(monkeypatch: pytest.MonkeyPatch) -> None:
+    (record,) = kept("tradeoff/{}-{}.json", "torus")
+    worse = copy.deepcopy(record)
+    for one in worse["rungs"]:
+        one["gradient"]["cosine"]["value"] = 0.5
+    for found, said in ((record, "kept"), (worse, "short in cosine")):
+        monkeypatch.setattr(
+            tables, "kept", lambda pattern, scene, found=found: [found] if scene == "torus" else MISSING
+        )
+        assert {row[-1] for row in lines(tables.fidelities()) if row[0] == "`torus`"} == {said}
+
+
+def test_shares_of_a_column_count_no_slice_twice() -> None:
+    for path in sorted((DATA / "census").glob("*.json")):
+        for words in COLUMNS.values():
+            assert all(len(set(words) & set(one["words"])) < 2 for one in read_json(path)["slices"])
+
+
+def test_slices_along_which_losses_hardly_move_are_counted() -> None:
+    assert faint_share([{"range": one} for one in ([0.0, 0.009], [0.3, 0.9], [0.0, 1.0], [None, None])]) == 0.25
