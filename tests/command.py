@@ -1,8 +1,9 @@
 """What tests of the command share: what it makes, what it printed and what it imports."""
 
+import math
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -10,7 +11,6 @@ from typing import Any
 
 import pytest
 import typer
-from benchmarks.results import leave_blank
 
 from gradscape.cli import app, main
 
@@ -36,6 +36,33 @@ def _leaves(command: Any, words: tuple[str, ...]) -> Iterator[tuple[str, Any]]:
         yield from _leaves(inner, (*words, name))
     if not hasattr(command, "commands"):
         yield " ".join(words), command
+
+
+def options(verb: Any) -> dict[str, bool]:
+    """Return the options of a verb, and whether each is a flag, which takes no value."""
+    named = [param for param in verb.params if param.opts[0].startswith("-")]
+    return {name: param.is_flag for param in named for name in (*param.opts, *param.secondary_opts)}
+
+
+def leave_blank(put: Callable[[object, str, Any], object]) -> None:
+    """Let pictures and frames of films be blank, and not laid out: most of what a small job takes is drawing them.
+
+    `put` is setattr, or what does the same for a while.
+    """
+    from matplotlib.figure import Figure
+
+    from gradscape.landscapes.draw.figures import page
+
+    save = Figure.savefig
+
+    def leave(figure: Figure, where: Any, **options: Any) -> None:
+        if options.get("format") == "rgba":  # a frame, whose size is known
+            where.write(bytes(4 * math.prod(figure.canvas.get_width_height())))
+        else:
+            save(Figure(figsize=(0.1, 0.1)), where, **options)
+
+    put(Figure, "savefig", leave)
+    put(page, "settle", lambda picture: None)
 
 
 def make(folder: Path, *commands: str) -> Path:
