@@ -1,15 +1,17 @@
 """What tests of the command share: what it makes, what it printed and what it imports."""
 
+import math
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import pytest
-from benchmarks.results import leave_blank
 
-from gradscape.cli import main
+from gradscape.cli import Verb, main
 
 needs_taichi = pytest.mark.skipif(find_spec("taichi") is None, reason="Taichi has no wheels past Python 3.12")
 NO_BROWSER = "there is no Chromium here: `apt-get install -y chromium` (or your system's) lets them run"
@@ -21,6 +23,33 @@ class Said:
     returncode: int
     stdout: str
     stderr: str
+
+
+def options(verb: Verb) -> dict[str, bool]:
+    """Return the options of a verb, and whether each is a flag, which takes no value."""
+    named = [one for one in verb.options if one.names[0].startswith("-")]
+    return {name: one.type is bool for one in named for name in one.names}
+
+
+def leave_blank(put: Callable[[object, str, Any], object]) -> None:
+    """Let pictures and frames of films be blank, and not laid out: most of what a small job takes is drawing them.
+
+    `put` is setattr, or what does the same for a while.
+    """
+    from matplotlib.figure import Figure
+
+    from gradscape.landscapes.draw.figures import page
+
+    save = Figure.savefig
+
+    def leave(figure: Figure, where: Any, **options: Any) -> None:
+        if options.get("format") == "rgba":  # a frame, whose size is known
+            where.write(bytes(4 * math.prod(figure.canvas.get_width_height())))
+        else:
+            save(Figure(figsize=(0.1, 0.1)), where, **options)
+
+    put(Figure, "savefig", leave)
+    put(page, "settle", lambda picture: None)
 
 
 def make(folder: Path, *commands: str) -> Path:

@@ -11,13 +11,12 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
-from benchmarks.results import leave_blank
 from hypothesis import HealthCheck, settings
 
 from gradscape.cli import main
 from gradscape.envs import registry
 
-from .command import NO_BROWSER, PATIENCE, Said
+from .command import NO_BROWSER, PATIENCE, Said, leave_blank
 
 # A shell that is not interactive starts what it sends to the background deaf to Ctrl-C; commands that tests interrupt
 # would inherit that.

@@ -11,26 +11,36 @@ import sys
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib import import_module
 from itertools import count
+from multiprocessing import get_context
 from pathlib import Path
+from pkgutil import walk_packages
 from signal import SIGKILL, Signals
 from typing import Any
 
 import zarr
-from benchmarks.forked import FORK, LOADED
-from benchmarks.results import leave_blank
 
 from gradscape.cli import main
 from gradscape.jobs import slice as job
 from gradscape.landscapes import cost
 from gradscape.optim.runs import store
 
-from .command import Said
+from .command import Said, leave_blank
 
 CHANGES = {"os.mkdir", "os.rename", "os.remove", "os.rmdir"}  # events of PEP 578
 
 # Processes are forked from one that has loaded what they need, and has used nothing of it.
-FORK.set_forkserver_preload(["pytest", "hypothesis", "benchmarks.results", "benchmarks.commands", *LOADED])
+FORK = get_context("forkserver")
+LOADED = [
+    *(f"gradscape.envs.{name}" for name in ("bounce", "engines.balls.rigid", "functions", "points")),
+    *("pytest", "hypothesis", "dask.array", "jinja2", "imageio_ffmpeg", "pyvista", "rerun", "cma"),
+    *("pydantic.type_adapter", "pydantic.json_schema", "pydantic.functional_validators", "pydantic.fields"),
+]
+for part in ("commands", "jobs", "gallery", "landscapes", "optim"):
+    package = import_module(f"gradscape.{part}")
+    LOADED += [one.name for one in walk_packages(package.__path__, f"{package.__name__}.")]
+FORK.set_forkserver_preload(LOADED)
 
 
 @dataclass(frozen=True)

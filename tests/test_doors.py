@@ -7,12 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from benchmarks.results import leave_blank
 
 import gradscape as gs
 from gradscape.envs.registry import as_environment, entries
 
-from .command import Said, verbs
+from .command import Said, leave_blank, verbs
 
 SIMULATORS = """
 import jax.numpy as jnp

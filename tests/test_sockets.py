@@ -12,13 +12,12 @@ from socket import AF_INET, AF_INET6
 from typing import Any
 
 import pytest
-from benchmarks.results import leave_blank
 
 from gradscape.cli import main
 from gradscape.jobs import workers as cluster
 from gradscape.landscapes.draw.recordings import viewer
 
-from .command import verbs
+from .command import leave_blank, verbs
 from .processes import FORK
 from .sockets import beyond_loopback, listening
 

@@ -14,7 +14,6 @@ from urllib.request import urlopen
 
 import numpy as np
 import pytest
-from benchmarks.results import leave_blank
 
 from gradscape.cli import main
 from gradscape.envs.functions import Branin, Function
@@ -26,6 +25,8 @@ from gradscape.landscapes.identity import stored_identity
 from gradscape.landscapes.measures.unresolved import probes
 from gradscape.landscapes.storage.store import open_slice
 from gradscape.landscapes.verification import POINTS
+
+from ..command import leave_blank
 
 FIGURES = [
     Figure(

@@ -5,7 +5,6 @@ from typing import Any
 
 import pytest
 import torch
-from benchmarks.results import leave_blank
 
 from gradscape.jobs.model import ModelJob
 from gradscape.jobs.scene import SceneSpec
@@ -15,6 +14,7 @@ from gradscape.landscapes.measures import fidelity, turns
 from gradscape.landscapes.measures.model import Effect, MeasuredPart, ModelStudy, Price
 from gradscape.landscapes.storage.records import read_json
 
+from ..command import leave_blank
 from ..parted import CLOCK, Parted
 
 

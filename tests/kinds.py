@@ -1,4 +1,4 @@
-"""Results of every kind that the verbs leave, small: how each is made, what reads it, and what numbers it holds."""
+"""Small results of every kind that the verbs leave: how each is made, what reads it, and what numbers it holds."""
 
 from __future__ import annotations
 
@@ -7,15 +7,27 @@ import hashlib
 import io
 import json
 import math
+import shutil
+import sys
+import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from contextlib import chdir, redirect_stderr, redirect_stdout, suppress
 from dataclasses import dataclass
+from functools import cache
+from io import StringIO
 from pathlib import Path
 from typing import Any
+from warnings import catch_warnings
 
 import numpy as np
+import pytest
 
-MADE, READ = "made-1", "read-1"  # what a kind is made into, and where a verb that reads it writes: no words of English
+from gradscape.cli import main
+
+from .command import Said
+
+ROOT = tempfile.TemporaryDirectory(prefix="gradscape-tests-")  # of all folders, for as long as tests run
+MADE, READ = "made-1", "read-1"  # what a kind is made into, and where a verb that reads it writes
 CUT = "slice ackley --set dim=3 --dims 0 1 --resolution 6 --out"
 SEARCH = "optimize ackley --set dim=3 --method cma-es --budget 30 --seed 1 --out"
 BOUNCE = "bounce --fidelity draft --device cpu"
@@ -32,44 +44,15 @@ VOLATILE |= {"folder", "wall", "versions", "episodes"}
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of result: the command that makes it in `MADE`, what it needs beside it, and what reads it.
+    """A kind of result: the command that makes it in `MADE`, what reads it, and what has to be there before.
 
-    `stop` is patched in the process that makes it, so that it ends unfinished; `where` holds what is worth damaging.
+    `where` is the folder that may be damaged.
     """
 
     make: str
     reads: tuple[str, ...] = ()
     needs: tuple[str, ...] = ()
-    stop: Callable[[], object] | None = None
     where: str = MADE
-
-
-def unfinished_slice() -> None:
-    """Stop a slice when all its tiles are there."""
-    from gradscape.landscapes.storage.store import SliceStore
-
-    small()
-    SliceStore.finish = _interrupted  # type: ignore[method-assign]
-
-
-def unfinished_run() -> None:
-    """Stop a search after some rows."""
-    from gradscape.optim.runs import store
-
-    small()
-    store.PAUSE, store.SHARE = 0.0, math.inf  # writes after every proposal
-    append = store.RunStore.append
-
-    def stopped(filled: store.RunStore, *given: Any, **options: Any) -> None:
-        if filled.count > 12:
-            _interrupted()
-        append(filled, *given, **options)
-
-    store.RunStore.append = stopped  # type: ignore[method-assign]
-
-
-def _interrupted(*_: object, **__: object) -> None:
-    raise KeyboardInterrupt
 
 
 KINDS = {
@@ -83,7 +66,6 @@ KINDS = {
         f"bounce --axis y --resolution 16 --fidelity draft --device cpu --out {MADE}",
         (EXPORT, f"report {MADE} --points 2 --out {READ} --json"),
     ),
-    "filling slice": Kind(f"{CUT} {MADE}", (EXPORT,), stop=unfinished_slice),
     "sweep": Kind(f"sweep ackley --set dim=3 --dims 0 1 --over 2 --frames 2 --resolution 4 --out {MADE}"),
     "run": Kind(
         f"{SEARCH} {MADE}",
@@ -91,7 +73,6 @@ KINDS = {
          f"--through best:{MADE} --out {READ} --json", f"{SEARCH.replace('30', '40')} {MADE}"),
         needs=(f"{CUT} cut",),
     ),
-    "stopped run": Kind(f"{SEARCH} {MADE}", (EXPORT,), stop=unfinished_run),
     "race": Kind(
         f"race ackley --set dim=3 --methods random,descents --seeds 2 --budget 16 --out {MADE}",
         (f"overlay cut {MADE} --out {READ}",),
@@ -134,54 +115,99 @@ KINDS = {
 }  # fmt: skip
 
 
-def leave_blank(put: Callable[[object, str, Any], object]) -> None:
-    """Let pictures and frames of films be blank, and not laid out: most of what a small job takes is drawing them.
+def quicken(put: Callable[[object, str, Any], object]) -> None:
+    """Let nothing be repeated only to be timed, and searches and films of the gallery be few.
 
     `put` is setattr, or what does the same for a while.
     """
-    from matplotlib.figure import Figure
-
-    from gradscape.landscapes.draw.figures import page
-
-    save = Figure.savefig
-
-    def leave(figure: Figure, where: Any, **how: Any) -> None:
-        if how.get("format") == "rgba":  # a frame, whose size is known
-            where.write(bytes(4 * math.prod(figure.canvas.get_width_height())))
-        else:
-            save(Figure(figsize=(0.1, 0.1)), where, **how)
-
-    put(Figure, "savefig", leave)
-    put(page, "settle", lambda picture: None)
-
-
-def small() -> None:
-    """Let pictures be blank, nothing be repeated only to be timed, and searches and films of the gallery be few."""
     from gradscape.gallery import episodes as gallery_episodes
     from gradscape.gallery import measures as gallery_measures
     from gradscape.gallery import parts as gallery_parts
     from gradscape.landscapes import cost
-    from gradscape.landscapes.measures import fidelity as tradeoff
+    from gradscape.landscapes.measures import fidelity
+    from gradscape.optim.runs import store
 
-    leave_blank(setattr)
-    tradeoff.REPETITION = tradeoff.LARGEST = 0.002
-    cost.MOMENT = cost.ENOUGH = cost.WARM_UP = 0.0
-    gallery_parts.METHODS, gallery_parts.BUDGET = ("random",), 8
-    gallery_parts.FRAMES, gallery_parts.COARSE = 2, 5
-    gallery_episodes.LONGEST, gallery_episodes.HEIGHT = 2, 48
-    gallery_measures.TRADEOFF_POINTS, gallery_measures.REPORT_POINTS = 2, 2
-    gallery_measures.TURNED = ["precision"]
+    for place, values in (
+        (fidelity, {"REPETITION": 0.002, "LARGEST": 0.002}),
+        (cost, {"MOMENT": 0.0, "ENOUGH": 0.0, "WARM_UP": 0.0}),
+        (store, {"PAUSE": 0.0, "SHARE": math.inf}),  # writes after every proposal
+        (gallery_parts, {"METHODS": ("random",), "BUDGET": 8, "FRAMES": 2, "COARSE": 5}),
+        (gallery_episodes, {"LONGEST": 2, "HEIGHT": 48}),
+        (gallery_measures, {"TRADEOFF_POINTS": 2, "REPORT_POINTS": 2, "TURNED": ["precision"]}),
+    ):
+        for name, value in values.items():
+            put(place, name, value)
 
 
-def nothing() -> None:
-    """Let Ctrl-C come with the first episode, page or request, so that nothing is computed."""
-    from http.server import ThreadingHTTPServer
+def files(folder: Path) -> list[Path]:
+    """Return every file under a folder."""
+    return sorted(file for file in folder.rglob("*") if file.is_file())
 
-    from gradscape.envs.base import Environment
-    from gradscape.gallery.site import build
 
-    for place, name in ((Environment, "evaluate"), (build, "build_site"), (ThreadingHTTPServer, "serve_forever")):
-        setattr(place, name, _interrupted)
+def say(command: str, folder: Path) -> Said:
+    """Run a command in this process and in a folder, which holds the user's data and temporary files, too."""
+    out, err = StringIO(), StringIO()
+    with (
+        pytest.MonkeyPatch.context() as patch,
+        chdir(folder),
+        redirect_stdout(out),
+        redirect_stderr(err),
+        catch_warnings(record=True, action="always") as warned,
+    ):
+        for name, place in (("XDG_DATA_HOME", "home"), ("TMPDIR", "tmp")):
+            (folder / place).mkdir(exist_ok=True)
+            patch.setenv(name, str(folder / place))
+        patch.setattr(tempfile, "tempdir", None)
+        patch.setenv("COLUMNS", "160")
+        patch.setattr(sys, "argv", ["landscape", *command.split()])
+        quicken(patch.setattr)
+        code = 0
+        try:
+            main(command.split())
+        except SystemExit as left:
+            code = int(left.code or 0)
+    return Said(code, out.getvalue(), "".join(f"{one.message}\n" for one in warned) + err.getvalue())
+
+
+def printed(out: str) -> str:
+    """Return what was printed, of JSON what is the same every time."""
+    try:
+        return json.dumps(plain(json.loads(out)), sort_keys=True)
+    except ValueError:
+        return ""
+
+
+@cache
+def before(kind: str) -> Path:
+    """Return a folder with what a kind needs."""
+    folder = Path(tempfile.mkdtemp(dir=ROOT.name))
+    for command in KINDS[kind].needs:
+        assert say(command, folder).returncode == 0, command
+    return folder
+
+
+@cache
+def whole(kind: str) -> Path:
+    """Return a folder with a whole result of a kind."""
+    folder = copy(before(kind))
+    done = say(KINDS[kind].make, folder)
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+@cache
+def undisturbed(kind: str, command: str) -> tuple[dict[str, Numbers], str]:
+    """Return the numbers, and what is printed, after a command on a whole result."""
+    folder = copy(whole(kind))
+    done = say(command, folder)
+    return numbers(folder), printed(done.stdout)
+
+
+def copy(folder: Path) -> Path:
+    """Return a copy of a folder."""
+    place = Path(tempfile.mkdtemp(dir=ROOT.name))
+    shutil.copytree(folder, place, symlinks=True, dirs_exist_ok=True)
+    return place
 
 
 @dataclass(frozen=True)
