@@ -81,6 +81,7 @@ def league(
     from ..gallery.paper import read_paper
     from ..jobs.league import PICTURE, RECORD, LeagueJob, simulated_scenes
     from ..jobs.workers import workers as cluster
+    from ..landscapes.convert import to_json
 
     how: dict[str, Any] = {"out": Path(out) if out else None, "force": force, "prints": print_ or []}
     scenes = [read_scene(text, one) for text in envs or simulated_scenes()]
@@ -89,7 +90,7 @@ def league(
     with cluster(scheduler, device) as executor:
         found = replace(job, claims=claims, workers=workers or cores(), executor=executor).run(bars)
     if json_:
-        print_json(found.record(), folder=str(job.folder))
+        print_json(to_json(found), folder=str(job.folder))
     else:
         _print(found, claims=report)
     bars.note(f"{job.folder}: {RECORD}, {PICTURE}, and a race in each folder")
