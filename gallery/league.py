@@ -10,6 +10,7 @@ from ..envs.batching import cores
 from ..jobs.league import Fixture, LeagueJob
 from ..jobs.scene import SceneSpec
 from ..jobs.watch import Watch
+from ..landscapes.convert import from_json, to_json
 from ..landscapes.storage.files import make_folder
 from ..landscapes.storage.records import read_json, reading, write_record
 from ..optim.league import League, SceneStandings
@@ -66,7 +67,7 @@ class LeaguePart(FigurePart):
         files.record.unlink(missing_ok=True)  # which says that the others are whole
         keep_both(race.plot(), files.picture)
         KeptRuns.of(race).write(files.runs)
-        write_record(files.record, found.record())
+        write_record(files.record, to_json(found))
         return (
             f"{len(found.methods)} methods, {found.seeds} seeds, {found.budget} episodes: {found.methods[0]} is first"
         )
@@ -93,7 +94,7 @@ class LeaguePart(FigurePart):
 def read_standings(path: Path) -> SceneStandings:
     """Read what is kept of a scene. Raises ValueError, naming the file, where it is not what was written."""
     with reading(path, REMAKE.format("league")):
-        return SceneStandings.of_record(read_json(path))
+        return from_json(SceneStandings, read_json(path))
 
 
 def read_league(root: Path) -> League | None:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
+from ..landscapes.convert import from_json
 from ..landscapes.plain import plain_json
 from ..landscapes.storage.records import read_json, reading
 from ..optim.league import SceneStandings
@@ -30,7 +31,7 @@ def best_of_league(env: Environment) -> tuple[Tensor, float] | None:
     if not path.is_file():
         return None
     with reading(path, "delete it, and `landscape gallery compute --part league` makes it anew"):
-        found = SceneStandings.of_record(read_json(path))
+        found = from_json(SceneStandings, read_json(path))
     if found.best is None or not has_options(found.identity, env) or len(found.best.x) != env.space.dim:
         return None
     return torch.tensor(found.best.x, dtype=torch.float64), found.best.loss

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..envs.registry import entries
+from ..landscapes.convert import to_json
 from ..landscapes.cost import duration, episode_cost
 from ..landscapes.space import as_whole
 from ..landscapes.storage.disk import full, is_full
@@ -234,7 +235,7 @@ class LeagueJob:
 
     def _write(self, scenes: Sequence[SceneStandings]) -> League:
         league = League(scenes, dict(self.failed), self.command)
-        write_record(self.folder / RECORD, league.record())
+        write_record(self.folder / RECORD, to_json(league))
         return league
 
     def _finish(self, scenes: Sequence[SceneStandings]) -> League:

@@ -12,7 +12,7 @@ import numpy as np
 import xarray as xr
 
 from ..landscapes.identity import current_identity
-from ..landscapes.plain import finite, number, optional, or_nan, plain, text
+from ..landscapes.plain import finite
 from .bootstrap import interval
 from .claims import ClaimFinding, Claims, check_claims
 from .comparison import Superiority
@@ -50,12 +50,6 @@ class BestPoint:
                 found.append(cls(float(loss[row]), run.method, run.seed, row + 1, x))
         return min(found, key=lambda one: one.loss, default=None)
 
-    @classmethod
-    def of_record(cls, record: Mapping[str, Any]) -> BestPoint:
-        """Read it from plain JSON; raises TypeError, KeyError and ValueError for what is none."""
-        seed, episode = (int(number(record[name])) for name in ("seed", "episode"))
-        return cls(number(record["loss"]), text(record["method"]), seed, episode, tuple(map(number, record["x"])))
-
 
 @dataclass(frozen=True)
 class Standing:
@@ -82,15 +76,6 @@ class Standing:
         kept = {name: getattr(rank, name) for name in cls.__dataclass_fields__ if name != "times"}
         return cls(**kept, times=tuple(times))
 
-    @classmethod
-    def of_record(cls, record: Mapping[str, Any]) -> Standing:
-        """Read it from plain JSON; raises TypeError, KeyError and ValueError for what is none."""
-        numbers = ("rank", "rank_low", "rank_high", "mean", "low", "high")
-        known: dict[str, Any] = {name: or_nan(record[name]) for name in numbers}
-        known |= {name: int(number(record[name])) for name in ("unsuccessful", "failed")}
-        times = tuple(optional(number, one) for one in record["times"])
-        return cls(method=text(record["method"]), times=times, **known)
-
 
 @dataclass(frozen=True)
 class SceneStandings:
@@ -115,6 +100,9 @@ class SceneStandings:
     left_out: Mapping[str, str]
     command: str
 
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "identity", current_identity(self.identity))
+
     @classmethod
     def of(cls, race: Race, *, left_out: Mapping[str, str] | None = None, command: str = "") -> SceneStandings:
         """Return what a race says."""
@@ -122,7 +110,8 @@ class SceneStandings:
         figures, some = race.statistics, race.statistics.targets.some
         times = {method: times_record(one[some]) for method, one in figures.times.items()}
         return cls(
-            **{name: str(identity[key]) for name, key in (("env", "objective"), ("fidelity", "fidelity"))},
+            env=str(identity["objective"]),
+            fidelity=str(identity["fidelity"]),
             device=str(identity["device"]),
             loss_unit=race.loss_unit,
             identity=identity,
@@ -150,26 +139,20 @@ class SceneStandings:
         seen = [one if one.first == method else one.reversed for one in self.pairs if method in (one.first, one.second)]
         return {one.second: one.probability for one in seen}
 
-    def record(self) -> dict[str, Any]:
-        """Return it as plain JSON."""
-        found: dict[str, Any] = plain(asdict(self))
-        return found
-
-    @classmethod
-    def of_record(cls, record: Mapping[str, Any]) -> SceneStandings:
-        """Read it from plain JSON; raises TypeError, KeyError and ValueError for what is none."""
-        words = ("env", "fidelity", "device", "loss_unit", "command")
-        return cls(
-            **{name: text(record[name]) for name in words},
-            identity=current_identity(record["identity"]),
-            budget=int(number(record["budget"])),
-            seeds=int(number(record["seeds"])),
-            goals=tuple(map(number, record["goals"])),
-            standings=tuple(map(Standing.of_record, record["standings"])),
-            pairs=tuple(map(_pair, record["pairs"])),
-            best=optional(BestPoint.of_record, record["best"]),
-            left_out={text(name): text(why) for name, why in dict(record["left_out"]).items()},
-        )
+    @property
+    def rows(self) -> list[dict[str, Any]]:
+        """What is known of each method, in one row each."""
+        about = {name: getattr(self, name) for name in ("env", "fidelity", "device", "loss_unit", "budget", "seeds")}
+        return [
+            {
+                **about,
+                **{name: value for name, value in asdict(one).items() if name != "times"},
+                "probability": {other: finite(p) for other, p in self.probabilities(one.method).items()},
+                "running_times": dict(zip(map("{:.6g}".format, self.goals), one.times, strict=True)),
+                "best_known": self.best.loss if self.best else None,
+            }
+            for one in self.standings
+        ]
 
 
 @dataclass(frozen=True)
@@ -190,6 +173,13 @@ class League:
     scenes: Sequence[SceneStandings]
     failed: Mapping[str, str]
     command: str
+
+    derived = ("rows", "overall")
+
+    @property
+    def rows(self) -> list[dict[str, Any]]:
+        """A row for each scene and method."""
+        return [row for scene in self.scenes for row in scene.rows]
 
     @cached_property
     def overall(self) -> list[OverallRank]:
@@ -212,7 +202,7 @@ class League:
         """Return a row for each scene and method: mean rank, mean best loss and their intervals, running times."""
         import pandas as pd
 
-        return pd.DataFrame([row for scene in self.scenes for row in _rows(scene)])
+        return pd.DataFrame(self.rows)
 
     def _repr_html_(self) -> str:
         """Show the table in a notebook."""
@@ -228,22 +218,6 @@ class League:
         from ..landscapes.draw.figures.league import league_figure
 
         return league_figure(self._picture(), width=width)
-
-    def record(self) -> dict[str, Any]:
-        """Return it as plain JSON: a row for each scene and method, the races, and all methods over all scenes."""
-        return {
-            "rows": [row for scene in self.scenes for row in plain(_rows(scene))],
-            "overall": plain([asdict(one) for one in self.overall]),
-            "scenes": [scene.record() for scene in self.scenes],
-            "failed": dict(self.failed),
-            "command": self.command,
-        }
-
-    @classmethod
-    def of_record(cls, record: Mapping[str, Any]) -> League:
-        """Read it from plain JSON; raises TypeError, KeyError and ValueError for what is none."""
-        failed = {text(name): text(why) for name, why in dict(record["failed"]).items()}
-        return cls([SceneStandings.of_record(one) for one in record["scenes"]], failed, text(record["command"]))
 
     def _picture(self) -> xr.Dataset:
         """Return what `landscapes.draw.figures.league` draws: ranks by scene and method, all scenes together last."""
@@ -269,27 +243,6 @@ class League:
                 "command": self.command,
             },
         )
-
-
-def _rows(scene: SceneStandings) -> list[dict[str, Any]]:
-    """Return what is known of each method in a scene, in one row each."""
-    about = {name: getattr(scene, name) for name in ("env", "fidelity", "device", "loss_unit", "budget", "seeds")}
-    best = scene.best
-    return [
-        {
-            **about,
-            **{name: value for name, value in asdict(one).items() if name != "times"},
-            "probability": {other: finite(p) for other, p in scene.probabilities(one.method).items()},
-            "running_times": dict(zip(map("{:.6g}".format, scene.goals), one.times, strict=True)),
-            "best_known": best.loss if best else None,
-        }
-        for one in scene.standings
-    ]
-
-
-def _pair(record: Mapping[str, Any]) -> Superiority:
-    chance, p, corrected = (number(record[name]) for name in ("probability", "p", "corrected"))
-    return Superiority(text(record["first"]), text(record["second"]), chance, p, corrected)
 
 
 def _range(values: Any) -> str:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from ...landscapes.convert import to_json
 from ...landscapes.plain import text
 from ...landscapes.storage.records import read_json, reading, write_record
 from ...landscapes.storage.store import open_slice
@@ -136,7 +137,7 @@ def place_league(data: Path, out: Path, paper: Paper) -> LeaguePage | None:
     for source, target in ((LeagueFiles.of(data, one.env), LeagueFiles.of(out, one.env)) for one in league.scenes):
         for name in ("record", "picture", "dark"):
             shutil.copyfile(getattr(source, name), getattr(target, name))
-    write_record(folder / LEAGUE_RECORD, league.record())
+    write_record(folder / LEAGUE_RECORD, to_json(league))
     save_both(league.plot(), folder / LEAGUE_PICTURE)
     save_table([_rank(one) for one in league.overall], folder / LEAGUE_TABLE)
     for scene in league.scenes:

@@ -20,6 +20,7 @@ from gradscape.jobs import known
 from gradscape.jobs.race import RaceJob
 from gradscape.jobs.scene import point_of
 from gradscape.jobs.watch import Watch
+from gradscape.landscapes.convert import to_json
 from gradscape.landscapes.identity import DamagedError, plane_of, stored_identity
 from gradscape.landscapes.overlay import IMPROVEMENTS_OF, best_point, lowered
 from gradscape.landscapes.space import ParameterSpace
@@ -102,7 +103,7 @@ def test_its_races_are_those_of_the_verb_and_neither_repeats_the_other(
     theirs = json.loads(capsys.readouterr().out)["scenes"][0]
     assert compute(small, "--only", "branin") == 0
     assert "all 72 episodes are there already" in capsys.readouterr().err
-    ours = read_standings(small / "league/branin.json").record()
+    ours = to_json(read_standings(small / "league/branin.json"))
     assert {name: one for name, one in ours.items() if name != "command"} == {
         name: one for name, one in theirs.items() if name != "command"
     }

@@ -26,7 +26,9 @@ from hypothesis import strategies as st
 from gradscape.envs.base import Environment
 from gradscape.gallery.site import build
 
-from ..command import options, verbs
+from gradscape.cli import verbs
+
+from ..command import options
 from ..faults import damage
 from ..kinds import KINDS, MADE, copy, files, whole
 from ..processes import Ended, alone, landscape

@@ -17,7 +17,7 @@ import zarr
 
 from gradscape import Environment
 
-from ..command import verbs
+from gradscape.cli import verbs
 from ..kinds import KINDS, copy, files, say, whole
 
 READ_AS_TEXT = {".json", ".md", ".csv", ".js", ".html", ".toml", ".css"}
@@ -116,5 +116,5 @@ def test_a_trap_is_sprung_by_who_unpickles_it(tmp_path: Path, monkeypatch: pytes
 
 def test_every_verb_that_reads_a_folder_is_tried() -> None:
     tried = {command.split()[0] for kind in KINDS.values() for command in (kind.make, *kind.reads)}
-    folders = {name.split()[0] for name, verb in verbs().items() if any("--out" in one.opts for one in verb.params)}
+    folders = {name.split()[0] for name, verb in verbs().items() if any("--out" in one.names for one in verb.options)}
     assert tried >= folders

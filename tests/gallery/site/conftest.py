@@ -170,7 +170,7 @@ def league(folder: Path) -> None:
     (folder / "league").mkdir()
     for env, left_out in (("fluid", {}), ("bounce", {"turbo": "turbo is <not> here"})):
         files = LeagueFiles.of(folder, env)
-        write_record(files.record, scene_standings(env, left_out).record())
+        write_record(files.record, to_json(scene_standings(env, left_out)))
         picture(files.picture)
         picture(files.dark)
     sliced = LeagueSliceFiles.of(folder, "fluid")
