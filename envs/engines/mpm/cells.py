@@ -22,6 +22,7 @@ from typing import no_type_check
 
 import warp as wp
 
+from .. import cpp
 from ..runtime import precision
 from .model import Box
 from .nodes import HIGHEST, node_placer, place_taker
@@ -30,50 +31,6 @@ from .stencil import lattice, stencil
 SEGMENT = 16  # cells
 STRETCH = 4  # planes of nodes that a walk of a small batch leaves, and the last along a segment up to two more
 STEP, SIZES = 4, 32  # walks are of one size up to so many particles apart, and the largest of so many sizes
-
-# Neighbours in memory are mostly of one cell: on a GPU one of them counts for all of a warp.
-TAKE_NUMBER = """
-#if defined(__CUDA_ARCH__)
-    const unsigned place = (unsigned)((unsigned long long)&wp::index(counts, e, cell) >> 2);
-    const unsigned alike = __match_any_sync(__activemask(), place);
-    const int lane = threadIdx.x & 31, leader = __ffs(alike) - 1;
-    int number = 0;
-    if (lane == leader) number = atomicAdd(&wp::index(counts, e, cell), __popc(alike));
-    return __shfl_sync(alike, number, leader) + __popc(alike & ((1u << lane) - 1u));
-#else
-    return wp::index(counts, e, cell)++;
-#endif
-"""
-
-
-# The numbers of a segment are read and written by fours.
-TAKE_COUNTS = """
-    struct alignas(16) Four { int n[4]; };
-    Four *four = (Four *)&wp::index(counts, e, segment * SEGMENT);
-    wp::vec_t<SEGMENT, wp::int32> found;
-    int any = 0;
-    for (int k = 0; k < SEGMENT; k += 4) {
-        const Four given = four[k / 4];
-        for (int l = 0; l < 4; ++l) any |= found[k + l] = given.n[l];
-    }
-    for (int k = 0; any && k < SEGMENT / 4; ++k) four[k] = Four{};
-    return found;
-"""
-WRITE_PLACES = """
-    struct alignas(16) Two { int low, high, next_low, next_high; };
-    Two *two = (Two *)&wp::index(places, e, segment * SEGMENT);
-    for (int k = 0; k < SEGMENT; k += 2) {
-        const int middle = at + counted[k], end = middle + counted[k + 1];
-        two[k / 2] = Two{at, middle, middle, end};
-        at = end;
-    }
-"""
-COUNT_BEFORE = """
-    const int *row = &wp::index(arrived, e, 0);
-    int before = 0;
-    for (int i = places[0]; i < places[1]; ++i) before += row[i] < p;
-    return before;
-"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +91,7 @@ def most_walks(box: Box, stretch: int) -> int:
 def number_taker():
     """Return the function that counts one more at a place, and returns how many there were."""
 
-    @wp.func_native(TAKE_NUMBER)
+    @cpp.func_native()
     def take_number(counts: wp.array2d[wp.int32], e: int, cell: int) -> int: ...
 
     return take_number
@@ -179,18 +136,18 @@ def cell_kernels(name: str) -> SimpleNamespace:
     Where g2p has counted particles, `count` need not.
     """
     vec3 = precision(name).vec3
-    Lattice, count_in_cell, module = lattice(name), counter(name), f"gradscape.cells.{name}"
+    Lattice, count_in_cell, module = lattice(name), counter(name), cpp.module(f"gradscape.cells.{name}")
     take_number, take_places, place_nodes = number_taker(), place_taker(), node_placer(name)
 
     Counts = wp.types.vector(SEGMENT, wp.int32)
 
-    @wp.func_native(TAKE_COUNTS.replace("SEGMENT", str(SEGMENT)))
+    @cpp.func_native(template=[SEGMENT])
     def take_counts(counts: wp.array2d[wp.int32], e: int, segment: int) -> Counts: ...
 
-    @wp.func_native(WRITE_PLACES.replace("SEGMENT", str(SEGMENT)))
+    @cpp.func_native(template=[SEGMENT])
     def write_places(places: wp.array2d[wp.vec2i], e: int, segment: int, at: int, counted: Counts): ...
 
-    @wp.func_native(COUNT_BEFORE)
+    @cpp.func_native()
     def count_before(arrived: wp.array2d[wp.int32], e: int, places: wp.vec2i, p: int) -> int: ...
 
     @wp.func(module=module)

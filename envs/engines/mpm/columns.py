@@ -13,6 +13,7 @@ from typing import Any, no_type_check
 
 import warp as wp
 
+from .. import cpp
 from ..launches import blocks
 from ..rows import with_arguments
 from ..runtime import precision
@@ -20,7 +21,7 @@ from .cells import SEGMENT, most_walks
 from .layout import layout
 from .model import Box
 from .stencil import lattice
-from .walk import PARTS, fill, lane_numbers, walker
+from .walk import PARTS, lane_numbers, walker
 
 
 @dataclass(frozen=True)
@@ -57,36 +58,6 @@ def kernel(lattice, rows, order, full, walks, OWN, parts):
         p = listed(order, e, place + i + size, last)  # asked for before the present ones are walked
         state = walk(parts, e, at, span, wp.min(size, count - i), what, state)
     close_segment(parts, e, at, span, state)
-"""
-
-ADD_UP = """
-    FOUR
-    const int nz = lattice.nz, ny = lattice.ny, column = node / nz;
-    const int x = column / ny, y = column % ny, z = lattice.first[2] + node % nz;
-    const int bottom = lattice.first[2] / SEGMENT, depth = (lattice.first[2] + nz - 1) / SEGMENT - bottom + 1;
-    const int segment = z / SEGMENT - bottom, plane = z % SEGMENT;
-    const bool both = plane < 2 && segment > 0;
-    const int *row = &wp::index(planes, e, 0);
-    const Four *given = (const Four *)&wp::index(parts, e, 0);
-    int lower[9], upper[9];
-#pragma unroll
-    for (int c = 0; c < 9; ++c) {
-        const bool there = x >= c / 3 && y >= c % 3;
-        const int here = ((x - c / 3) * ny + y - c % 3) * depth + segment;
-        lower[c] = there && both ? row[here - 1] : 0;
-        upper[c] = there ? row[here] : 0;
-    }
-    Four low{}, high{};
-#pragma unroll
-    for (int c = 0; c < 9; ++c) {
-        const int here = ((x - c / 3) * ny + y - c % 3) * depth + segment, at = plane + SEGMENT;
-        const Four none{};
-        const Four a = lower[c] >> at & 1 ? given[(here - 1) * PARTS + 9 * at + c] : none;
-        const Four b = upper[c] >> plane & 1 ? given[here * PARTS + 9 * plane + c] : none;
-        low.a += a.a, low.b += a.b, low.c += a.c, low.d += a.d;
-        high.a += b.a, high.b += b.b, high.c += b.c, high.d += b.d;
-    }
-    return wp::vec_t<4, REAL>(low.a + high.a, low.b + high.b, low.c + high.c, low.d + high.d);
 """
 
 
@@ -138,7 +109,7 @@ def walking_kernel(key: str, name: str, team: Team, given: Any, *, sloping: bool
     return wp.Kernel(
         with_arguments(kernel, kinds),
         key=key.replace(".", "__locals__"),
-        module=wp.get_module(given.module.name),
+        module=wp.get_module(cpp.module(given.module.name)),
         options={"enable_backward": False} | bounds,
         source=WALK.replace("OWN", ", ".join(own)),
     )
@@ -150,7 +121,7 @@ def node_sum(name: str):
     """Return the function (lattice, planes, parts, e, node) that adds up what the parts say of a node, in one order."""
     Lattice, vec4 = lattice(name), precision(name).vec4
 
-    @wp.func_native(fill(ADD_UP, name))
+    @cpp.func_native(template=[SEGMENT, PARTS])
     def add_up_node(
         lattice: Lattice, planes: wp.array2d[wp.int32], parts: wp.array2d[vec4], e: int, node: int
     ) -> vec4: ...
@@ -167,7 +138,7 @@ def column_kernels(name: str, team: Team) -> SimpleNamespace:
     """
     types, at_nodes, lies = precision(name), walker(name, sloping=True).at_nodes, layout(name)
     real, vec3, mat33 = types.real, types.vec3, types.mat33
-    Lattice, module = lattice(name), f"gradscape.columns.{name}.{team.lanes}"
+    Lattice, module = lattice(name), cpp.module(f"gradscape.columns.{name}.{team.lanes}")
     read_number, read_vector, read_matrix = lies.read_number, lies.read_vector, lies.read_matrix
 
     @wp.func(module=module)

@@ -14,59 +14,13 @@ from typing import no_type_check
 
 import warp as wp
 
+from .. import cpp
 from ..runtime import precision
 
 LANES = 8  # copies of the sums, so that fewer nodes wait for each other to add to the same one
 BITS = 16
 SUMS = {"float32": 17, "float64": 132}  # ranges that hold all exponents, and the last: how many are no numbers
 
-ADD = {
-    "float32": """
-        const unsigned bits = __float_as_uint(value), exponent = bits >> 23 & 255u;
-        const long long mantissa = (bits & 0x7fffffu) | (exponent ? 0x800000u : 0u);
-        const int shift = exponent ? exponent - 1 : 0;
-        const int last = exponent == 255u;
-        const long long part = last ? 1 : mantissa << (shift & 15);
-        atomicAdd(sums + (last ? SUMS - 1 : shift >> 4), (unsigned long long)(bits >> 31 && !last ? -part : part));
-    """,
-    "float64": """
-        const unsigned long long bits = __double_as_longlong(value), exponent = bits >> 52 & 2047u;
-        const unsigned long long mantissa = (bits & 0xfffffffffffffull) | (exponent ? 0x10000000000000ull : 0ull);
-        if (exponent == 2047u) {
-            atomicAdd(sums + SUMS - 1, 1ull);
-            continue;
-        }
-        for (int third = 0; third < 3; ++third) {
-            const int shift = (exponent ? (int)exponent - 1 : 0) + 18 * third;
-            const long long part = (long long)(mantissa >> 18 * third & 0x3ffffull) << (shift & 15);
-            if (part) atomicAdd(sums + (shift >> 4), (unsigned long long)(bits >> 63 ? -part : part));
-        }
-    """,
-}
-READ = "return wp::index(tools, e, step + after, slot);"
-ADJOINT_READ = """
-#if defined(__CUDA_ARCH__)
-    unsigned long long *all = (unsigned long long *)&wp::index(sums, e * LANES + lane, 0);
-    for (int axis = 0; axis < 3; ++axis) {
-        const REAL value = adj_ret[axis];
-        if (value == REAL(0.0)) continue;
-        unsigned long long *sums = all + ((after * tools.shape[2] + slot) * 3 + axis) * SUMS;
-        ADD
-    }
-#else
-    wp::adj_atomic_add(&wp::index(adj_tools, e, step + after, slot), adj_ret);
-#endif
-"""
-TAKE = """
-    long long *first = (long long *)&wp::index(sums, e * LANES, at), total = 0;
-    const int across = sums.shape[1];
-#pragma unroll
-    for (int lane = 0; lane < LANES; ++lane) total += first[lane * across];
-#pragma unroll
-    for (int lane = 0; lane < LANES; ++lane) first[lane * across] = 0;
-    return total;
-"""
-WEIGH = "return ldexp((double)sum, BITS * range - LOWEST);"
 LOWEST = {"float32": 149, "float64": 1074}  # 2^-LOWEST is the least number
 
 
@@ -79,17 +33,13 @@ def tool_readers(name: str) -> SimpleNamespace:
     integers `sums` of the environment's `lane`, after being 0 or 1; `settle` takes it from there.
     """
     vec3 = precision(name).vec3
-    words = {"ADD": ADD[name], "SUMS": str(SUMS[name]), "REAL": f"wp::{name}", "LANES": str(LANES)}
-    adjoint = ADJOINT_READ
-    for word, value in words.items():
-        adjoint = adjoint.replace(word, value)
 
-    @wp.func_native(READ, adj_snippet=adjoint)
+    @cpp.func_native(called="read_tool", template=[LANES, SUMS[name]], adjoint="adj_read_tool")
     def read(
         tools: wp.array3d[vec3], sums: wp.array2d[wp.int64], e: int, lane: int, step: int, after: int, slot: int
     ) -> vec3: ...
 
-    @wp.func_native(READ, adj_snippet="")
+    @cpp.func_native(called="look_at_tool", adjoint="")
     def look(tools: wp.array3d[vec3], e: int, step: int, after: int, slot: int) -> vec3: ...
 
     return SimpleNamespace(read=read, look=look)
@@ -105,16 +55,16 @@ def settle_kernel(name: str):
     types, count = precision(name), SUMS[name]
     real = types.real
 
-    @wp.func_native(WEIGH.replace("BITS", str(BITS)).replace("LOWEST", str(LOWEST[name])))
+    @cpp.func_native(called="weigh_sum", template=[BITS, LOWEST[name]])
     def weigh(sum: wp.int64, range: int) -> wp.float64: ...
 
-    @wp.func_native(TAKE.replace("LANES", str(LANES)))
+    @cpp.func_native(template=[LANES])
     def take_sum(sums: wp.array2d[wp.int64], e: int, at: int) -> wp.int64: ...
 
-    @wp.func_native("return NAN;")
+    @cpp.func_native()
     def no_number() -> wp.float64: ...
 
-    @wp.kernel(module=f"gradscape.exact.{name}", enable_backward=False)
+    @wp.kernel(module=cpp.module(f"gradscape.exact.{name}"), enable_backward=False)
     def settle(step: int, sums: wp.array2d[wp.int64], adj_tools: wp.array4d[real]):
         e, place = wp.tid()
         value = wp.float64(0.0)

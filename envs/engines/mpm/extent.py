@@ -7,21 +7,13 @@ from typing import Any, no_type_check
 import numpy as np
 import warp as wp
 
+from .. import cpp
 from ..launches import Launches
 from ..runtime import load, precision
 from .checkpoints import Allocator
 
 SHARES, LANES = 2048, 256  # of a GPU
 WARP = 32  # threads of a GPU that find out together
-
-OF_WARP = """
-#if defined(__CUDA_ARCH__)
-    for (int step = 16; step > 0; step /= 2)
-        for (int axis = 0; axis < 3; ++axis)
-            x[axis] = LEAST(x[axis], __shfl_xor_sync(0xffffffffu, x[axis], step));
-#endif
-    return x;
-"""
 
 
 @cache
@@ -32,12 +24,12 @@ def extent_kernels(name: str) -> SimpleNamespace:
     Of threads that are `together`, a warp of a GPU or one, one writes down what all have found.
     """
     types = precision(name)
-    real, vec3, module = types.real, types.vec3, f"gradscape.extent.{name}"
+    real, vec3, module = types.real, types.vec3, cpp.module(f"gradscape.extent.{name}")
 
-    @wp.func_native(OF_WARP.replace("LEAST", "min"))
+    @cpp.func_native(called="least_of_warp")
     def least(x: vec3) -> vec3: ...
 
-    @wp.func_native(OF_WARP.replace("LEAST", "max"))
+    @cpp.func_native(called="greatest_of_warp")
     def greatest(x: vec3) -> vec3: ...
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)

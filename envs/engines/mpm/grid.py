@@ -5,18 +5,14 @@ from typing import Any, no_type_check
 
 import warp as wp
 
+from .. import cpp
 from ..launches import blocks
 from ..runtime import precision
-from .columns import ADD_UP
+from .cells import SEGMENT
 from .exact import LANES
-from .layout import READ_NODE, WRITE_NODE, in_precision
 from .nodes import node_taker
 from .stencil import lattice
-from .walk import fill
-
-# A node is read once, so that its adjoint can be set, where Warp would add to it atomically; and it is set once.
-ADJOINT_READ = WRITE_NODE.replace("grid", "adj_grid").replace("value", "adj_ret")
-ADJOINT_WRITE = READ_NODE.replace("grid", "adj_grid").replace("return", "adj_value +=")
+from .walk import PARTS
 
 
 @cache
@@ -61,13 +57,14 @@ def velocity_kernel(name: str, boundary_velocity: Any, Data: Any) -> Any:
     real, vec3, vec4 = types.real, types.vec3, types.vec4
     Lattice, velocity_at_node = lattice(name), velocity_at(name, boundary_velocity, Data)
 
-    @wp.func_native(in_precision(READ_NODE, name), adj_snippet=in_precision(ADJOINT_READ, name))
+    # A node is read once, so that its adjoint can be set, where Warp would add to it atomically; and it is set once.
+    @cpp.func_native(called="read_node", adjoint="set_adj_read_node")
     def read(grid: wp.array2d[vec4], e: int, i: int) -> vec4: ...
 
-    @wp.func_native(in_precision(WRITE_NODE, name), adj_snippet=in_precision(ADJOINT_WRITE, name), replay_snippet="")
+    @cpp.func_native(called="write_node", adjoint="set_adj_write_node", replay=False)
     def write(grid: wp.array2d[vec4], e: int, i: int, value: vec4): ...
 
-    @wp.kernel(module="unique")
+    @wp.kernel(module="unique", module_options=cpp.options())
     def velocity(
         lattice: Lattice,
         boundary: Data,
@@ -103,9 +100,8 @@ def velocity_of_columns(name: str, boundary_velocity: Any, Data: Any) -> Any:
     types, take_node = precision(name), node_taker()
     real, vec3, vec4 = types.real, types.vec3, types.vec4
     Lattice, velocity_at_node = lattice(name), velocity_at(name, boundary_velocity, Data)
-    keep = in_precision(WRITE_NODE, name)
 
-    @wp.func_native(f"const auto value = [&] {{ {fill(ADD_UP, name)} }}();\n{keep}", adj_snippet="", replay_snippet="")
+    @cpp.func_native(called="write_sum", template=[SEGMENT, PARTS], adjoint="", replay=False)
     def add_up(
         lattice: Lattice,
         planes: wp.array2d[wp.int32],
@@ -116,10 +112,11 @@ def velocity_of_columns(name: str, boundary_velocity: Any, Data: Any) -> Any:
         node: int,
     ): ...
 
-    @wp.func_native(in_precision(READ_NODE, name), adj_snippet=in_precision(ADJOINT_READ, name))
+    # A node is read once, so that its adjoint can be set, where Warp would add to it atomically; and it is set once.
+    @cpp.func_native(called="read_node", adjoint="set_adj_read_node")
     def read(grid: wp.array2d[vec4], e: int, i: int) -> vec4: ...
 
-    @wp.func_native(keep, adj_snippet=f"adj_value += [&] {{ {fill(ADD_UP, name)} }}();", replay_snippet="")
+    @cpp.func_native(called="write_with_parts", template=[SEGMENT, PARTS], adjoint="adj_write_with_parts", replay=False)
     def write(
         lattice: Lattice,
         planes: wp.array2d[wp.int32],
@@ -131,7 +128,7 @@ def velocity_of_columns(name: str, boundary_velocity: Any, Data: Any) -> Any:
         value: vec4,
     ): ...
 
-    @wp.kernel(module="unique", launch_bounds=blocks(name))
+    @wp.kernel(module="unique", module_options=cpp.options(), launch_bounds=blocks(name))
     def velocity(
         lattice: Lattice,
         boundary: Data,

@@ -8,69 +8,10 @@ from typing import no_type_check
 
 import warp as wp
 
+from .. import cpp
 from .stencil import lattice
 
 HIGHEST = 1 << 30  # beyond all planes of nodes
-
-# The next `count` places of an environment, and the next `parts` of another kind: a warp's lanes take theirs together.
-TAKE_PLACES = """
-#if defined(__CUDA_ARCH__)
-    const unsigned all = 0xffffffffu;
-    if (!__ballot_sync(all, count > 0)) return wp::vec_t<2, wp::int32>(0, 0);
-    const int lane = threadIdx.x & 31;
-    int before = count, more = parts;
-    for (int step = 1; step < 32; step *= 2) {
-        const int other = __shfl_up_sync(all, before, step), others = __shfl_up_sync(all, more, step);
-        if (lane >= step) before += other, more += others;
-    }
-    int place = 0, part = 0;
-    if (lane == 31) {
-        place = atomicAdd(&wp::index(used, e, 0), before);
-        part = atomicAdd(&wp::index(used, e, 1), more);
-    }
-    place = __shfl_sync(all, place, 31) + before - count;
-    part = __shfl_sync(all, part, 31) + more - parts;
-#else
-    const int place = wp::index(used, e, 0), part = wp::index(used, e, 1);
-    wp::index(used, e, 0) += count;
-    wp::index(used, e, 1) += parts;
-#endif
-    return wp::vec_t<2, wp::int32>(place, part);
-"""
-# From which node of a column to which one, along z, particles of its nine columns of cells touch.
-FIND_TOUCHED = """
-    struct alignas(8) Two { int above, high; };
-    const Two *span = (const Two *)&wp::index(spans, e, 0);
-    const int x = column / lattice.ny, y = column % lattice.ny;
-    int above = 0, high = 0;
-    for (int c = 0; c < 9; ++c) {
-        if (x >= lattice.nx || x < c / 3 || y < c % 3) continue;
-        const Two found = span[(x - c / 3) * lattice.ny + y - c % 3];
-        above = wp::max(above, found.above);
-        high = wp::max(high, found.high);
-    }
-    return high ? wp::vec_t<2, wp::int32>(HIGHEST - above, high) : wp::vec_t<2, wp::int32>(0, 0);
-"""
-# Lanes of a warp have columns beside each other, whose nodes have places one after the other. They write all of these
-# together, a place each, and find out to whose column it belongs.
-NAME_NODES = """
-    const int room = nodes.shape[1], first = column * depth + low;
-    int *row = &wp::index(nodes, e, 0);
-#if defined(__CUDA_ARCH__)
-    const unsigned all = 0xffffffffu;
-    const int lane = threadIdx.x & 31, begin = __shfl_sync(all, start, 0), end = __shfl_sync(all, start + count, 31);
-    for (int from = begin; from < end; from += 32) {
-        const int place = from + lane;
-        int owner = 0;
-        for (int step = 16; step > 0; step /= 2)
-            if (__shfl_sync(all, start, owner + step) <= place) owner += step;
-        const int node = __shfl_sync(all, first - start, owner) + place;
-        if (place < wp::min(end, room)) row[place] = node;
-    }
-#else
-    for (int place = start; place < wp::min(start + count, room); ++place) row[place] = first + place - start;
-#endif
-"""
 
 
 @cache
@@ -78,7 +19,7 @@ NAME_NODES = """
 def place_taker():
     """Return the function that takes the next `count` places of an environment, and `parts` of another kind."""
 
-    @wp.func_native(TAKE_PLACES)
+    @cpp.func_native()
     def take_places(used: wp.array2d[wp.int32], e: int, count: int, parts: int) -> wp.vec2i: ...
 
     return take_places
@@ -93,10 +34,10 @@ def node_placer(name: str):
     """
     Lattice, take_places = lattice(name), place_taker()
 
-    @wp.func_native(FIND_TOUCHED.replace("HIGHEST", str(HIGHEST)))
+    @cpp.func_native(template=[HIGHEST])
     def find_touched(lattice: Lattice, spans: wp.array2d[wp.int32], e: int, column: int) -> wp.vec2i: ...
 
-    @wp.func_native(NAME_NODES)
+    @cpp.func_native()
     def name_nodes(nodes: wp.array2d[wp.int32], e: int, column: int, depth: int, low: int, count: int, start: int): ...
 
     @wp.func(module=f"gradscape.cells.{name}")

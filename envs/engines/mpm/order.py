@@ -13,6 +13,7 @@ import numpy as np
 import torch
 import warp as wp
 
+from .. import cpp
 from ..launches import Launches
 from ..runtime import load, precision, to_torch
 from .layout import layout
@@ -26,7 +27,7 @@ def sorting_kernels(name: str, key: Any) -> SimpleNamespace:
     """Return the kernels `label`, with keys of a type, `take, give`, and `take_state, give_state` by a state's type."""
     types = precision(name)
     real, vec3, mat33 = types.real, types.vec3, types.mat33
-    Lattice, module = lattice(name), f"gradscape.order.{name}.{key.__name__}"
+    Lattice, module = lattice(name), cpp.module(f"gradscape.order.{name}.{key.__name__}")
     read_matrix, write_matrix = layout(name).read_matrix, layout(name).write_matrix
 
     @wp.kernel(module=module, enable_backward=False)
@@ -101,8 +102,8 @@ def sorting_kernels(name: str, key: Any) -> SimpleNamespace:
         values[e, p] = value
 
     states = {
-        real: _state_kernels(real, f"{module}.number", read_number, write_number),
-        mat33: _state_kernels(mat33, f"{module}.matrix", read_matrix, write_matrix),
+        real: _state_kernels(real, cpp.module(f"{module}.number"), read_number, write_number),
+        mat33: _state_kernels(mat33, cpp.module(f"{module}.matrix"), read_matrix, write_matrix),
     }
     return SimpleNamespace(label=label, take=take, give=give, states=states)
 

@@ -7,6 +7,7 @@ import numpy as np
 import torch
 import warp as wp
 
+from .. import cpp
 from ..runtime import load, precision, threads, to_torch
 from .model import Model, place_grid
 from .stencil import lattice, stencil
@@ -25,7 +26,7 @@ def count_kernel(name: str) -> Any:
     Lattice, spline = lattice(name), stencil(name)
     base_node, weights = spline.base_node, spline.weights
 
-    @wp.kernel(module=f"gradscape.raster.{name}", enable_backward=False)
+    @wp.kernel(module=cpp.module(f"gradscape.raster.{name}"), enable_backward=False)
     def count_mass(
         lattice: Lattice,
         mass: wp.array2d[real],

@@ -9,6 +9,7 @@ from typing import no_type_check
 
 import warp as wp
 
+from .. import cpp
 from ..runtime import precision
 from .columns import Team, node_sum, walking_kernel
 from .gathers import gatherers
@@ -30,7 +31,8 @@ def smoothing_columns(name: str, team: Team) -> SimpleNamespace:
     real, vec3, vec4 = types.real, types.vec3, types.vec4
     Lattice, base_node, at_nodes = lattice(name), stencil(name).base_node, walker(name, sloping=False).at_nodes
     from_base = gatherers(name).from_base
-    add_up_node, take_node, module = node_sum(name), node_taker(), f"gradscape.smoothing.{name}.columns.{team.lanes}"
+    add_up_node, take_node = node_sum(name), node_taker()
+    module = cpp.module(f"gradscape.smoothing.{name}.columns.{team.lanes}")
     lies, gather, mat33 = layout(name), gatherers(name).gather, types.mat33
     read_number, read_vector, read_node, write_node = (
         lies.read_number,
@@ -43,7 +45,8 @@ def smoothing_columns(name: str, team: Team) -> SimpleNamespace:
     def at(lattice: Lattice, starts: wp.array2d[wp.int32], nodes: wp.array2d[vec4], e: int, x: vec3, q: vec3):
         """Return the sums of `gathers` at x, of what nodes hold, and of the slopes of w times its product with q."""
         base = base_node((x - lattice.origin) * lattice.inv_dx, lattice)
-        return gather(lattice, starts, nodes, e, base - lattice.first, from_base(x, base, lattice), q, mat33())
+        f = from_base(x, base, lattice)
+        return gather(lattice, starts, nodes, e, base - lattice.first, f, q, mat33(), real(0.0))
 
     @wp.func(module=module)
     def given_volume(

@@ -6,6 +6,7 @@ from typing import no_type_check
 
 import warp as wp
 
+from .. import cpp
 from ..runtime import precision
 from .layout import layout
 from .stencil import lattice, stencil
@@ -17,7 +18,7 @@ def smoothing_kernels(name: str) -> SimpleNamespace:
     """Return the kernels `clear, spread, collect, adjoint_collect, adjoint_spread` of one precision."""
     types = precision(name)
     real, vec3 = types.real, types.vec3
-    module = f"gradscape.smoothing.{name}"
+    module = cpp.module(f"gradscape.smoothing.{name}")
     Lattice, spline = lattice(name), stencil(name)
     base_node, weights, weight_slopes = spline.base_node, spline.weights, spline.weight_slopes
     read_number = layout(name).read_number

@@ -6,17 +6,8 @@ from typing import no_type_check
 
 import warp as wp
 
+from .. import cpp
 from ..runtime import precision
-
-# A compiler that makes one operation of a product and a sum would round otherwise in one kernel than in another, and a
-# particle close to the border of two cells would be listed in one and add to the nodes of the other.
-LOWEST = """
-#if defined(__CUDA_ARCH__)
-    return (int)floor(ADD(s, REAL(-0.5)));
-#else
-    return (int)floor(s - REAL(0.5));
-#endif
-"""
 
 
 @cache
@@ -56,9 +47,7 @@ def stencil(name: str) -> SimpleNamespace:
     real, vec3 = types.real, types.vec3
     Lattice, module = lattice(name), f"gradscape.stencil.{name}"
 
-    @wp.func_native(
-        LOWEST.replace("REAL", f"wp::{name}").replace("ADD", "__fadd_rn" if name == "float32" else "__dadd_rn")
-    )
+    @cpp.func_native(called="lowest_node")
     def lowest(s: real) -> int: ...
 
     @wp.func(module=module)

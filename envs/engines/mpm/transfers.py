@@ -14,6 +14,7 @@ from typing import no_type_check
 
 import warp as wp
 
+from .. import cpp
 from ..runtime import precision
 from .layout import layout
 from .stencil import lattice, stencil
@@ -25,7 +26,7 @@ def transfers(name: str) -> SimpleNamespace:
     """Return the transfer kernels `p2g, g2p, adjoint_p2g, adjoint_g2p` of one precision."""
     types = precision(name)
     real, vec3, vec4, mat33 = types.real, types.vec3, types.vec4, types.mat33
-    module = f"gradscape.transfers.{name}"
+    module = cpp.module(f"gradscape.transfers.{name}")
     Lattice, spline = lattice(name), stencil(name)
     base_node, weights, weight_slopes = spline.base_node, spline.weights, spline.weight_slopes
     lies = layout(name)

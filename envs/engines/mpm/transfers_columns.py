@@ -6,6 +6,7 @@ from typing import no_type_check
 
 import warp as wp
 
+from .. import cpp
 from ..runtime import precision
 from .cells import counter
 from .gathers import adjoint_gatherers, gatherers
@@ -22,7 +23,7 @@ def transfers_of_columns(name: str) -> SimpleNamespace:
     """
     types, sums_of = precision(name), gatherers(name)
     real, vec3, vec4, mat33 = types.real, types.vec3, types.vec4, types.mat33
-    module, lies = f"gradscape.transfers.{name}.columns", layout(name)
+    module, lies = cpp.module(f"gradscape.transfers.{name}.columns"), layout(name)
     Lattice, base_node, count_in_cell = lattice(name), stencil(name).base_node, counter(name)
     gather, from_base, gather_back = sums_of.gather, sums_of.from_base, adjoint_gatherers(name).p2g
     read_vector, read_matrix, write_matrix = lies.read_vector, lies.read_matrix, lies.write_matrix
@@ -48,7 +49,7 @@ def transfers_of_columns(name: str) -> SimpleNamespace:
         here = read_vector(x, e, p)
         base = base_node((here - lattice.origin) * lattice.inv_dx, lattice)
         f = from_base(here, base, lattice)
-        sums = gather(lattice, starts, grid_v, e, base - lattice.first, f, vec3(), mat33())
+        sums = gather(lattice, starts, grid_v, e, base - lattice.first, f, vec3(), mat33(), real(0.0))
         v = sums[0]
         C = wp.matrix_from_cols(sums[1] - f[0] * v, sums[2] - f[1] * v, sums[3] - f[2] * v)
         write_matrix(C_new, e, p, (real(4.0) * lattice.inv_dx) * C)

@@ -18,6 +18,7 @@ from typing import Any, ClassVar, Literal, Protocol, no_type_check
 
 import warp as wp
 
+from .. import cpp
 from ..runtime import fill_struct, precision
 
 Rule = Literal["end", "start"]
@@ -293,11 +294,6 @@ def _stop_twice(name: str, rule: Rule) -> Any:
     return stop
 
 
-# An element is read once, so that its adjoint can be set, where Warp would add to it atomically.
-READ = "return wp::index(values, row, i);"
-ADJOINT_READ = "if (adj_values.data) wp::index(adj_values, row, i) = adj_ret;"
-
-
 @cache
 @no_type_check
 def contact_kernel(name: str, stop: Any, Data: Any) -> Any:
@@ -309,10 +305,11 @@ def contact_kernel(name: str, stop: Any, Data: Any) -> Any:
     types = precision(name)
     real, vec3 = types.real, types.vec3
 
-    @wp.func_native(READ, adj_snippet=ADJOINT_READ)
+    # An element is read once, so that its adjoint can be set, where Warp would add to it atomically.
+    @cpp.func_native(called="read_strided", adjoint="set_adj_read_strided")
     def read(values: wp.array2d[vec3], row: int, i: int) -> vec3: ...
 
-    @wp.kernel(module=f"gradscape.contact.{stop.key}", grid_stride=False)
+    @wp.kernel(module=cpp.module(f"gradscape.contact.{stop.key}"), grid_stride=False)
     def touch(
         dt: real,
         data: Data,

@@ -17,6 +17,7 @@ import numpy as np
 import torch
 import warp as wp
 
+from .. import cpp
 from ..launches import Launches
 from ..runtime import free_memory, load, precision, to_torch
 from .contact import Rule, Surface, contact_kernel, sum_kernels
@@ -242,7 +243,7 @@ def spring_kernels(name: str) -> SimpleNamespace:
     """Return the kernel `pull` of forces on velocities, its `adjoint`, and the struct `Network` of one precision."""
     types = precision(name)
     real, vec3 = types.real, types.vec3
-    module = f"gradscape.springs.{name}"
+    module = cpp.module(f"gradscape.springs.{name}")
 
     @partial(wp.struct, module=module)
     class Network:
@@ -266,16 +267,16 @@ def spring_kernels(name: str) -> SimpleNamespace:
 
     # Warp looks of every index whether it counts from the end, and multiplies it by a stride in 64 bits. These arrays
     # are read twelve times a vertex.
-    @wp.func_native("return values.data[i];")
+    @cpp.func_native(called="read_flat")
     def real_at(values: wp.array[real], i: int) -> real: ...
 
-    @wp.func_native("return values.data[i];")
+    @cpp.func_native(called="read_flat")
     def number_at(values: wp.array[int], i: int) -> int: ...
 
-    @wp.func_native("return values.data[i];")
+    @cpp.func_native(called="read_flat")
     def stiffness_at(values: wp.array2d[real], i: int) -> real: ...
 
-    @wp.func_native("return values.data[i];")
+    @cpp.func_native(called="read_flat")
     def vector_at(values: wp.array2d[vec3], i: int) -> vec3: ...
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)

@@ -4,6 +4,7 @@ import numpy as np
 import torch
 import warp as wp
 
+from gradscape.envs.engines import cpp
 from gradscape.envs.engines.mpm.stencil import lattice
 from gradscape.envs.engines.runtime import has_rows, precision, threads, to_torch
 
@@ -113,7 +114,7 @@ class BoundaryBench:
         self.data = boundary.data("float64", "cpu")
         real, vec3 = self.types.real, self.types.vec3
 
-        @wp.kernel(module="unique")
+        @wp.kernel(module="unique", module_options=cpp.options())
         def apply(
             data: Data,
             p: wp.array[vec3],

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
+from ... import cpp
 from ...launches import blocks
 from ...rows import with_arguments
 from ...runtime import precision
@@ -105,7 +106,7 @@ def _kernel(
     return wp.Kernel(
         with_arguments(function, kinds),
         key=f"kernels__locals__adjoint{called}",
-        module=wp.get_module(f"{turn_back.module.name}{module}"),
+        module=wp.get_module(cpp.module(f"{turn_back.module.name}{module}")),
         options={"enable_backward": False} | options,
         source="\n    ".join([f"def kernel({', '.join(kinds)}):", "e, p = wp.tid()", *lines]) + "\n",
     )

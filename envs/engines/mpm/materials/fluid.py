@@ -5,6 +5,7 @@ from typing import no_type_check
 
 import warp as wp
 
+from ... import cpp
 from ...runtime import precision
 from ..layout import layout
 from .adjoints import MaterialKernels, alone
@@ -21,7 +22,7 @@ def kernels(name: str) -> MaterialKernels:
     """
     types = precision(name)
     real, mat33 = types.real, types.mat33
-    module = f"gradscape.fluid.{name}"
+    module = cpp.module(f"gradscape.fluid.{name}")
     read_matrix, write_matrix = layout(name).read_matrix, layout(name).write_matrix
 
     @wp.func(module=module)

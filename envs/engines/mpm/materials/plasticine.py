@@ -17,6 +17,7 @@ from typing import Any, no_type_check
 
 import warp as wp
 
+from ... import cpp
 from ...runtime import precision
 from ..layout import layout
 from .adjoints import MaterialKernels, alone
@@ -173,7 +174,7 @@ def responses(name: str) -> SimpleNamespace:
 @cache
 def kernels(name: str) -> MaterialKernels:
     """Return the kernels."""
-    found: MaterialKernels = kernels_of(name, responses(name), f"gradscape.plasticine.{name}")
+    found: MaterialKernels = kernels_of(name, responses(name), cpp.module(f"gradscape.plasticine.{name}"))
     return found
 
 

@@ -22,6 +22,7 @@ from typing import no_type_check
 
 import warp as wp
 
+from ... import cpp
 from ...runtime import precision
 from .adjoints import MaterialKernels
 from .plasticine import ROUNDED, SMALLEST, kernels_of, responses
@@ -32,7 +33,7 @@ NEAR = 0.2  # Frobenius norm of X up to which series are as exact as float32 is
 @cache
 def kernels(name: str) -> MaterialKernels:
     """Return the kernels."""
-    found: MaterialKernels = kernels_of(name, series(name), f"gradscape.plasticine.series.{name}")
+    found: MaterialKernels = kernels_of(name, series(name), cpp.module(f"gradscape.plasticine.series.{name}"))
     return found
 
 

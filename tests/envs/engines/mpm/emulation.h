@@ -2,6 +2,7 @@
 #pragma once
 #include <atomic>
 #include <barrier>
+#include <bit>
 #include <cstring>
 #include <memory>
 #include <thread>
@@ -48,6 +49,9 @@ template <class T> T __shfl_sync(unsigned mask, T value, int from) {
 template <class T> T __shfl_up_sync(unsigned, T value, int by) {
     return agree(value, [&](auto of) { return of(lane() < by ? lane() : lane() - by); });
 }
+template <class T> T __shfl_xor_sync(unsigned, T value, int by) {
+    return agree(value, [&](auto of) { return of(lane() ^ by); });
+}
 inline int __reduce_max_sync(unsigned, int value) {
     return agree(value, [](auto of) { int most = of(0); for (int i = 1; i < 32; ++i) most = std::max(most, of(i)); return most; });
 }
@@ -55,7 +59,9 @@ inline int __popc(unsigned value) { return __builtin_popcount(value); }
 inline int __ffs(unsigned value) { return __builtin_ffs(value); }
 inline float __fadd_rn(float a, float b) { return a + b; }
 inline double __dadd_rn(double a, double b) { return a + b; }
-inline int atomicAdd(int *place, int value) { return __atomic_fetch_add(place, value, __ATOMIC_SEQ_CST); }
+inline unsigned __float_as_uint(float value) { return std::bit_cast<unsigned>(value); }
+inline long long __double_as_longlong(double value) { return std::bit_cast<long long>(value); }
+template <class T> T atomicAdd(T *place, T value) { return __atomic_fetch_add(place, value, __ATOMIC_SEQ_CST); }
 
 template <class F> void launch(size_t count, F kernel) {
     gridDim.x = (count + BLOCK - 1) / BLOCK;

@@ -7,6 +7,7 @@ import pytest
 import torch
 import warp as wp
 
+from gradscape.envs.engines import cpp
 from gradscape.envs.engines.mpm.transfers import lattice, transfers
 from gradscape.envs.engines.mpm.transfers_cpu import transfers_in_rows, transfers_on_cpu
 from gradscape.envs.engines.runtime import has_rows, precision, to_torch
@@ -116,7 +117,7 @@ def double(array):
 def differentiated(name):
     """Return p2g and g2p built anew, this time with Warp's own adjoints."""
     kernels = transfers(name)
-    decorate = wp.kernel(module=f"tests.transfers.{name}", enable_backward=True)
+    decorate = wp.kernel(module=cpp.module(f"tests.transfers.{name}"), enable_backward=True)
     return SimpleNamespace(p2g=decorate(kernels.p2g.func), g2p=decorate(kernels.g2p.func))
 
 
