@@ -15,8 +15,8 @@ from pathlib import Path
 
 import pytest
 
-from gradscape.cli import main, verbs
 from gradscape.api import view
+from gradscape.cli import main, verbs
 from gradscape.gallery.files import DATA
 from gradscape.jobs.workers import workers
 

@@ -23,10 +23,9 @@ import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
+from gradscape.cli import verbs
 from gradscape.envs.base import Environment
 from gradscape.gallery.site import build
-
-from gradscape.cli import verbs
 
 from ..command import options
 from ..faults import damage

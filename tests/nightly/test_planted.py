@@ -16,8 +16,8 @@ import pytest
 import zarr
 
 from gradscape import Environment
-
 from gradscape.cli import verbs
+
 from ..kinds import KINDS, copy, files, say, whole
 
 READ_AS_TEXT = {".json", ".md", ".csv", ".js", ".html", ".toml", ".css"}

@@ -15,6 +15,7 @@ from gradscape.gallery.files import RUN_SUFFIX, RUNS, LeagueFiles, LeagueSliceFi
 from gradscape.gallery.paper import PaperCaption
 from gradscape.gallery.runs import save_run
 from gradscape.gallery.site.build import build_site
+from gradscape.landscapes.convert import to_json
 from gradscape.landscapes.objective import Evaluation, Objective
 from gradscape.landscapes.plane import Plane
 from gradscape.landscapes.sampling.fill import sample
