@@ -63,6 +63,7 @@ RENAMED = {  # verbs and options of earlier versions, and today's
     "--print": "--figure-width-mm",
     "--report": "--claims",
 }
+ALL_KINDS = (Slot.POSITIONAL_ONLY, Slot.POSITIONAL_OR_KEYWORD, Slot.KEYWORD_ONLY, Slot.VAR_KEYWORD)
 STOPPED = 130  # the exit code of what Ctrl-C has ended
 LONG_PATH = 200  # characters of a path that an error shows
 DIMS = "--dims"
@@ -94,7 +95,7 @@ class Verb:
         own = _slots(self.function)
         if not _returned(self.function):
             return own
-        shown = {}
+        shown: dict[str, Slot] = {}
         for kind in _returned(self.function):
             shown |= {slot.name: slot for slot in _slots(shower(kind), (Slot.KEYWORD_ONLY,))}
         last = own.pop() if own and own[-1].kind is Slot.VAR_KEYWORD else None
@@ -167,14 +168,14 @@ def _plan(function: Callable[..., Any], given: Sequence[Any], named: dict[str, A
     return plan(function, *given, **named)
 
 
-def _slots(function: Callable[..., Any] | None, kinds: Sequence[Any] = tuple(type(Slot.KEYWORD_ONLY))) -> list[Slot]:
+def _slots(function: Callable[..., Any] | None, kinds: Sequence[Any] = ALL_KINDS) -> list[Slot]:
     """Return a function's parameters for the command line: arguments are those that are marked, all else is options."""
     from .api.options import ARGUMENT
 
     slots = []
     for slot in signature(function).parameters.values() if function else ():
         hint, kind = _hint(function, slot.annotation), slot.kind
-        if kind not in kinds or kind is Slot.VAR_POSITIONAL or (kind is Slot.VAR_KEYWORD and hint is Any):
+        if kind not in kinds or (kind is Slot.VAR_KEYWORD and hint is Any):
             continue  # of a plan: the words of another verb
         if slot.default is None or slot.default is False or slot.default == ():
             hint = Annotated[hint, Parameter(show_default=False)]
@@ -189,7 +190,7 @@ def _slots(function: Callable[..., Any] | None, kinds: Sequence[Any] = tuple(typ
 def _hint(function: Callable[..., Any] | None, written: Any) -> Any:
     """Return the type that stands for a parameter; what only type checkers know is no option of the command."""
     try:
-        return eval(written, getattr(function, "__wrapped__", function).__globals__)
+        return eval(written, vars(import_module(str(function.__module__))))
     except NameError:
         return Any
 

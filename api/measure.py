@@ -11,7 +11,6 @@ from .call import current, verb
 from .options import (
     Count,
     Device,
-    FidelityName,
     FigureWidth,
     Force,
     Out,
@@ -155,7 +154,7 @@ def census(
     resolution: Annotated[int, at_least(6)] = 24,
     gradients: Count = 1,
     along: Literal["pairs", "random"] = "pairs",
-    second_fidelity: FidelityName | None = None,
+    second_fidelity: str | None = None,
     seed: Seed = 0,
     scheduler: Scheduler = None,
     figure_width_mm: FigureWidth = (),

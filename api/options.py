@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypedDict
+from typing import TYPE_CHECKING, Annotated, Any, TypeAlias, TypedDict
 
 from cyclopts import Parameter
 from cyclopts.validators import Number
@@ -26,19 +26,19 @@ if TYPE_CHECKING:
 
     from ..envs.base import Fidelity
 
-    Point = str | Float[Tensor, " dim"]
-    Points = Point
-    Window = float | str | tuple[float, float]
-    Share = float | str
-    Settings = Mapping[str, Any] | Sequence[str]
-    MethodSettings = Mapping[str, Mapping[str, Any]] | Sequence[str]
-    Names = str | Sequence[str]
-    Dims = Sequence[int | str]
-    Stride = bool | int | None
-    Widths = float | Sequence[float]
-    FidelityName = str | Fidelity
-    Resolution = int | Sequence[int]
-    Parameter_ = int | str
+    Point: TypeAlias = str | Float[Tensor, " dim"]
+    Points: TypeAlias = Point
+    Window: TypeAlias = float | str | tuple[float, float]
+    Share: TypeAlias = float | str
+    Settings: TypeAlias = Mapping[str, Any] | Sequence[str]
+    MethodSettings: TypeAlias = Mapping[str, Mapping[str, Any]] | Sequence[str]
+    Names: TypeAlias = str | Sequence[str]
+    Dims: TypeAlias = Sequence[int | str]
+    Stride: TypeAlias = bool | int | None
+    Widths: TypeAlias = float | Sequence[float]
+    FidelityName: TypeAlias = str | Fidelity
+    Resolution: TypeAlias = int | Sequence[int]
+    Parameter_: TypeAlias = int | str
 else:
     Point = Points = Window = Share = FidelityName = Parameter_ = str
     Names = Settings = MethodSettings = list[str]

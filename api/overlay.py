@@ -12,7 +12,7 @@ from .slice import as_slice
 from .values import as_path, as_widths
 
 if TYPE_CHECKING:
-    from typing import Protocol
+    from typing import Protocol, TypeAlias
 
     import pandas as pd
 
@@ -36,9 +36,9 @@ if TYPE_CHECKING:
         def lookup_data(self) -> Any:
             """Return what its metrics measured."""
 
-    SliceFolder = str | Path | Slice
-    RunFolder = str | Path | Run | pd.DataFrame | Study | Experiment
-    RunFolders = RunFolder | Sequence[RunFolder]
+    SliceFolder: TypeAlias = str | Path | Slice
+    RunFolder: TypeAlias = str | Path | Run | pd.DataFrame | Study | Experiment
+    RunFolders: TypeAlias = RunFolder | Sequence[RunFolder]
 else:
     SliceFolder, RunFolders = str, list[str]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Unpack
+from typing import TYPE_CHECKING, Annotated, Any, TypeAlias, Unpack
 
 from cyclopts import Parameter
 
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from ..optim.race import Race
     from ..optim.runs.run import Run
 
-    Scenes = Scene | Sequence[Scene]
+    Scenes: TypeAlias = Scene | Sequence[Scene]
 else:
     Scenes = list[str]
 

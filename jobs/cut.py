@@ -22,7 +22,7 @@ HALF, LEAST = 0.5, 1e-3  # of a width of the box: how far a slice reaches at lea
 SPREAD = 1 / 8  # the same by the root of how many parameters there are: each moves by that share of its width
 
 
-def refuse_cut(dims: Sequence[str] | None, along: str | None) -> None:
+def refuse_cut(dims: Sequence[int | str] | None, along: str | None) -> None:
     """Raise ValueError for parameters beside directions, and for a word that names no directions."""
     if dims and along is not None:
         raise ValueError(ONE_OF)
