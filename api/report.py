@@ -13,8 +13,7 @@ from .scene import environment, spec_of
 from .values import as_path, as_widths
 
 if TYPE_CHECKING:
-    from ..jobs.report import ReportedSlice
-    from ..jobs.report_record import Report, Reports
+    from ..jobs.report import Report, ReportedSlice, Reports
 
 
 @verb

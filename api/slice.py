@@ -238,7 +238,7 @@ def _open(path: Path, env: Scene, remake: Callable[[], Objective] | None) -> Sli
 
 
 def _sample_in_memory(objective: Objective, plane: Plane, refinement: Refinement | None, gradients: int) -> Slice:
-    from ..jobs.slice_summary import look_between
+    from ..jobs.slice import look_between
     from ..landscapes.lattice import check_gradients
     from ..landscapes.sampling.fill import describe, sample
     from ..landscapes.sampling.refine import refine

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from .terminal import Console, table
 
 if TYPE_CHECKING:
-    from ..jobs.report_record import Report, Reports
+    from ..jobs.report import Report, Reports
 
 
 def show(report: Report, console: Console) -> None:
@@ -22,7 +22,7 @@ def show(report: Report, console: Console) -> None:
 
 def show_several(found: Reports, console: Console) -> int:
     """Print a row for each slice; the exit code is 1 where one failed."""
-    from ..jobs.report_tables import HEADINGS, slice_rows
+    from ..jobs.report import HEADINGS, slice_rows
 
     rows = table(*HEADINGS, title="what landscapes are like")
     for row in slice_rows(found.reports):

@@ -79,7 +79,7 @@ class Figure:
 
     def sweep_command(self, *, frames: int, resolution: int, gradients: int, fidelity: str, device: str) -> str:
         """Return the command that makes its sweep; of smoothed losses there are no gradients."""
-        from ..jobs.motion import SMOOTHING
+        from ..jobs.sweep import SMOOTHING
 
         axes = ["--dims", *map(str, self.dims), "--over", self.over, "--frames", str(frames)]
         how = ["--resolution", str(resolution), "--fidelity", fidelity, "--through", self.through]

@@ -27,8 +27,7 @@ from ..landscapes.storage.records import read_json, reading
 from ..landscapes.storage.store import open_slice
 from .folder import COMPARISON, SLICE_STORE, folder_named
 from .job import Job
-from .slice import SliceJob
-from .slice_place import identity_of
+from .slice import SliceJob, identity_of
 from .watch import Watch
 
 if TYPE_CHECKING:

@@ -59,7 +59,7 @@ def cut(
         raise ValueError(f"a slice along {along} takes one resolution for its axes; got {list(resolution)}")
     where: dict[str, Any] = {"through": through, "extent": extent}
     if kept is not None and (named := describe_cut(along, **where)):
-        from .slice_place import kept_plane
+        from .slice import kept_plane
 
         rank = len(joined_points(along)) - 1 if joined_points(along) else 2
         if (found := kept_plane(objective, named, (resolution,) * rank, **kept)) is not None:
@@ -146,7 +146,7 @@ def describe_cut(
     """Return what a slice along directions is known by; None for one along parameters."""
     if along is None:
         return None
-    from .slice_summary import JOINED
+    from .slice import JOINED
 
     names = joined_points(along)
     point = through if isinstance(through, str) else through.tolist()

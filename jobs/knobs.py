@@ -10,7 +10,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 from ..landscapes.measures.stability import Axis
-from .motion import HORIZON
+from .sweep import HORIZON
 
 if TYPE_CHECKING:
     from ..envs.base import Environment

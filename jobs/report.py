@@ -7,41 +7,51 @@ import hashlib
 import json
 import shutil
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
+from itertools import groupby
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, NotRequired, Protocol, TypedDict, cast
 
 import torch
 from torch import Tensor
 
 from ..landscapes.capacity import Need, require, size
 from ..landscapes.cost import duration, seconds_per_episode
-from ..landscapes.identity import MODEL_VERSION, stored_identity
+from ..landscapes.identity import MODEL_VERSION, current_identity, stored_identity
+from ..landscapes.measures.records import ProfileRecord, WordRecord
 from ..landscapes.objective import BoxedObjective, Evaluation, ObjectiveWrapper
+from ..landscapes.plain import number, text
 from ..landscapes.storage.disk import is_full
 from ..landscapes.storage.files import make_folder, other_files, replacing, tidy, write_json
-from ..landscapes.storage.records import read_json, write_record
+from ..landscapes.storage.records import read_json, reading, write_record
 from ..landscapes.verification import RESAMPLE, verify_dataset
 from . import growth
 from .folder import REPORT, REPORTS, ROOT, SLICE_STORE, folder_named, store_in
 from .plan import Work
-from .report_record import ARRAYS, MEASURES, PICTURE, RECORD, PaperRecord, Quoted, Report, ReportKey, Reports
-from .report_tables import slices_markdown
 from .scene import environment_of
 from .watch import PREPARING, Watch, resumable
 
 if TYPE_CHECKING:
+    import pandas as pd
     import xarray as xr
 
     from ..envs.base import Environment
+    from ..landscapes.draw.figures.page import Picture
     from ..landscapes.measures.profile import Profile
-    from ..landscapes.measures.records import ProfileRecord
+    from ..landscapes.measures.records import ScaleRecord
     from ..landscapes.objective import Objective
+    from ..landscapes.statistics import EstimateRecord
 
 TABLE = REPORTS.files[1]
 POINTS = 6  # along each axis where gradients are tested by new evaluations
 RESOLUTION = 24  # points per axis of a slice that is sampled for its report
+RECORD, MEASURES, PICTURE, ARRAYS = REPORT.files  # the arrays are what the picture is drawn from, but for the slice
+HEADINGS = ("slice", "minima", "flat", "jumps", "cosine", "measured", "the paper's words", "measured too")
+ENVIRONMENTS = (
+    "environment", "slices", "minima", "flat", "jumps", "cosine, small step", "cosine, two samples", "measured",
+SEEN = 0.5  # of the points that any step sees, for a smaller one to be worth showing
 
 
 @dataclass(frozen=True)
@@ -401,3 +411,291 @@ def _check_summary(folder: Path) -> None:
             f"{path} is not there, damaged or of something else than several slices, so that it and {TABLE} are not "
             "replaced; move both away, or give --out a new or an empty folder"
         )
+
+
+
+
+class Quoted(Protocol):
+    """What the paper says of an environment's landscape: words of `classify.WORDS`, and where it says them."""
+
+    @property
+    def words(self) -> tuple[str, ...]: ...  # noqa: D102
+
+    @property
+    def where(self) -> str: ...  # noqa: D102
+
+
+class PaperRecord(TypedDict):
+    """The paper's words for a landscape, and where it says them."""
+
+    words: list[WordRecord]
+    where: str
+
+
+class ReportKey(TypedDict):
+    """What decides a report: its settings, the digest of the slice, and the version of the scene's model."""
+
+    points: int
+    seed: int
+    slice: str
+    model_version: int
+    device: NotRequired[str]  # of early versions
+
+
+@dataclass(frozen=True)
+class Report:
+    """Hold what was measured of a slice, as `report.json` has it.
+
+    `profile` is what `Profile.record` returns, `paper` the words that the paper has for the scene, None where it has
+    none, and `seconds` what the measuring took. `folder` is where its files are, and `store` the slice's.
+    """
+
+    name: str
+    env: str
+    options: dict[str, Any]
+    fidelity: str
+    device: str
+    profile: ProfileRecord
+    paper: PaperRecord | None
+    seconds: float
+    command: str
+    key: ReportKey
+    folder: Path | None = field(default=None, compare=False, repr=False)
+    store: Path | None = field(default=None, compare=False, repr=False)
+
+    @classmethod
+    def read(cls, path: Path) -> Report:
+        """Read `report.json`, or that of a folder.
+
+        Raises DamagedError, which names the file and says what to do, where not all of it can be shown, and
+        FileNotFoundError.
+        """
+        path = path / RECORD if path.is_dir() else path
+        with reading(path, "delete it, and the same command measures the slice anew"):
+            report = replace(cls.of_record(read_json(path)), folder=path.parent)
+            report.measures, slices_markdown([report]), by_environment([report])
+            number(report.key["model_version"])
+            own = report.name, report.env, report.device, report.profile.get("errors", "")
+            for said in (*own, *report.verdict_lines()):
+                text(said)
+        return report
+
+    @classmethod
+    def of_record(cls, record: Mapping[str, Any]) -> Report:
+        """Take a report from plain JSON, by the keys of the file; raises KeyError where one is missing."""
+        own = [name for name in cls.__dataclass_fields__ if name not in ("profile", "key", "folder", "store")]
+        profile = {name: record[name] for name in ProfileRecord.__annotations__ if name in record}
+        key = cast("ReportKey", current_identity(record["key"]))
+        return cls(**{name: record[name] for name in own}, profile=cast("ProfileRecord", profile), key=key)
+
+    def record(self) -> dict[str, Any]:
+        """Return it as plain JSON, by the keys of the file."""
+        return {
+            "name": self.name,
+            "env": self.env,
+            "options": self.options,
+            "fidelity": self.fidelity,
+            "device": self.device,
+            **self.profile,
+            "paper": self.paper,
+            "seconds": self.seconds,
+            "command": self.command,
+            "key": self.key,
+        }
+
+    @property
+    def words(self) -> tuple[str, ...]:
+        """The words for the landscape."""
+        return tuple(self.profile["verdict"]["words"])
+
+    @property
+    def measures(self) -> dict[str, str]:
+        """The chief numbers by short names, with 95 % intervals, as a page shows them."""
+        from ..landscapes.measures.profile import named_measures
+
+        return named_measures(self.profile)
+
+    def verdict_lines(self) -> list[str]:
+        """Return the words, each with its reason, and whether the paper has them, a line each."""
+        verdict = self.profile["verdict"]
+        lines = [f"{word}: {verdict['reasons'][word]}" for word in verdict["words"]]
+        if finer := self.profile.get("at_twice"):
+            lines.append(_say_changes(finer["appear"], finer["go"]))
+        if self.paper:
+            said = "; ".join(f"{one['word']}: {'yes' if one['measured'] else 'no'}" for one in self.paper["words"])
+            lines.append(f"the paper's words ({self.paper['where']}), measured too? {said}")
+        return lines
+
+    def table(self) -> pd.DataFrame:
+        """Return the chief numbers, a row each, indexed by `measure`, with the column `value` as text."""
+        import pandas as pd
+
+        return pd.DataFrame({"value": self.measures}).rename_axis("measure")
+
+    def plot(self, width: float | None = None) -> Picture:
+        """Draw gradient quality over the slice, for a screen, or for a page so wide [mm].
+
+        Raises ValueError where its files do not hold what it is drawn from.
+        """
+        return self.picture()(width=width)
+
+    def picture(self) -> Callable[..., Picture]:
+        """Read what it is drawn from, and return what draws it, for any width. Raises ValueError as `plot` does."""
+        import numpy as np
+
+        from ..landscapes.draw.figures.quality import quality_figure
+        from ..landscapes.lattice import sampled_lattice
+        from ..landscapes.measures.gradient_quality import compare_samples
+        from ..landscapes.storage.bundle import open_bundle
+        from ..landscapes.storage.store import open_slice
+
+        if self.folder is None or self.store is None or not (self.folder / ARRAYS).exists():
+            raise ValueError(
+                f"{self.folder} is a report from before {ARRAYS} was kept to draw from; delete it to measure it anew"
+            )
+        dataset, kept = sampled_lattice(open_slice(self.store)), open_bundle(self.folder / ARRAYS)
+        samples = compare_samples(dataset, deviation=float(np.nan_to_num(kept["noise"]["deviation"])))
+        return partial(quality_figure, dataset, kept["steps"], samples, kept["smooth"])
+
+    def _repr_html_(self) -> str:
+        """Show words and numbers in a notebook."""
+        from html import escape
+
+        lines = "".join(f"<li>{escape(line)}</li>" for line in self.verdict_lines())
+        return f"<p>{escape(self.name)} ({escape(self.env)})</p><ul>{lines}</ul>{self.table().to_html()}"
+
+
+def _say_changes(appear: Sequence[str], go: Sequence[str]) -> str:
+    """Say which words would change at twice the resolution."""
+    said = [f"{word} would appear" for word in appear] + [f"{word} would go" for word in go]
+    return f"at twice the resolution: {', '.join(said) or 'no word is seen to change'}"
+
+
+@dataclass(frozen=True)
+class Reports:
+    """Hold the reports of several slices, in their order, and by name what was wrong with those that failed."""
+
+    reports: tuple[Report, ...]
+    failed: dict[str, str]
+
+    def record(self) -> dict[str, Any]:
+        """Return them as plain JSON, with what the environments have in common."""
+        environments: dict[str, EnvironmentRecord] = by_environment(self.reports)
+        reports = [report.record() for report in self.reports]
+        return {"reports": reports, "environments": environments, "failed": self.failed}
+
+
+    "the paper's words", "agree",
+)  # fmt: skip
+
+
+class EnvironmentRecord(TypedDict):
+    """In how many `slices` of an environment each word was measured, and each of the paper's."""
+
+    slices: int
+    measured: dict[str, int]
+    paper: dict[str, int]
+
+
+def by_environment(reports: Sequence[Report]) -> dict[str, EnvironmentRecord]:
+    """Count by environment in how many of its slices each word was measured, and each of the paper's."""
+    found: dict[str, EnvironmentRecord] = {}
+    for report in reports:
+        entry = found.setdefault(report.env, {"slices": 0, "measured": {}, "paper": {}})
+        entry["slices"] += 1
+        for word in report.words:
+            entry["measured"][word] = entry["measured"].get(word, 0) + 1
+        for one in report.paper["words"] if report.paper else []:
+            entry["paper"][one["word"]] = entry["paper"].get(one["word"], 0) + one["measured"]
+    return found
+
+
+def slice_rows(reports: Sequence[Report]) -> list[tuple[str, ...]]:
+    """Return a row for each slice, under `HEADINGS`."""
+    return [_slice(report) for report in reports]
+
+
+def slices_markdown(reports: Sequence[Report]) -> str:
+    """Return a row for each slice, as Markdown."""
+    return markdown(HEADINGS, slice_rows(reports))
+
+
+def environments_markdown(reports: Sequence[Report]) -> str:
+    """Return a row for each environment, as Markdown: the least and the most of its slices, and the words.
+
+    The small step is the smallest that sees a slope above the noise at half as many points as any step does.
+    """
+    groups = groupby(reports, key=lambda report: report.env)
+    return markdown(ENVIRONMENTS, (_environment(env, list(group)) for env, group in groups))
+
+
+def _environment(env: str, reports: Sequence[Report]) -> tuple[str, ...]:
+    from ..landscapes.measures.classify import WORDS
+
+    words, count = by_environment(reports)[env], len(reports)
+    measured = [_of(word, words["measured"][word], count) for word in WORDS if word in words["measured"]]
+    profiles = [report.profile for report in reports]
+    samples = [profile["differences_of_samples"][0] for profile in profiles if profile["differences_of_samples"]]
+    return (
+        f"`{env}`",
+        str(count),
+        _span([profile["losses"]["notable"] for profile in profiles], "{:.0f}"),
+        _span([_value(profile["losses"]["flat"], 100) for profile in profiles], "{:.0f} %"),
+        _span([_value(profile["jumps"]["share"], 100) for profile in profiles], "{:.1f} %"),
+        _span([_value(_small(profile["differences"])["cosine"]) for profile in profiles], "{:z.2f}"),
+        _span([_value(row["cosine"]) for row in samples], "{:z.2f}"),
+        ", ".join(measured),
+        ", ".join(_of(word, hits, count) for word, hits in words["paper"].items()),
+        _agreement(list(words["paper"].values()), count),
+    )
+
+
+def _small(rows: Sequence[ScaleRecord]) -> ScaleRecord:
+    most = max(row["points"] for row in rows)
+    return next(row for row in rows if row["points"] >= SEEN * most)
+
+
+def _value(estimate: EstimateRecord | None, scale: float = 1.0) -> float | None:
+    return None if estimate is None or estimate["value"] is None else scale * float(estimate["value"])
+
+
+def _span(values: Iterable[float | None], form: str) -> str:
+    """Write the least and the most of what is known."""
+    known = sorted(value for value in values if value is not None)
+    if not known:
+        return ""
+    low, high = (form.format(end).replace("-", "\N{MINUS SIGN}") for end in (known[0], known[-1]))
+    return high if low == high else f"{low.removesuffix(' %')} to {high}"
+
+
+def _of(word: str, hits: int, count: int) -> str:
+    return word if hits == count else f"{word} ({hits} of {count})"
+
+
+def _agreement(hits: Sequence[int], count: int) -> str:
+    """Say whether all of the paper's words were measured in all slices, none in any, or some."""
+    if not hits:
+        return ""
+    return "yes" if min(hits) == count else "in part" if max(hits) else "no"
+
+
+def _slice(report: Report) -> tuple[str, ...]:
+    losses, samples = report.profile["losses"], report.profile["differences_of_samples"]
+    words = report.paper["words"] if report.paper else []
+    hits = sum(one["measured"] for one in words)
+    return (
+        report.name,
+        str(losses["notable"]),
+        _span([_value(losses["flat"], 100)], "{:.1f} %"),
+        _span([_value(report.profile["jumps"]["share"], 100)], "{:.1f} %"),
+        _span([_value(samples[0]["cosine"]) if samples else None], "{:z.2f}"),
+        ", ".join(report.words),
+        ", ".join(one["word"] for one in words),
+        f"{hits} of {len(words)}" if words else "",
+    )
+
+
+def markdown(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return a table in Markdown."""
+    lines = [headings, ("---",) * len(headings), *rows]
+    return "".join(f"| {' | '.join(row)} |\n" for row in lines)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import math
 import resource
 import sys
 import time
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import AbstractContextManager
@@ -14,6 +16,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 import xarray as xr
 from jaxtyping import Float
@@ -22,11 +25,13 @@ from torch import Tensor
 from ..landscapes.capacity import size
 from ..landscapes.convert import to_json
 from ..landscapes.cost import duration, seconds_per_episode
-from ..landscapes.identity import with_stride
+from ..landscapes.directions import barrier
+from ..landscapes.identity import plane_of, stored_identity, with_stride
 from ..landscapes.lattice import check_gradients, count_gradients
-from ..landscapes.measures.unresolved import probes, stored_unresolved
-from ..landscapes.objective import BoxedObjective, Objective, Status, failed
-from ..landscapes.plain import digest
+from ..landscapes.measures.records import UnresolvedRecord
+from ..landscapes.measures.unresolved import attribute_of, find_unresolved, probes, say_unresolved, stored_unresolved
+from ..landscapes.objective import BoxedObjective, Objective, Status, describe_errors, failed
+from ..landscapes.plain import digest, plain_name
 from ..landscapes.plane import Plane
 from ..landscapes.sampling.distribution import RemoteSite, Site, evaluator, run_tasks, workers_of
 from ..landscapes.sampling.fill import Progress, sample
@@ -35,16 +40,14 @@ from ..landscapes.sampling.refine import Refined, Refinement, partly_refined, re
 from ..landscapes.storage.arrays import need_of
 from ..landscapes.storage.checkpoint import Checkpoint
 from ..landscapes.storage.files import clear, tidy, write_json
-from ..landscapes.storage.paths import slice_exists
+from ..landscapes.storage.paths import is_slice, slice_exists
 from ..landscapes.storage.store import SliceStore
 from ..landscapes.storage.tiles import Tile
 from ..landscapes.verification import verify_dataset, verify_store
-from .folder import ROOT, SLICE, SUMMARY
+from .folder import ROOT, SLICE, SUMMARY, folder_named
 from .job import Job
 from .plan import Work
 from .scene import provenance
-from .slice_place import default_folder, identity_of
-from .slice_summary import SliceSummary, barrier_of, count_statuses, flat_points, look_between, range_of
 from .watch import PREPARING, Watch, resumable
 from .workers import recipe
 
@@ -52,9 +55,63 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 STORE, PICTURE, REFINING = SLICE.store, SLICE.picture, "slice.refining"
-PAUSE, DRAWING = 10.0, 0.1  # between pictures of an unfinished slice: least seconds, and most of the time for them
-SOON = 3.0  # seconds until the first of them: of a slice that is finished by then it would be seen by nobody
+MIN_PAUSE_SECONDS, MAX_DRAWING_SHARE = (
+    10.0,
+    0.1,
+)  # between pictures of an unfinished slice: least seconds, and most of the time for them
+FIRST_PICTURE_SECONDS = (
+    3.0  # seconds until the first of them: of a slice that is finished by then it would be seen by nobody
+)
+MAX_NAME_LETTERS = 40  # letters of a folder's name that say along what a slice was cut
+JOINED = "joined"  # in the identity of a slice that was cut between points: their names
 Draw = Callable[..., "Figure"]  # draw(dataset, width=None): a slice for a screen, or for a page so wide [mm]
+
+
+@dataclass(frozen=True)
+class SliceSummary:
+    """Say what a slice cost, as `summary.json` beside it has it; `status` counts points, `flat` those without slope.
+
+    Gradients are at every `gradients_every` samples along each axis. `episodes` are those of the samples; `unresolved`
+    has those that looked between them, and what they found, None where nothing is known of it. `barrier` [loss unit] is
+    that between the ends of a line. `error` is what the first point that raised said.
+    """
+
+    env: str | None
+    dims: list[str]
+    fidelity: str | None
+    device: str | None
+    options: dict[str, Any] | None
+    resolution: list[int]
+    gradients: bool
+    gradients_every: int
+    episodes: int
+    resumed: int
+    seconds: float
+    status: dict[str, int]
+    loss: dict[str, float | None]
+    flat: int | None
+    unresolved: UnresolvedRecord | None
+    refinement: Refined | None
+    command: str
+    files: list[str]
+    barrier: float | None = None
+    error: str = ""
+
+    def outcome(self) -> str:
+        """Say in a line what the slice cost and what came out."""
+        counts = {kind: count for kind, count in self.status.items() if count}
+        ends = ", ".join(f"{count} {kind.replace('_', ' ')}" for kind, count in counts.items())
+        raised = f"; {said}" if (said := describe_errors(counts.get("error", 0), self.error)) else ""
+        refined = f"; {self.refinement.say()}" if self.refinement else ""
+        losses = say_range(self.loss)
+        sloped = math.prod(-(-points // self.gradients_every) for points in self.resolution)
+        asked = min(sloped, sum(counts.values()) - counts.get("interpolated", 0))
+        share = (self.flat or 0) / asked if asked else 0.0
+        flat = f"; gradient exactly zero at {share:.1%} of points" if share else ""
+        barred = "" if self.barrier is None else f"; barrier of {self.barrier:.4g} above the line between its ends"
+        hidden = f"; {said}" if (said := say_unresolved(self.unresolved)) else ""
+        spent = f"{self.episodes} episodes in {duration(self.seconds)}"
+        return f"{spent}; {ends}{raised}; {losses}{flat}{barred}{refined}{hidden}"
 
 
 @dataclass(frozen=True)
@@ -263,7 +320,7 @@ class SliceJob(Job[SliceSummary]):
 
     def _sample(self, watch: Watch) -> tuple[xr.Dataset, int]:
         """Sample what is missing; return the slice, and how many episodes were computed."""
-        drawn, pause, computed = time.monotonic(), SOON, 0
+        drawn, pause, computed = time.monotonic(), FIRST_PICTURE_SECONDS, 0
         with watch.progress(math.prod(self.plane.resolution)) as advance:
 
             def follow(now: Progress) -> None:
@@ -350,7 +407,7 @@ def _gpu_memory(objective: Objective) -> str:
 
 def pause_after(seconds: float) -> float:
     """Return how long no picture of an unfinished slice follows one that took so many seconds."""
-    return max(PAUSE, seconds / DRAWING)
+    return max(MIN_PAUSE_SECONDS, seconds / MAX_DRAWING_SHARE)
 
 
 def estimate_cost(
@@ -403,3 +460,109 @@ def peak_memory() -> int:
     """Return the most memory this process has held [bytes]."""
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else 1024 * peak
+
+
+def default_folder(
+    identity: dict[str, Any],
+    resolution: tuple[int, ...],
+    plane: Plane | None,
+    grad: bool,
+    root: Path,
+    refinement: Refinement | None,
+) -> Path:
+    """Return a folder of its own for every different slice, the same for the same one.
+
+    That of a cut along directions, which may differ by rounding, does not depend on the `plane`.
+    """
+    where: Any = resolution
+    if "cut" in identity or plane is None:
+        axes = [plain_name(identity["cut"]["along"])[:MAX_NAME_LETTERS]]
+    else:
+        aligned = all(len(row.nonzero()) == 1 for row in plane.basis)
+        axes = [str(int(row.nonzero()[0])) for row in plane.basis] if aligned else ["plane"]
+        where = plane.record()
+    points = "x".join(map(str, resolution))
+    fidelity = [identity["fidelity"]] if "fidelity" in identity else []
+    parts = [identity["objective"], *axes, *fidelity, points]
+    refined = [asdict(refinement)] if refinement else []
+    return folder_named([*parts, *["refined" for _ in refined]], [identity, where, grad, *refined], root)
+
+
+def kept_plane(
+    objective: Objective,
+    cut: Mapping[str, Any],
+    resolution: tuple[int, ...],
+    *,
+    out: Path | None = None,
+    root: Path = ROOT,
+    gradients: int = 1,
+    refinement: Refinement | None = None,
+) -> Plane | None:
+    """Return the plane of a slice that was begun with the same cut along directions, None where there is none.
+
+    It goes on along these: others may come out a little different each time, on a GPU, and some take many episodes.
+    """
+    identity = with_stride(identity_of(objective), gradients) | {"boxed": True, "cut": dict(cut)}
+    path = (out or default_folder(identity, resolution, None, gradients > 0, root, refinement)) / STORE
+    if not is_slice(path):
+        return None
+    kept = SliceStore.open(path).identity
+    same = all(kept.get(name) == json.loads(json.dumps(value)) for name, value in identity.items())
+    found = Plane.from_record(kept["plane"])
+    return found if same and found.resolution == resolution else None
+
+
+def identity_of(objective: Objective) -> dict[str, Any]:
+    """Return what decides an objective's numbers, as far as it says: an environment all, any other its name."""
+    return objective.identity()
+
+
+def look_between(objective: Objective, dataset: xr.Dataset) -> dict[str, Any]:
+    """Return the attribute of a slice that says how much of it is finer than its samples.
+
+    An objective that raises between them has been sampled all the same: that is warned of, and nothing is said.
+    """
+    try:
+        return attribute_of(find_unresolved(objective, dataset))
+    except (OSError, MemoryError):  # lost workers, a full disk: the slice is finished once they are there again
+        raise
+    except Exception as error:
+        said = f"{objective.name} raised between the samples, so what they hide is not known: {error}"
+        warnings.warn(said, RuntimeWarning, stacklevel=2)
+        return {}
+
+
+def barrier_of(dataset: xr.Dataset) -> float | None:
+    """Return the height of the barrier on a line between two points, None for other slices and where samples failed."""
+    if dataset["loss"].ndim != 1 or JOINED not in stored_identity(dataset).get("cut", {}):
+        return None
+    height = barrier(dataset["u"].to_numpy(), dataset["loss"].to_numpy())
+    return height if math.isfinite(height) else None
+
+
+def count_statuses(dataset: xr.Dataset) -> dict[str, int]:
+    """Count the points of a slice by how they ended."""
+    status = dataset["status"].to_numpy()
+    return {kind.name.lower(): int((status == kind).sum()) for kind in Status}
+
+
+def range_of(dataset: xr.Dataset) -> dict[str, float | None]:
+    """Return the lowest and the highest finite loss of a slice, None where there is none."""
+    loss = dataset["loss"].to_numpy()
+    if not np.isfinite(loss).any():
+        return {"lowest": None, "highest": None}
+    return {"lowest": float(np.nanmin(loss)), "highest": float(np.nanmax(loss))}
+
+
+def say_range(loss: Mapping[str, float | None]) -> str:
+    """Say in words what `range_of` returns."""
+    low, high = loss["lowest"], loss["highest"]
+    return "no finite loss" if low is None else f"losses from {low:.4g} to {high:.4g}"
+
+
+def flat_points(dataset: xr.Dataset) -> int | None:
+    """Count the points whose gradient along the plane is exactly zero, none if gradients are not there."""
+    if "grad" not in dataset:
+        return None
+    slope = plane_of(dataset).slope(torch.from_numpy(dataset["grad"].to_numpy()))
+    return int((slope == 0).all(dim=-1).sum())

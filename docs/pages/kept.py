@@ -13,7 +13,7 @@ from gradscape.gallery.files import DATA, STORE
 from gradscape.gallery.league import read_league
 from gradscape.gallery.paper import Paper, read_paper
 from gradscape.jobs.folder import REPORT
-from gradscape.jobs.report_record import Report
+from gradscape.jobs.report import Report
 from gradscape.landscapes.slice import Slice
 from gradscape.landscapes.storage.paths import is_slice
 from gradscape.landscapes.storage.store import open_slice

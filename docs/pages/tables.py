@@ -18,8 +18,7 @@ from gradscape.envs.registry import entries, environment_class
 from gradscape.gallery.figures import read_figures
 from gradscape.gallery.files import DATA, DEVICES
 from gradscape.gallery.paper import read_paper
-from gradscape.jobs.report_record import Report
-from gradscape.jobs.report_tables import environments_markdown
+from gradscape.jobs.report import Report, environments_markdown
 from gradscape.landscapes.measures.choice import CLAIMS, Claim, Shortfall
 from gradscape.landscapes.measures.fidelity import Comparison
 from gradscape.landscapes.storage.records import read_json

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 import xarray as xr
 
-from ...jobs.slice_summary import count_statuses, flat_points
+from ...jobs.slice import count_statuses, flat_points
 from ...landscapes.identity import plane_of
 from ...landscapes.lattice import own_cells
 from ...landscapes.measures.unresolved import contradicted_cells, stored_unresolved

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 import gradscape as gs
-from gradscape.jobs.slice_summary import SliceSummary
+from gradscape.jobs.slice import SliceSummary
 from gradscape.landscapes.identity import StoreMismatchError, stored_identity
 from gradscape.landscapes.objective import Objective
 

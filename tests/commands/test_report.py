@@ -12,8 +12,7 @@ import pytest
 from gradscape.envs.functions import Function
 from gradscape.gallery.paper import read_paper
 from gradscape.jobs import report as job
-from gradscape.jobs.report_record import Report
-from gradscape.jobs.report_tables import environments_markdown
+from gradscape.jobs.report import Report, environments_markdown
 from gradscape.landscapes.storage.records import read_json, write_record
 
 from ..command import Said, make

@@ -12,7 +12,7 @@ import xarray as xr
 from torch import Tensor
 
 from gradscape.envs.adapters import from_numpy, from_torch
-from gradscape.jobs.slice_summary import look_between
+from gradscape.jobs.slice import look_between
 from gradscape.landscapes.measures.unresolved import (
     UNRESOLVED,
     Unresolved,
