@@ -51,7 +51,9 @@ RECORD, MEASURES, PICTURE, ARRAYS = REPORT.files  # the arrays are what the pict
 HEADINGS = ("slice", "minima", "flat", "jumps", "cosine", "measured", "the paper's words", "measured too")
 ENVIRONMENTS = (
     "environment", "slices", "minima", "flat", "jumps", "cosine, small step", "cosine, two samples", "measured",
-SEEN = 0.5  # of the points that any step sees, for a smaller one to be worth showing
+    "the paper's words", "agree",
+)  # fmt: skip
+MIN_SEEN = 0.5  # of the points that any step sees, for a smaller one to be worth showing
 
 
 @dataclass(frozen=True)
@@ -413,8 +415,6 @@ def _check_summary(folder: Path) -> None:
         )
 
 
-
-
 class Quoted(Protocol):
     """What the paper says of an environment's landscape: words of `classify.WORDS`, and where it says them."""
 
@@ -585,10 +585,6 @@ class Reports:
         return {"reports": reports, "environments": environments, "failed": self.failed}
 
 
-    "the paper's words", "agree",
-)  # fmt: skip
-
-
 class EnvironmentRecord(TypedDict):
     """In how many `slices` of an environment each word was measured, and each of the paper's."""
 
@@ -652,7 +648,7 @@ def _environment(env: str, reports: Sequence[Report]) -> tuple[str, ...]:
 
 def _small(rows: Sequence[ScaleRecord]) -> ScaleRecord:
     most = max(row["points"] for row in rows)
-    return next(row for row in rows if row["points"] >= SEEN * most)
+    return next(row for row in rows if row["points"] >= MIN_SEEN * most)
 
 
 def _value(estimate: EstimateRecord | None, scale: float = 1.0) -> float | None:

@@ -55,13 +55,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 STORE, PICTURE, REFINING = SLICE.store, SLICE.picture, "slice.refining"
-MIN_PAUSE_SECONDS, MAX_DRAWING_SHARE = (
-    10.0,
-    0.1,
-)  # between pictures of an unfinished slice: least seconds, and most of the time for them
-FIRST_PICTURE_SECONDS = (
-    3.0  # seconds until the first of them: of a slice that is finished by then it would be seen by nobody
-)
+MIN_PAUSE_SECONDS = 10.0  # between pictures of an unfinished slice
+MAX_DRAWING_SHARE = 0.1  # of the time, for pictures of an unfinished slice
+FIRST_PICTURE_SECONDS = 3.0  # no intermediate picture of slices that are faster than this
 MAX_NAME_LETTERS = 40  # letters of a folder's name that say along what a slice was cut
 JOINED = "joined"  # in the identity of a slice that was cut between points: their names
 Draw = Callable[..., "Figure"]  # draw(dataset, width=None): a slice for a screen, or for a page so wide [mm]

@@ -47,13 +47,11 @@ if TYPE_CHECKING:
 
 FRAMES, ONLY, FILM, GIF, STREAM, SUMMARY = SWEEP.files
 FRAME = re.compile(r"\d{3,}(?:\.filling)?\.zarr")  # what the folder of a sweep's slices holds
-SMOOTHING, MAX_SMOOTHING = (
-    "smoothing",
-    0.25,
-)  # the widest Gaussian's standard deviation, as a fraction of the box's sides
+SMOOTHING = "smoothing"
+MAX_SMOOTHING = 0.25  # the widest Gaussian's standard deviation, as a fraction of the box's sides
 PARALLEL_TOLERANCE = 1e-9  # of a parameter's unit: as near as rounding lets a point on a plane be to it
 HORIZON = "horizon"  # a scene option: the episode's duration as a multiple of the scene's own
-STORE_MEMORY, STORE_FILES = 100e3, 25  # what a slice takes beside its samples: bytes of its arrays' records, and files
+STORE_MEMORY, STORE_FILES = 100e3, 25  # of a slice without samples: bytes of its arrays' records, and files
 
 
 @dataclass(frozen=True)

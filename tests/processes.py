@@ -95,7 +95,7 @@ def _work(work: Callable[[], object], folder: Path, said: Path, changes: Any, st
                     os.kill(os.getpid(), stop.by)
 
     store.PAUSE, store.SHARE, cost.MOMENT = 0.0, math.inf, 0.0  # writes after every proposal, times two episodes
-    job.PAUSE, cost.ENOUGH, cost.WARM_UP = math.inf, 0.0, 0.0  # draws no coarse picture
+    job.MIN_PAUSE_SECONDS, cost.ENOUGH, cost.WARM_UP = math.inf, 0.0, 0.0  # draws no coarse picture
     zarr.config.set({"threading.max_workers": 1})  # so that its threads never take turns
     leave_blank(setattr)
     sys.addaudithook(watch)
