@@ -52,7 +52,8 @@ def episode_kernels(module: str, name: str, find: Any, move: Any) -> Kernels:
     at i + 1. Nothing else is carried from one iteration to the next: variables that a loop carries would be lost to its
     derivatives.
     """
-    Data, Path, Reals = surfaces(name).Data, path_struct(name), wp.array2d[precision(name).real]
+    real = precision(name).real
+    Data, Path, Reals = surfaces(name).Data, path_struct(name), wp.array2d[real]
 
     @wp.kernel(module=module, enable_backward=False)
     def follow(last: int, taken: wp.array[int], data: Data, angle: Reals, path: Path):
