@@ -3,6 +3,7 @@
 A launch costs more than an event, and rows have their events at times of their own: a thread follows its row alone.
 """
 
+from functools import cache, partial
 from typing import Any, NamedTuple, no_type_check
 
 import warp as wp
@@ -18,6 +19,31 @@ class Kernels(NamedTuple):
     retrace: Any
 
 
+@cache
+@no_type_check
+def path_struct(name: str) -> Any:
+    """Return the struct of rows' states in one precision."""
+    real = precision(name).real
+    vec2 = wp.types.vector(2, real)
+
+    @partial(wp.struct, module=f"gradscape.episodes.{name}")
+    class Path:
+        """The state at the start of every iteration, as `Flight` says it, arrays [iteration, row]."""
+
+        x: wp.array2d[vec2]
+        v: wp.array2d[vec2]
+        spin: wp.array2d[real]
+        rest: wp.array2d[real]
+        step: wp.array2d[int]
+        impacts: wp.array2d[int]
+        support: wp.array2d[int]
+        pick: wp.array2d[int]
+        hits: wp.array2d[int]
+        when: wp.array2d[real]
+
+    return Path
+
+
 @no_type_check
 def episode_kernels(module: str, name: str, find: Any, move: Any) -> Kernels:
     """Return the kernels of one precision that repeat two Warp functions of one iteration of one row.
@@ -27,74 +53,28 @@ def episode_kernels(module: str, name: str, find: Any, move: Any) -> Kernels:
     derivatives.
     """
     real = precision(name).real
-    vec2 = wp.types.vector(2, real)
-    Reals, Vecs, Ints = wp.array2d[real], wp.array2d[vec2], wp.array2d[int]
-    Data = surfaces(name).Data
+    Data, Path, Reals = surfaces(name).Data, path_struct(name), wp.array2d[real]
 
     @wp.kernel(module=module, enable_backward=False)
-    def follow(
-        last: int,
-        taken: wp.array[int],
-        data: Data,
-        angle: Reals,
-        x: Vecs,
-        v: Vecs,
-        spin: Reals,
-        rest: Reals,
-        step: Ints,
-        impacts: Ints,
-        support: Ints,
-        pick: Ints,
-        hits: Ints,
-        when: Reals,
-    ):
+    def follow(last: int, taken: wp.array[int], data: Data, angle: Reals, path: Path):
         """Go on from iteration `taken`, and leave there where a row has come to: done, or at the `last` it may take."""
         e = wp.tid()
         i = taken[e]
-        while i < last and step[i, e] < data.steps:
-            find(i, e, data, angle, x, v, spin, rest, step, impacts, support, pick, hits, when)
-            move(i, e, data, angle, x, v, spin, rest, step, impacts, support, pick, hits, when)
+        while i < last and path.step[i, e] < data.steps:
+            find(i, e, data, angle, path)
+            move(i, e, data, angle, path)
             i += 1
         taken[e] = i
-        pick[i, e] = DONE
+        path.pick[i, e] = DONE
 
     @wp.func_replay(move)
-    def stay(
-        i: int,
-        e: int,
-        data: Data,
-        angle: Reals,
-        x: Vecs,
-        v: Vecs,
-        spin: Reals,
-        rest: Reals,
-        step: Ints,
-        impacts: Ints,
-        support: Ints,
-        pick: Ints,
-        hits: Ints,
-        when: Reals,
-    ):
+    def stay(i: int, e: int, data: Data, angle: Reals, path: Path):
         """Do nothing, since all states are kept: the adjoint of a loop would repeat each move before it goes back."""
 
     @wp.kernel(module=module)
-    def retrace(
-        taken: wp.array[int],
-        data: Data,
-        angle: Reals,
-        x: Vecs,
-        v: Vecs,
-        spin: Reals,
-        rest: Reals,
-        step: Ints,
-        impacts: Ints,
-        support: Ints,
-        pick: Ints,
-        hits: Ints,
-        when: Reals,
-    ):
+    def retrace(taken: wp.array[int], data: Data, angle: Reals, path: Path):
         e = wp.tid()
         for i in range(taken[e]):
-            move(i, e, data, angle, x, v, spin, rest, step, impacts, support, pick, hits, when)
+            move(i, e, data, angle, path)
 
     return Kernels(follow, retrace)

@@ -7,7 +7,7 @@ import warp as wp
 
 from ..runtime import precision
 from .board import FREE, surfaces
-from .episodes import Kernels, episode_kernels
+from .episodes import Kernels, episode_kernels, path_struct
 from .rolling import ARC, rolling
 from .roots import roots
 
@@ -25,7 +25,7 @@ def impact_kernels(name: str) -> Kernels:
     """Return the kernels of one precision."""
     real = precision(name).real
     vec2 = wp.types.vector(2, real)
-    Reals, Vecs, Ints = wp.array2d[real], wp.array2d[vec2], wp.array2d[int]
+    Reals, Path = wp.array2d[real], path_struct(name)
     module, halves = f"gradscape.impacts.{name}", HALVES[name]
     Data, along, anchor, outward, distance, nearest, _, rebound, deflect = surfaces(name)
     plane, disc = roots(name)
@@ -151,46 +151,31 @@ def impact_kernels(name: str) -> Kernels:
         return soonest, first
 
     @wp.func(module=module)
-    def find(
-        i: int,
-        e: int,
-        data: Data,
-        angle: Reals,
-        x: Vecs,
-        v: Vecs,
-        spin: Reals,
-        rest: Reals,
-        step: Ints,
-        impacts: Ints,
-        support: Ints,
-        pick: Ints,
-        hits: Ints,
-        when: Reals,
-    ):
-        here, carrier, span = x[i, e], support[i, e], rest[i, e]
-        pick[i, e] = FREE
-        when[i, e] = span
+    def find(i: int, e: int, data: Data, angle: Reals, path: Path):
+        here, carrier, span = path.x[i, e], path.support[i, e], path.rest[i, e]
+        path.pick[i, e] = FREE
+        path.when[i, e] = span
         if span <= data.graze * data.dt:  # nothing but rounding is left of the step
             return
         if is_round(data, carrier):
-            turn = start(data, carrier, angle, e, here, v[i, e], spin[i, e])
+            turn = start(data, carrier, angle, e, here, path.v[i, e], path.spin[i, e])
             late, event_there = around(data, carrier, angle, e, turn, span)
-            when[i, e] = late
-            pick[i, e] = event_there
+            path.when[i, e] = late
+            path.pick[i, e] = event_there
             return
-        a, _, last = carry(data, carrier, angle, e, here, v[i, e], spin[i, e])
+        a, _, last = carry(data, carrier, angle, e, here, path.v[i, e], path.spin[i, e])
         soonest, first = real(span), int(FREE)
         if last < soonest:
             soonest = last
             first = SLIDES
         if carrier >= 0 and carrier // 4 < data.pivot.shape[0]:
-            end = edge(data, carrier, angle, e, here, v[i, e], a)
+            end = edge(data, carrier, angle, e, here, path.v[i, e], a)
             if end < soonest:
                 soonest = end
                 first = EDGE
-        t, met = first_met(data, carrier, angle, e, here, v[i, e], a, soonest, first)
-        when[i, e] = t
-        pick[i, e] = met
+        t, met = first_met(data, carrier, angle, e, here, path.v[i, e], a, soonest, first)
+        path.when[i, e] = t
+        path.pick[i, e] = met
 
     @wp.func(module=module)
     def correct(data: Data, t: real, gap: real, speed: real, least: real) -> real:
@@ -288,76 +273,62 @@ def impact_kernels(name: str) -> Kernels:
         return FREE
 
     @wp.func(module=module)
-    def move(
-        i: int,
-        e: int,
-        data: Data,
-        angle: Reals,
-        x: Vecs,
-        v: Vecs,
-        spin: Reals,
-        rest: Reals,
-        step: Ints,
-        impacts: Ints,
-        support: Ints,
-        pick: Ints,
-        hits: Ints,
-        when: Reals,
-    ):
-        surface, carrier = pick[i, e], support[i, e]
-        step[i + 1, e] = step[i, e]
-        span, found = rest[i, e], when[i, e]
-        hits[i + 1, e] = hits[i, e]
-        impacts[i + 1, e] = 0
-        support[i + 1, e] = carrier
+    def move(i: int, e: int, data: Data, angle: Reals, path: Path):
+        surface, carrier = path.pick[i, e], path.support[i, e]
+        path.step[i + 1, e] = path.step[i, e]
+        x, v, spin = path.x[i, e], path.v[i, e], path.spin[i, e]
+        span, found = path.rest[i, e], path.when[i, e]
+        path.hits[i + 1, e] = path.hits[i, e]
+        path.impacts[i + 1, e] = 0
+        path.support[i + 1, e] = carrier
         if surface == FREE and found >= span:
-            _, there, arriving, turning = travel(data, surface, carrier, angle, e, x[i, e], v[i, e], spin[i, e], span)
-            x[i + 1, e] = there
-            v[i + 1, e] = arriving
-            spin[i + 1, e] = turning
-            rest[i + 1, e] = data.dt
-            step[i + 1, e] = step[i, e] + 1
+            _, there, arriving, turning = travel(data, surface, carrier, angle, e, x, v, spin, span)
+            path.x[i + 1, e] = there
+            path.v[i + 1, e] = arriving
+            path.spin[i + 1, e] = turning
+            path.rest[i + 1, e] = data.dt
+            path.step[i + 1, e] = path.step[i, e] + 1
             return
-        t, there, arriving, turning = travel(data, surface, carrier, angle, e, x[i, e], v[i, e], spin[i, e], found)
-        x[i + 1, e] = there
-        rest[i + 1, e] = span - t
+        t, there, arriving, turning = travel(data, surface, carrier, angle, e, x, v, spin, found)
+        path.x[i + 1, e] = there
+        path.rest[i + 1, e] = span - t
         if surface >= 0:
             n = outward(data, surface, angle, e, there)
             u = wp.dot(arriving, n)
             if u < -data.crawl:
-                hits[i + 1, e] = hits[i, e] + 1
+                path.hits[i + 1, e] = path.hits[i, e] + 1
             after = rebound(data, wp.max(-u, real(0.0)))
             rubbed, _ = deflect(data, n, arriving, turning, after)
             away = pull(data, surface, n, rubbed)
-            support[i + 1, e] = FREE
+            path.support[i + 1, e] = FREE
             if away < real(0.0) and after < real(-0.5) * away * real(LINGER):
-                support[i + 1, e] = surface
+                path.support[i + 1, e] = surface
                 after = real(0.0)
             leaving, turned = deflect(data, n, arriving, turning, after)
-            v[i + 1, e] = leaving
-            spin[i + 1, e] = turned
+            path.v[i + 1, e] = leaving
+            path.spin[i + 1, e] = turned
         elif surface == SLIDES:
-            v[i + 1, e] = arriving
+            path.v[i + 1, e] = arriving
             n = outward(data, carrier, angle, e, there)
-            spin[i + 1, e] = wp.dot(arriving, vec2(-n[1], n[0])) / data.radius
+            path.spin[i + 1, e] = wp.dot(arriving, vec2(-n[1], n[0])) / data.radius
         elif surface == SLIPS:
-            v[i + 1, e] = arriving
+            path.v[i + 1, e] = arriving
             n = outward(data, carrier, angle, e, there)
             least = real(4.0) * data.graze * (wp.length(arriving) + data.radius * wp.abs(turning))
-            spin[i + 1, e] = (wp.dot(arriving, vec2(-n[1], n[0])) + wp.sign(n[0]) * least) / data.radius
+            path.spin[i + 1, e] = (wp.dot(arriving, vec2(-n[1], n[0])) + wp.sign(n[0]) * least) / data.radius
         else:
-            v[i + 1, e] = arriving
-            spin[i + 1, e] = turning
+            path.v[i + 1, e] = arriving
+            path.spin[i + 1, e] = turning
             if surface == LEAVES:
-                support[i + 1, e] = FREE
+                path.support[i + 1, e] = FREE
             if surface == EDGE:
                 over = beyond(data, carrier, angle, e, there)
-                support[i + 1, e] = carrier_of(data, over, angle, e, there, arriving)
+                path.support[i + 1, e] = carrier_of(data, over, angle, e, there, arriving)
         if found < real(LINGER) and surface != FREE:
-            if impacts[i, e] + 1 == JAM:
-                rest[i + 1, e] = data.dt
-                step[i + 1, e] = step[i, e] + 1
+            if path.impacts[i, e] + 1 == JAM:
+                path.rest[i + 1, e] = data.dt
+                path.step[i + 1, e] = path.step[i, e] + 1
             else:
-                impacts[i + 1, e] = impacts[i, e] + 1
+                path.impacts[i + 1, e] = path.impacts[i, e] + 1
 
     return episode_kernels(module, name, find, move)

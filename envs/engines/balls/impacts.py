@@ -15,6 +15,7 @@ import warp as wp
 
 from ..runtime import load, precision, to_torch
 from .board import FREE, Board, constants
+from .episodes import path_struct
 from .events import JAM as JAM
 from .events import impact_kernels
 from .overlaps import step_kernels
@@ -44,22 +45,26 @@ class Flight:
     NUMBERS = ("x", "v", "spin", "rest")
     COUNTS = ("step", "impacts", "support", "pick", "hits", "when")
 
-    def __init__(self, length: int, capacity: int, name: str, device: str, *, counts: bool = True) -> None:
+    def __init__(self, length: int, capacity: int, name: str, device: str) -> None:
         real = precision(name).real
         vec2 = wp.types.vector(2, real)
-        self.length = length
+        self.length, self.path = length, path_struct(name)()  # as kernels take it
         kinds = dict(zip(self.NUMBERS, (vec2, vec2, real, real), strict=True))
-        kinds |= dict.fromkeys(self.COUNTS, wp.int32) | {"when": real} if counts else {}
+        kinds |= dict.fromkeys(self.COUNTS, wp.int32) | {"when": real}
         for field, kind in kinds.items():
-            setattr(self, field, wp.zeros((length, capacity), dtype=kind, device=device))
+            setattr(self.path, field, wp.zeros((length, capacity), dtype=kind, device=device))
 
     def tensor(self, field: str) -> torch.Tensor:
         """View one field as a tensor."""
-        return to_torch(getattr(self, field))
+        return to_torch(getattr(self.path, field))
 
-    def arrays(self) -> list[Any]:
-        """Return the arrays in the order kernels take them."""
-        return [getattr(self, field) for field in (*self.NUMBERS, *self.COUNTS) if hasattr(self, field)]
+    def adjoint(self, field: str) -> torch.Tensor:
+        """View the adjoint of one field, zeros at first, as a tensor."""
+        array = getattr(self.path, field)
+        if array.grad is None:
+            array.requires_grad = True
+            setattr(self.path, field, array)  # now with what the adjoint kernel adds to
+        return to_torch(array.grad)
 
 
 class Solver:
@@ -81,7 +86,6 @@ class Solver:
         )
         self.iterations = wp.zeros(capacity, dtype=wp.int32, device=device)  # that rows have taken
         self.flight = Flight(2 * steps + SPARE, capacity, name, device)
-        self.adjoint: Flight | None = None
 
     def run(
         self,
@@ -107,13 +111,17 @@ class Solver:
     def gradient(self, adj_x: torch.Tensor) -> Slopes:
         """Return what the adjoint of the last positions, shape (batch, 2), is for the beginning of the latest run."""
         batch = len(adj_x)
-        adjoint = self._clear_adjoint(batch)
-        adjoint.tensor("x")[self.taken, self._rows(batch)] = adj_x.to(adjoint.tensor("x"))
+        used = int(self.taken.max()) + 1
+        for field in Flight.NUMBERS:
+            self.flight.adjoint(field)[:used, :batch] = 0
+        self.adj_angle.zero_()
+        adjoint = self.flight.adjoint("x")
+        adjoint[self.taken, self._rows(batch)] = adj_x.to(adjoint)
+        inputs = self._inputs()
+        adjoints = [None, type(self.data)(), self.adj_angle, type(self.flight.path)()]
         settings: dict[str, Any] = {"device": self.device, "adjoint": True, "record_tape": False}
-        nothing = [None] * len(Flight.COUNTS)
-        settings["adj_inputs"] = [None, type(self.data)(), self.adj_angle, *adjoint.arrays(), *nothing]
-        wp.launch(self.kernels.retrace, batch, self._inputs(), **settings)
-        first = {name: adjoint.tensor(field)[0, :batch].clone() for name, field in _SLOPES.items()}
+        wp.launch(self.kernels.retrace, batch, inputs, adj_inputs=adjoints, **settings)
+        first = {name: self.flight.adjoint(field)[0, :batch].clone() for name, field in _SLOPES.items()}
         return Slopes(to_torch(self.adj_angle)[:batch].clone(), **first)
 
     def at_end(self, field: str) -> torch.Tensor:
@@ -144,17 +152,8 @@ class Solver:
         for field in (*Flight.NUMBERS, *Flight.COUNTS):
             self.flight.tensor(field)[: old.length] = old.tensor(field)
 
-    def _clear_adjoint(self, batch: int) -> Flight:
-        if self.adjoint is None or self.adjoint.length != self.flight.length:
-            self.adjoint = Flight(self.flight.length, self.capacity, self.name, self.device, counts=False)
-        used = int(self.taken.max()) + 1
-        for field in Flight.NUMBERS:
-            self.adjoint.tensor(field)[:used, :batch] = 0
-        self.adj_angle.zero_()
-        return self.adjoint
-
     def _inputs(self) -> list[Any]:
-        return [self.iterations, self.data, self.angle, *self.flight.arrays()]
+        return [self.iterations, self.data, self.angle, self.flight.path]
 
     def _rows(self, batch: int) -> torch.Tensor:
         return torch.arange(batch, device=self.flight.tensor("step").device)

@@ -11,7 +11,7 @@ import warp as wp
 
 from ..runtime import precision
 from .board import FREE, surfaces
-from .episodes import Kernels, episode_kernels
+from .episodes import Kernels, episode_kernels, path_struct
 
 
 @cache
@@ -20,30 +20,15 @@ def step_kernels(name: str) -> Kernels:
     """Return the kernels of a step; they take what those of `impacts` take."""
     real = precision(name).real
     vec2 = wp.types.vector(2, real)
-    Reals, Vecs, Ints = wp.array2d[real], wp.array2d[vec2], wp.array2d[int]
+    Reals, Path = wp.array2d[real], path_struct(name)
     module = f"gradscape.overlaps.{name}"
     Data, along, _, outward, distance, nearest, _, rebound, deflect = surfaces(name)
 
     @wp.func(module=module)
-    def find(
-        i: int,
-        e: int,
-        data: Data,
-        angle: Reals,
-        x: Vecs,
-        v: Vecs,
-        spin: Reals,
-        rest: Reals,
-        step: Ints,
-        impacts: Ints,
-        support: Ints,
-        pick: Ints,
-        hits: Ints,
-        when: Reals,
-    ):
+    def find(i: int, e: int, data: Data, angle: Reals, path: Path):
         """Find the surface that is overlapped most, of those that are approached."""
-        here = x[i, e]
-        w = v[i, e] - vec2(real(0.0), data.gravity * data.dt)
+        here = path.x[i, e]
+        w = path.v[i, e] - vec2(real(0.0), data.gravity * data.dt)
         bars = data.pivot.shape[0]
         deepest = real(0.0)
         first = int(FREE)
@@ -57,38 +42,23 @@ def step_kernels(name: str) -> Kernels:
             if gap < deepest and wp.dot(outward(data, surface, angle, e, here), w) < real(0.0):
                 deepest = gap
                 first = surface
-        pick[i, e] = first
+        path.pick[i, e] = first
 
     @wp.func(module=module)
-    def move(
-        i: int,
-        e: int,
-        data: Data,
-        angle: Reals,
-        x: Vecs,
-        v: Vecs,
-        spin: Reals,
-        rest: Reals,
-        step: Ints,
-        impacts: Ints,
-        support: Ints,
-        pick: Ints,
-        hits: Ints,
-        when: Reals,
-    ):
-        surface = pick[i, e]
-        here, turn = x[i, e], real(spin[i, e])
-        w = v[i, e] - vec2(real(0.0), data.gravity * data.dt)
-        hits[i + 1, e] = hits[i, e]
+    def move(i: int, e: int, data: Data, angle: Reals, path: Path):
+        surface = path.pick[i, e]
+        here, turn = path.x[i, e], real(path.spin[i, e])
+        w = path.v[i, e] - vec2(real(0.0), data.gravity * data.dt)
+        path.hits[i + 1, e] = path.hits[i, e]
         if surface != FREE:
             n = outward(data, surface, angle, e, here)
             approach = -wp.dot(n, w)
             w, turn = deflect(data, n, w, turn, rebound(data, approach))
             if approach > data.crawl:
-                hits[i + 1, e] = hits[i, e] + 1
-        x[i + 1, e] = here + data.dt * w
-        v[i + 1, e] = w
-        spin[i + 1, e] = turn
-        step[i + 1, e] = step[i, e] + 1
+                path.hits[i + 1, e] = path.hits[i, e] + 1
+        path.x[i + 1, e] = here + data.dt * w
+        path.v[i + 1, e] = w
+        path.spin[i + 1, e] = turn
+        path.step[i + 1, e] = path.step[i, e] + 1
 
     return episode_kernels(module, name, find, move)
