@@ -251,5 +251,5 @@ def test_interrupt_ends_cleanly_and_says_how_to_go_on(run: Callable[..., Said], 
     assert done.returncode == 130
     assert done.stdout == ""
     assert "Traceback" not in done.stderr
-    assert "the same command goes on from there: landscape slice bounce" in done.stderr
+    assert "the same command continues from there: landscape slice bounce" in done.stderr
     assert 0 < json.loads(run(*LONG, cwd=tmp_path).stdout)["resumed"] < SIDE**2

@@ -178,6 +178,6 @@ def test_interrupt_ends_cleanly_and_says_how_to_go_on(tmp_path: Path) -> None:
     assert "Traceback" not in done.stderr
     kept = RunStore.open(tmp_path / "run/run.zarr").count
     assert f"stopped: {kept} of {BUDGET} episodes are kept in run" in done.stderr
-    assert "the same command goes on from there: landscape optimize rastrigin" in done.stderr
+    assert "the same command continues from there: landscape optimize rastrigin" in done.stderr
     assert 0 < kept < BUDGET
     assert (tmp_path / "run/progress.png").exists()

@@ -142,7 +142,7 @@ def test_interrupt_says_how_to_go_on_and_the_result_is_the_same(run: Callable[..
     stopped = alone(race, tmp_path / "stopped", Instant(9, of="status/c", by=signal.SIGINT))
     assert (stopped.returncode, stopped.stdout) == (130, "")
     assert "Traceback" not in stopped.stderr
-    assert "the same command goes on from there: landscape race bounce" in stopped.stderr
+    assert "the same command continues from there: landscape race bounce" in stopped.stderr
     resumed = run(*LONG, cwd=tmp_path / "stopped")
     assert "are there already" in resumed.stderr
     assert "all 160 episodes" not in resumed.stderr

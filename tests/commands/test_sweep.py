@@ -202,7 +202,7 @@ def test_a_sweep_that_is_stopped_goes_on_to_the_same_bits(run: Command, tmp_path
     sweep = partial(landscape, *text.split())
     done = alone(sweep, tmp_path, Instant(20, of="status/c", by=signal.SIGINT))
     assert done.returncode == 130
-    assert f"the same command goes on from there: landscape {text}" in done.stderr
+    assert f"the same command continues from there: landscape {text}" in done.stderr
     kept = int(done.stderr.split("stopped: ")[1].split(" of 256 points")[0])
     assert 0 < kept < 256
     again = json.loads(run(f"{text} --json").stdout)
