@@ -145,7 +145,7 @@ def _bisect(
     low, high = torch.cat(list(ends)).unbind(dim=1)
 
     def losses(u: Float[Tensor, "pairs rank"]) -> Float[Tensor, " pairs"]:
-        x = [plane.lift(part) for plane, part in zip(planes, u.split(counts), strict=True)]
+        x = [plane.lift(part) for plane, part in zip(planes, torch.split(u, counts), strict=True)]
         return evaluate(objective, torch.cat(x), grad=False).loss
 
     below, above = losses(low), losses(high)  # anew: a slice may come from another device
@@ -157,7 +157,8 @@ def _bisect(
         high, above = torch.where(left[:, None], middle, high), torch.where(left, between, above)
         low, below = torch.where(left[:, None], low, middle), torch.where(left, below, between)
         gaps.append((above - below).abs() + 0 * between)  # NaN once a middle failed
-    return list(zip(low.split(counts), high.split(counts), torch.stack(gaps).split(counts, dim=1), strict=True))
+    halved = torch.split(torch.stack(gaps), counts, dim=1)
+    return list(zip(torch.split(low, counts), torch.split(high, counts), halved, strict=True))
 
 
 def _differ(events: Count, low: Float[Tensor, "jumps dim"], high: Float[Tensor, "jumps dim"]) -> Tensor | None:
