@@ -1,0 +1,109 @@
+"""The verb `plan`: episodes times what one takes, for any verb, and nothing is written."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+import gradscape as gs
+from gradscape.jobs import plan as module
+from gradscape.landscapes.measures.unresolved import probes
+
+from ..command import Said
+
+EACH = {False: 0.5, True: 2.0}  # seconds of a loss and of a gradient
+
+
+@pytest.fixture(autouse=True)
+def priced(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Give every episode a price, in place of a clock."""
+    monkeypatch.setattr(module, "seconds_per_episode", lambda objective, x, *, grad, count: EACH[grad])
+
+
+@pytest.mark.parametrize(
+    ("words", "losses", "gradients"),
+    [
+        ("slice branin --resolution 8", probes(64, grad=True), 64),
+        ("slice branin --resolution 8 --no-gradients", 64 + probes(64, grad=False), 0),
+        ("slice branin --resolution 9 --gradients 4", 81 - 9 + probes(81, grad=False), 9),
+        ("slice bounce --along random:1 --window 0.2 --resolution 5", probes(25, grad=True), 25),
+        ("bounce --axis y --resolution 16", probes(16, grad=True), 16),
+        ("sweep ackley --set dim=3 --dims 0 1 --over 2 --frames 3 --resolution 5", 0, 75),
+        ("optimize branin --method random --budget 30", 30, 0),
+        ("optimize branin --method descents --budget 30", 0, 30),
+        ("race branin --methods random,descents --budget 20 --seeds 3", 60, 60),
+        ("league branin beale --methods random --budget 20 --seeds 2", 80, 0),
+        ("census ackley --slices 1 --resolution 6", 16 * 5, 36),
+        ("replay bounce --no-film", 2, 0),
+    ],
+)
+def test_a_plan_counts_what_the_verb_evaluates(
+    run: Callable[..., Said], tmp_path: Path, words: str, losses: int, gradients: int
+) -> None:
+    done = run("plan", *words.split(), "--device", "cpu", "--json", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    assert (found["episodes"], found["gradients"]) == (losses + gradients, gradients)
+    assert found["seconds"] == pytest.approx(losses * EACH[False] + gradients * EACH[True])
+    assert found["device_hours"] == pytest.approx(found["seconds"] / 3600)
+    assert found["memory"] > 0
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("words", ["check branin --points 2", "pairs ackley --samples 2", "report ackley"])
+def test_verbs_whose_episodes_depend_on_what_they_find_are_planned_too(
+    run: Callable[..., Said], tmp_path: Path, words: str
+) -> None:
+    done = run("plan", *words.split(), "--json", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["episodes"] > 10
+
+
+def test_a_plan_takes_as_many_episodes_as_the_slice(run: Callable[..., Said], tmp_path: Path) -> None:
+    words = ("slice", "branin", "--resolution", "6", "--json")
+    planned = json.loads(run("plan", *words, cwd=tmp_path).stdout)
+    made = json.loads(run(*words, cwd=tmp_path).stdout)
+    assert planned["gradients"] == made["episodes"]
+    assert planned["episodes"] - planned["gradients"] >= made["unresolved"]["episodes"]
+    taken = sum(file.stat().st_size for file in (tmp_path / made["folder"] / "slice.zarr").rglob("*") if file.is_file())
+    assert taken <= planned["disk"]
+
+
+def test_python_plans_a_function_of_its_own() -> None:
+    bowl = gs.from_numpy(lambda x: (x**2).sum(-1), gs.ParameterSpace({"a": (0, 1), "b": (0, 1)}))
+    found = gs.plan(gs.slice, bowl, resolution=4, gradients=False)
+    assert found.episodes == 16 + probes(16, grad=False)
+    assert found.command.startswith("gradscape.plan(")
+
+
+def test_a_device_that_is_not_here_is_planned_by_what_was_measured_on_one(
+    run: Callable[..., Said], tmp_path: Path
+) -> None:
+    pytest.importorskip("torch")
+    import torch
+
+    if torch.cuda.is_available():
+        pytest.skip("there is a CUDA device")
+    found = json.loads(
+        run("plan", "slice", "fluid", "--dims", "6", "8", "--device", "cuda", "--json", cwd=tmp_path).stdout
+    )
+    (part,) = found["parts"]
+    assert part["device"] == "cuda"
+    assert "fluid-cuda" in part["rate"]
+    assert part["gpu_memory"] > 0
+    unknown = run("plan", "slice", "branin", "--device", "cuda", cwd=tmp_path)
+    assert unknown.returncode == 2
+    assert "branin" in unknown.stderr
+
+
+def test_what_cannot_be_planned_says_so(run: Callable[..., Said], tmp_path: Path) -> None:
+    for words, said in (
+        (["branin"], "landscape plan slice branin"),
+        (["slice", "brannin"], "did you mean branin?"),
+        (["slice", "branin", "--resolution", "1"], "--resolution"),
+        (["envs"], "envs simulates nothing"),
+    ):
+        done = run("plan", *words, cwd=tmp_path)
+        assert done.returncode == 2
+        assert said in done.stderr
