@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from jaxtyping import Float, Int
     from numpy.typing import NDArray
 
-    from ..draw.figures.page import Picture
+    from ..draw.figure import Picture
 
 Outcome = Literal["passes", "fails", "not installed"]
 Checks = Sequence[Mapping[str, Any]]
@@ -96,9 +96,9 @@ class Card:
 
     def plot(self, width: float | None = None) -> Picture:
         """Draw the slices, a row for each scene; `width` is that of a page for print [mm]."""
-        from ..draw.figures.card import card_figure
+        from ..draw.figure import figure_of
 
-        return card_figure(self, width=width)
+        return figure_of(self, width)
 
     @property
     def failed(self) -> int:

@@ -18,7 +18,7 @@ from .census_statistics import QUANTILES, Parts, Spread, bootstrap, divide, spre
 if TYPE_CHECKING:
     import pandas as pd
 
-    from ..draw.figures.page import Picture
+    from ..draw.figure import Picture
 
 
 @dataclass(frozen=True)
@@ -119,9 +119,9 @@ class Census:
 
     def plot(self, width: float | None = None) -> Picture:
         """Draw every slice small, the least rugged first, for a screen, or for a page so wide [mm]."""
-        from ..draw.figures.census import census_figure
+        from ..draw.figure import figure_of
 
-        return census_figure(self, width=width)
+        return figure_of(self, width)
 
     def _repr_html_(self) -> str:
         """Show the table in a notebook."""

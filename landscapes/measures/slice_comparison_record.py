@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     import pandas as pd
     import xarray as xr
 
-    from ..draw.figures.page import Picture
+    from ..draw.figure import Picture
 
 POINTS, RANGE = "of the points", "of A's range"  # what shares are of
 
@@ -157,9 +157,9 @@ class SliceComparison:
 
         The picture is matplotlib's figure; `width` is that of a page [mm], and none that of a screen.
         """
-        from ..draw.figures.comparison import comparison_figure
+        from ..draw.figure import figure_of
 
-        return comparison_figure(self, width=width)
+        return figure_of(self, width)
 
     def __repr__(self) -> str:
         """Return in a line what is compared and what came out."""
