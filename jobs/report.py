@@ -10,12 +10,13 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
 from ..landscapes.capacity import Need, require, size
+from ..landscapes.convert import to_json
 from ..landscapes.cost import duration, seconds_per_episode
 from ..landscapes.identity import MODEL_VERSION, stored_identity
 from ..landscapes.objective import BoxedObjective, Evaluation, ObjectiveWrapper
@@ -26,7 +27,7 @@ from ..landscapes.verification import RESAMPLE, verify_dataset
 from . import growth
 from .folder import REPORT, REPORTS, ROOT, SLICE_STORE, folder_named, store_in
 from .plan import Work
-from .report_record import ARRAYS, MEASURES, PICTURE, RECORD, PaperRecord, Quoted, Report, ReportKey, Reports
+from .report_record import ARRAYS, MEASURES, PICTURE, RECORD, PaperWords, Quoted, Report, ReportKey, Reports
 from .report_tables import slices_markdown
 from .scene import environment_of
 from .watch import PREPARING, Watch, resumable
@@ -36,7 +37,6 @@ if TYPE_CHECKING:
 
     from ..envs.base import Environment
     from ..landscapes.measures.profile import Profile
-    from ..landscapes.measures.records import ProfileRecord
     from ..landscapes.objective import Objective
 
 TABLE = REPORTS.files[1]
@@ -141,7 +141,7 @@ class ReportJob:
                     watch.note(f"{subject.name} failed: {failed[subject.name]}")
             found = Reports(tuple(done), failed)
             if not self.single:
-                write_json(self.folder / RECORD, found.record())
+                write_json(self.folder / RECORD, to_json(found))
                 with replacing(self.folder / TABLE) as partial:
                     partial.write_text(slices_markdown(found.reports))
         return found
@@ -164,12 +164,7 @@ class ReportJob:
         """
         dataset = _open(subject)
         env = environment_of(dataset, self.device, self.env)
-        key: ReportKey = {
-            "points": self.points,
-            "seed": self.seed,
-            "slice": digest_of(dataset),
-            MODEL_VERSION: env.version_on(env.engine),
-        }
+        key = ReportKey(self.points, self.seed, digest_of(dataset), env.version_on(env.engine))
         beside = subject.store.parent
         if not self.prints or (beside / ARRAYS).exists():
             _fetch(beside, folder, key, watch)
@@ -188,20 +183,20 @@ class ReportJob:
         verify_dataset(env, dataset, subject.store, todo=RESAMPLE)
         start = time.monotonic()
         profile = measure(env, dataset, self.points, self.seed, watch)
-        grown = growth.measure_growth_of(env, dataset, watch)
+        profile = replace(profile, growth=growth.measure_growth_of(env, dataset, watch))
         report = Report(
             name=subject.name,
             env=env.name,
             options=stored_identity(dataset)["options"],
             fidelity=env.fidelity.name,
             device=env.device,
-            profile=cast("ProfileRecord", json.loads(json.dumps({**profile.record(), "growth": grown}))),
-            paper=_beside(profile, self.paper.get(env.name)),
+            profile=profile,
+            paper=_compare_words(profile, self.paper.get(env.name)),
             seconds=round(time.monotonic() - start, 3),
             command=self.command,
             key=key,
         )
-        _leave(dataset, profile, report, folder, watch)
+        _leave(dataset, report, folder, watch)
         return report
 
     def _print(self, report: Report, watch: Watch) -> None:
@@ -308,13 +303,11 @@ def _warn(subject: ReportedSlice, dataset: xr.Dataset, env: Environment, watch: 
         watch.note(f"warning: {subject.name} was sampled otherwise ({said}), so losses may differ")
 
 
-def _beside(profile: Profile, said: Quoted | None) -> PaperRecord | None:
-    if said is None:
-        return None
-    return {"words": profile.verdict.beside(said.words), "where": said.where}
+def _compare_words(profile: Profile, said: Quoted | None) -> PaperWords | None:
+    return None if said is None else PaperWords(profile.verdict.compare_words(said.words), said.where)
 
 
-def _leave(dataset: xr.Dataset, profile: Profile, report: Report, folder: Path, watch: Watch) -> None:
+def _leave(dataset: xr.Dataset, report: Report, folder: Path, watch: Watch) -> None:
     """Write a report's files."""
     import xarray as xr
 
@@ -322,11 +315,12 @@ def _leave(dataset: xr.Dataset, profile: Profile, report: Report, folder: Path, 
     from ..landscapes.draw.figures.quality import quality_figure
     from ..landscapes.storage.bundle import save_bundle
 
-    noise = xr.Dataset({"deviation": profile.noise.deviation})
-    save_bundle(folder / ARRAYS, steps=profile.steps, smooth=profile.smooth, noise=noise)
-    save(quality_figure(dataset, profile.steps, profile.samples, profile.smooth), folder / PICTURE)
+    noise, quality = xr.Dataset({"deviation": report.profile.noise.deviation}), report.profile.quality
+    assert quality is not None  # measured just now
+    save_bundle(folder / ARRAYS, steps=quality.steps, smooth=quality.smooth, noise=noise)
+    save(quality_figure(dataset, quality), folder / PICTURE)
     _leave_measures(folder, report)
-    write_record(folder / RECORD, report.record())
+    write_record(folder / RECORD, to_json(report))
 
 
 def _leave_measures(folder: Path, report: Report) -> None:
@@ -364,7 +358,7 @@ def _keep(folder: Path, key: ReportKey, device: str, watch: Watch) -> Report:
     _leave_measures(folder, kept)
     elsewhere = f", measured on {kept.device}" if kept.device != device else ""
     watch.note(f"{folder} is there already{elsewhere}")
-    if (theirs := kept.key["model_version"]) != (ours := key["model_version"]):
+    if (theirs := kept.key.model_version) != (ours := key.model_version):
         said = f"{kept.env} model {theirs}; this is model {ours}"
         watch.note(f"warning: it was measured by {said}. Delete the folder to measure it anew")
     return kept
@@ -372,7 +366,7 @@ def _keep(folder: Path, key: ReportKey, device: str, watch: Watch) -> Report:
 
 def _differences(theirs: ReportKey, ours: ReportKey) -> str:
     """Say in what two reports differ, nothing where slice and settings are the same, whatever the model's version."""
-    differ = {name: (theirs.get(name), value) for name, value in ours.items() if theirs.get(name) != value}
+    differ = {name: (getattr(theirs, name), one) for name, one in vars(ours).items() if getattr(theirs, name) != one}
     if set(differ) <= {MODEL_VERSION}:
         return ""
     return ", ".join(f"{name} {there} there, {here} here" for name, (there, here) in differ.items())

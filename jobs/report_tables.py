@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
 from itertools import groupby
-from typing import TYPE_CHECKING, TypedDict
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from ..landscapes.measures.records import ScaleRecord
-    from ..landscapes.statistics import EstimateRecord
+    from ..landscapes.measures.gradient_quality import ScaleRow
+    from ..landscapes.statistics import Estimate
     from .report_record import Report
 
 HEADINGS = ("slice", "minima", "flat", "jumps", "cosine", "measured", "the paper's words", "measured too")
@@ -19,24 +21,25 @@ ENVIRONMENTS = (
 SEEN = 0.5  # of the points that any step sees, for a smaller one to be worth showing
 
 
-class EnvironmentRecord(TypedDict):
+@dataclass
+class EnvironmentCounts:
     """In how many `slices` of an environment each word was measured, and each of the paper's."""
 
-    slices: int
-    measured: dict[str, int]
-    paper: dict[str, int]
+    slices: int = 0
+    measured: dict[str, int] = field(default_factory=dict)
+    paper: dict[str, int] = field(default_factory=dict)
 
 
-def by_environment(reports: Sequence[Report]) -> dict[str, EnvironmentRecord]:
+def by_environment(reports: Sequence[Report]) -> dict[str, EnvironmentCounts]:
     """Count by environment in how many of its slices each word was measured, and each of the paper's."""
-    found: dict[str, EnvironmentRecord] = {}
+    found: dict[str, EnvironmentCounts] = {}
     for report in reports:
-        entry = found.setdefault(report.env, {"slices": 0, "measured": {}, "paper": {}})
-        entry["slices"] += 1
+        entry = found.setdefault(report.env, EnvironmentCounts())
+        entry.slices += 1
         for word in report.words:
-            entry["measured"][word] = entry["measured"].get(word, 0) + 1
-        for one in report.paper["words"] if report.paper else []:
-            entry["paper"][one["word"]] = entry["paper"].get(one["word"], 0) + one["measured"]
+            entry.measured[word] = entry.measured.get(word, 0) + 1
+        for one in report.paper.words if report.paper else ():
+            entry.paper[one.word] = entry.paper.get(one.word, 0) + one.measured
     return found
 
 
@@ -63,30 +66,30 @@ def _environment(env: str, reports: Sequence[Report]) -> tuple[str, ...]:
     from ..landscapes.measures.classify import WORDS
 
     words, count = by_environment(reports)[env], len(reports)
-    measured = [_of(word, words["measured"][word], count) for word in WORDS if word in words["measured"]]
+    measured = [_of(word, words.measured[word], count) for word in WORDS if word in words.measured]
     profiles = [report.profile for report in reports]
-    samples = [profile["differences_of_samples"][0] for profile in profiles if profile["differences_of_samples"]]
+    samples = [profile.differences_of_samples[0] for profile in profiles if profile.differences_of_samples]
     return (
         f"`{env}`",
         str(count),
-        _span([profile["losses"]["notable"] for profile in profiles], "{:.0f}"),
-        _span([_value(profile["losses"]["flat"], 100) for profile in profiles], "{:.0f} %"),
-        _span([_value(profile["jumps"]["share"], 100) for profile in profiles], "{:.1f} %"),
-        _span([_value(_small(profile["differences"])["cosine"]) for profile in profiles], "{:z.2f}"),
-        _span([_value(row["cosine"]) for row in samples], "{:z.2f}"),
+        _span([profile.losses.notable for profile in profiles], "{:.0f}"),
+        _span([_value(profile.losses.flat, 100) for profile in profiles], "{:.0f} %"),
+        _span([_value(profile.jumps.share, 100) for profile in profiles], "{:.1f} %"),
+        _span([_value(_small(profile.differences).cosine) for profile in profiles], "{:z.2f}"),
+        _span([_value(row.cosine) for row in samples], "{:z.2f}"),
         ", ".join(measured),
-        ", ".join(_of(word, hits, count) for word, hits in words["paper"].items()),
-        _agreement(list(words["paper"].values()), count),
+        ", ".join(_of(word, hits, count) for word, hits in words.paper.items()),
+        _agreement(list(words.paper.values()), count),
     )
 
 
-def _small(rows: Sequence[ScaleRecord]) -> ScaleRecord:
-    most = max(row["points"] for row in rows)
-    return next(row for row in rows if row["points"] >= SEEN * most)
+def _small(rows: Sequence[ScaleRow]) -> ScaleRow:
+    most = max(row.points for row in rows)
+    return next(row for row in rows if row.points >= SEEN * most)
 
 
-def _value(estimate: EstimateRecord | None, scale: float = 1.0) -> float | None:
-    return None if estimate is None or estimate["value"] is None else scale * float(estimate["value"])
+def _value(estimate: Estimate | None, scale: float = 1.0) -> float | None:
+    return None if estimate is None or not math.isfinite(estimate.value) else scale * estimate.value
 
 
 def _span(values: Iterable[float | None], form: str) -> str:
@@ -110,17 +113,17 @@ def _agreement(hits: Sequence[int], count: int) -> str:
 
 
 def _slice(report: Report) -> tuple[str, ...]:
-    losses, samples = report.profile["losses"], report.profile["differences_of_samples"]
-    words = report.paper["words"] if report.paper else []
-    hits = sum(one["measured"] for one in words)
+    losses, samples = report.profile.losses, report.profile.differences_of_samples
+    words = report.paper.words if report.paper else ()
+    hits = sum(one.measured for one in words)
     return (
         report.name,
-        str(losses["notable"]),
-        _span([_value(losses["flat"], 100)], "{:.1f} %"),
-        _span([_value(report.profile["jumps"]["share"], 100)], "{:.1f} %"),
-        _span([_value(samples[0]["cosine"]) if samples else None], "{:z.2f}"),
+        str(losses.notable),
+        _span([_value(losses.flat, 100)], "{:.1f} %"),
+        _span([_value(report.profile.jumps.share, 100)], "{:.1f} %"),
+        _span([_value(samples[0].cosine) if samples else None], "{:z.2f}"),
         ", ".join(report.words),
-        ", ".join(one["word"] for one in words),
+        ", ".join(one.word for one in words),
         f"{hits} of {len(words)}" if words else "",
     )
 

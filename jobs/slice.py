@@ -24,7 +24,7 @@ from ..landscapes.convert import to_json
 from ..landscapes.cost import duration, seconds_per_episode
 from ..landscapes.identity import with_stride
 from ..landscapes.lattice import check_gradients, count_gradients
-from ..landscapes.measures.unresolved import probes, stored_unresolved
+from ..landscapes.measures.undersampled import Undersampled, probes
 from ..landscapes.objective import BoxedObjective, Objective, Status, failed
 from ..landscapes.plain import digest
 from ..landscapes.plane import Plane
@@ -304,7 +304,7 @@ class SliceJob(Job[SliceSummary]):
             status=count_statuses(dataset),
             loss=range_of(dataset),
             flat=flat_points(dataset),
-            unresolved=stored_unresolved(dataset),
+            undersampled=Undersampled.of(dataset),
             refinement=Refined.of(dataset),
             command=self.command,
             files=files,

@@ -18,7 +18,7 @@ from matplotlib.patches import Patch
 
 from ...identity import PACKAGE, VERSIONS, simulator_parts, stored_identity, stored_provenance
 from ...lattice import with_gradients
-from ...measures.unresolved import say_unresolved, stored_unresolved
+from ...measures.undersampled import Undersampled
 from ...objective import Status
 from ...sampling.refine import Refined
 from ...storage.files import print_width, replacing, visible_files
@@ -126,15 +126,16 @@ def gradient_key(dataset: xr.Dataset) -> list[Patch]:
     return [Patch(**style.NO_GRADIENT_LOOK, label=label)] if lacking else []
 
 
-def unresolved_key(dataset: xr.Dataset) -> list[Patch]:
-    """Return legend entries of how exact a refined slice is, and how much is finer than the samples, where known."""
+def sampling_key(dataset: xr.Dataset) -> list[Patch]:
+    """Return legend entries of how exact a refined slice is, and which share of its cells is undersampled."""
     refined = Refined.of(dataset)
     exact = (
         f"interpolated points: 95 % within {100 * refined.error:.2g} % of the range"
         if refined and refined.error is not None
         else ""
     )
-    lines = [exact, say_unresolved(stored_unresolved(dataset))]
+    between = Undersampled.of(dataset)
+    lines = [exact, between.describe() if between else ""]
     return [Patch(facecolor="none", edgecolor="none", label=said) for said in lines if said]
 
 
