@@ -39,7 +39,7 @@ def test_a_slice_and_its_folder_have_the_same_report_which_is_read_again(tmp_pat
 
 def test_a_scene_without_a_slice_is_sampled_for_its_report() -> None:
     told = gs.report("beale", points_per_axis=2)
-    assert (told.env, told.key["points"]) == ("beale", 2)
+    assert (told.env, told.key.points) == ("beale", 2)
     assert told.store is not None
     assert gs.open_slice(told.store.parent).plane.resolution == (24, 24)
 
