@@ -13,7 +13,7 @@ from .values import as_path, as_widths
 
 if TYPE_CHECKING:
     from ..envs.base import Environment
-    from ..landscapes.measures.slice_comparison_record import SliceComparison
+    from ..landscapes.measures.slice_comparison import SliceComparison
     from ..landscapes.slice import Slice
 
 

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from ..jobs.check import CheckReport
     from ..jobs.pairs import PairRanking
     from ..landscapes.measures.card import Card
-    from ..landscapes.measures.census_record import Census
+    from ..landscapes.measures.census import Census
 
 
 @verb

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from .terminal import Console, table
 
 if TYPE_CHECKING:
-    from ..landscapes.measures.census_record import Census
+    from ..landscapes.measures.census import Census
 
 
 def show(found: Census, console: Console) -> None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 from .terminal import Console, table
 
 if TYPE_CHECKING:
-    from ..landscapes.measures.slice_comparison_record import SliceComparison
+    from ..landscapes.measures.slice_comparison import SliceComparison
 
 LISTED = 12  # settings that differ, in the terminal
 

@@ -91,18 +91,18 @@ class CompanionPart(FigurePart):
 
     def make(self, watch: Watch) -> str:
         """Sample them, draw them beside the slice, and keep what they are."""
-        from ..landscapes.draw.figures.companions import Cut, companions_figure
+        from ..landscapes.draw.figures.companions import CompanionSlice, companions_figure
         from ..landscapes.draw.figures.page import save
         from ..landscapes.draw.film import lighten
         from ..landscapes.storage.store import open_slice
 
         dataset, env = open_slice(self.folder / STORE), self.scene().make()
-        names, cuts = points_beside(self.figure), [Cut(self.figure.through, dataset["loss"].to_numpy())]
+        names, cuts = points_beside(self.figure), [CompanionSlice(self.figure.through, dataset["loss"].to_numpy())]
         found = list[Companion]()
         with watch.progress(self.count_left(), "episodes") as advance:
             for name in names:
                 loss = sample(env, replace(self.figure, through=name).plane(env, self._resolution))
-                cuts.append(Cut(name, loss))
+                cuts.append(CompanionSlice(name, loss))
                 found.append(_companion(name, loss))
                 advance(len(found) * loss.size, "")
         save(companions_figure(cuts, dataset), self.folder / COMPANION_PICTURE)

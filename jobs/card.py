@@ -145,7 +145,7 @@ class CardJob(CheckpointedJob[Card]):
                     slices[number] = _slice_of(arrays, about)
             advance(len(self.entrants))
         created = datetime.now(UTC).strftime("%Y-%m-%d")
-        return Card(grades, created, device, self.command, slices)
+        return Card(tuple(grades), created, device, self.command, slices)
 
     def _arrays(self, one: Entrant) -> dict[str, NDArray[Any]]:
         """Return what is found of an entrant, from what is kept of it where that is there."""

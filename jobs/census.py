@@ -12,6 +12,7 @@ import cloudpickle
 import numpy as np
 
 from ..landscapes.capacity import Need, require
+from ..landscapes.convert import from_json
 from ..landscapes.cost import duration, seconds_per_episode
 from ..landscapes.sampling.distribution import make_objective, run_tasks, workers_of
 from ..landscapes.storage.files import replacing
@@ -25,8 +26,7 @@ from .workers import recipe
 
 if TYPE_CHECKING:
     from ..envs.base import Environment
-    from ..landscapes.measures.census import CensusDesign, SurveyedSlice
-    from ..landscapes.measures.census_record import Census
+    from ..landscapes.measures.census import Census, CensusDesign, SurveyedSlice
     from ..landscapes.plane import Plane
 
 RECORD, LOSSES, PICTURE = CENSUS.files
@@ -221,7 +221,7 @@ class CensusJob(CheckpointedJob["Census"]):
                 yield from found
 
     def _conclude(self, found: Mapping[str, SurveyedSlice]) -> Census:
-        from ..landscapes.measures.census_record import conclude
+        from ..landscapes.measures.census import conclude
 
         whole = [found[task.piece] for task in self.tasks if not task.other]
         others = {task.number: found[task.piece] for task in self.tasks if task.other}
@@ -242,13 +242,13 @@ class CensusJob(CheckpointedJob["Census"]):
 
 def open_census(folder: Path) -> Census:
     """Read the census in a folder. Raises DamagedError where it holds none that is whole."""
-    from ..landscapes.measures.census_record import Census
+    from ..landscapes.measures.census import Census
 
     todo = "delete it, and `landscape census` goes on from the slices that are kept"
     with reading(folder / LOSSES, todo), np.load(folder / LOSSES, allow_pickle=False) as arrays:
         losses = arrays["loss"]
     with reading(folder / RECORD, todo):
-        return Census.of_record(read_json(folder / RECORD), losses)
+        return replace(from_json(Census, read_json(folder / RECORD)), losses=losses)
 
 
 Piece = tuple[str, dict[str, Any]]  # its name, and what it holds

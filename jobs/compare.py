@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..landscapes.identity import check_identity
 from ..landscapes.measures.slice_comparison import (
+    SliceComparison,
     check_finished,
     check_landscapes,
     check_planes,
@@ -16,7 +17,6 @@ from ..landscapes.measures.slice_comparison import (
     loss_unit,
     parameters,
 )
-from ..landscapes.measures.slice_comparison_record import SliceComparison
 from ..landscapes.objective import Objective
 from ..landscapes.plain import plain_json
 from ..landscapes.slice import Slice

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from ..envs.base import Environment
+    from ..landscapes.measures.lyapunov import GradientGrowth
 
 SHARES = (0.2, 0.4, 0.6, 0.8, 1.0)  # of the episode
 POINTS = 16
@@ -28,8 +29,8 @@ def effort(env: Environment) -> int:
     return len(SHARES) * POINTS if env.horizon else 0
 
 
-def measure_growth_of(env: Environment, dataset: xr.Dataset, watch: Watch) -> dict[str, Any] | None:
-    """Measure how gradients grow with the length of episodes at points of a slice; return the record of it.
+def measure_growth_of(env: Environment, dataset: xr.Dataset, watch: Watch) -> GradientGrowth | None:
+    """Measure how gradients grow with the length of episodes at points of a slice.
 
     None where no setting says how long episodes are. Where a scene draws none, time is in the unit of that setting.
     """
@@ -52,4 +53,4 @@ def measure_growth_of(env: Environment, dataset: xr.Dataset, watch: Watch) -> di
             assert found.grad is not None
             norms.append((found.grad * width).norm(dim=1))
             advance(len(norms) * len(x))
-    return measure_growth(time * np.array(SHARES), torch.stack(norms).numpy()).record()
+    return measure_growth(time * np.array(SHARES), torch.stack(norms).numpy())

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import math
 import shutil
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -12,17 +13,19 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import groupby
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NotRequired, Protocol, TypedDict, cast
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import torch
 from torch import Tensor
 
 from ..landscapes.capacity import Need, require, size
+from ..landscapes.convert import NOT_JSON, from_json, to_json
 from ..landscapes.cost import duration, seconds_per_episode
-from ..landscapes.identity import MODEL_VERSION, current_identity, stored_identity
-from ..landscapes.measures.records import ProfileRecord, WordRecord
+from ..landscapes.identity import MODEL_VERSION, stored_identity
+from ..landscapes.measures.classify import QuotedWord
+from ..landscapes.measures.doubled_resolution import DoubledResolution
+from ..landscapes.measures.profile import Profile
 from ..landscapes.objective import BoxedObjective, Evaluation, ObjectiveWrapper
-from ..landscapes.plain import number, text
 from ..landscapes.storage.disk import is_full
 from ..landscapes.storage.files import make_folder, other_files, replacing, tidy, write_json
 from ..landscapes.storage.records import read_json, reading, write_record
@@ -38,16 +41,15 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from ..envs.base import Environment
-    from ..landscapes.draw.figures.page import Picture
-    from ..landscapes.measures.profile import Profile
-    from ..landscapes.measures.records import ScaleRecord
+    from ..landscapes.draw.figure import Picture
+    from ..landscapes.measures.gradient_quality import ScaleRow
     from ..landscapes.objective import Objective
-    from ..landscapes.statistics import EstimateRecord
+    from ..landscapes.statistics import Estimate
 
+RECORD, MEASURES, PICTURE, ARRAYS = REPORT.files  # the arrays are what the picture is drawn from, but for the slice
 TABLE = REPORTS.files[1]
 POINTS = 6  # along each axis where gradients are tested by new evaluations
 RESOLUTION = 24  # points per axis of a slice that is sampled for its report
-RECORD, MEASURES, PICTURE, ARRAYS = REPORT.files  # the arrays are what the picture is drawn from, but for the slice
 HEADINGS = ("slice", "minima", "flat", "jumps", "cosine", "measured", "the paper's words", "measured too")
 ENVIRONMENTS = (
     "environment", "slices", "minima", "flat", "jumps", "cosine, small step", "cosine, two samples", "measured",
@@ -153,7 +155,7 @@ class ReportJob:
                     watch.note(f"{subject.name} failed: {failed[subject.name]}")
             found = Reports(tuple(done), failed)
             if not self.single:
-                write_json(self.folder / RECORD, found.record())
+                write_json(self.folder / RECORD, to_json(found))
                 with replacing(self.folder / TABLE) as partial:
                     partial.write_text(slices_markdown(found.reports))
         return found
@@ -176,12 +178,7 @@ class ReportJob:
         """
         dataset = _open(subject)
         env = environment_of(dataset, self.device, self.env)
-        key: ReportKey = {
-            "points": self.points,
-            "seed": self.seed,
-            "slice": digest_of(dataset),
-            MODEL_VERSION: env.version_on(env.engine),
-        }
+        key = ReportKey(self.points, self.seed, digest_of(dataset), env.version_on(env.engine))
         beside = subject.store.parent
         if not self.prints or (beside / ARRAYS).exists():
             _fetch(beside, folder, key, watch)
@@ -200,20 +197,20 @@ class ReportJob:
         verify_dataset(env, dataset, subject.store, todo=RESAMPLE)
         start = time.monotonic()
         profile = measure(env, dataset, self.points, self.seed, watch)
-        grown = growth.measure_growth_of(env, dataset, watch)
+        profile = replace(profile, growth=growth.measure_growth_of(env, dataset, watch))
         report = Report(
             name=subject.name,
             env=env.name,
             options=stored_identity(dataset)["options"],
             fidelity=env.fidelity.name,
             device=env.device,
-            profile=cast("ProfileRecord", json.loads(json.dumps({**profile.record(), "growth": grown}))),
-            paper=_beside(profile, self.paper.get(env.name)),
+            profile=profile,
+            paper=_compare_words(profile, self.paper.get(env.name)),
             seconds=round(time.monotonic() - start, 3),
             command=self.command,
             key=key,
         )
-        _leave(dataset, profile, report, folder, watch)
+        _leave(dataset, report, folder, watch)
         return report
 
     def _print(self, report: Report, watch: Watch) -> None:
@@ -320,13 +317,11 @@ def _warn(subject: ReportedSlice, dataset: xr.Dataset, env: Environment, watch: 
         watch.note(f"warning: {subject.name} was sampled otherwise ({said}), so losses may differ")
 
 
-def _beside(profile: Profile, said: Quoted | None) -> PaperRecord | None:
-    if said is None:
-        return None
-    return {"words": profile.verdict.beside(said.words), "where": said.where}
+def _compare_words(profile: Profile, said: Quoted | None) -> PaperWords | None:
+    return None if said is None else PaperWords(profile.verdict.compare_words(said.words), said.where)
 
 
-def _leave(dataset: xr.Dataset, profile: Profile, report: Report, folder: Path, watch: Watch) -> None:
+def _leave(dataset: xr.Dataset, report: Report, folder: Path, watch: Watch) -> None:
     """Write a report's files."""
     import xarray as xr
 
@@ -334,11 +329,12 @@ def _leave(dataset: xr.Dataset, profile: Profile, report: Report, folder: Path, 
     from ..landscapes.draw.figures.quality import quality_figure
     from ..landscapes.storage.bundle import save_bundle
 
-    noise = xr.Dataset({"deviation": profile.noise.deviation})
-    save_bundle(folder / ARRAYS, steps=profile.steps, smooth=profile.smooth, noise=noise)
-    save(quality_figure(dataset, profile.steps, profile.samples, profile.smooth), folder / PICTURE)
+    noise, quality = xr.Dataset({"deviation": report.profile.noise.deviation}), report.profile.quality
+    assert quality is not None  # measured just now
+    save_bundle(folder / ARRAYS, steps=quality.steps, smooth=quality.smooth, noise=noise)
+    save(quality_figure(dataset, quality), folder / PICTURE)
     _leave_measures(folder, report)
-    write_record(folder / RECORD, report.record())
+    write_record(folder / RECORD, to_json(report))
 
 
 def _leave_measures(folder: Path, report: Report) -> None:
@@ -376,7 +372,7 @@ def _keep(folder: Path, key: ReportKey, device: str, watch: Watch) -> Report:
     _leave_measures(folder, kept)
     elsewhere = f", measured on {kept.device}" if kept.device != device else ""
     watch.note(f"{folder} is there already{elsewhere}")
-    if (theirs := kept.key["model_version"]) != (ours := key["model_version"]):
+    if (theirs := kept.key.model_version) != (ours := key.model_version):
         said = f"{kept.env} model {theirs}; this is model {ours}"
         watch.note(f"warning: it was measured by {said}. Delete the folder to measure it anew")
     return kept
@@ -384,7 +380,7 @@ def _keep(folder: Path, key: ReportKey, device: str, watch: Watch) -> Report:
 
 def _differences(theirs: ReportKey, ours: ReportKey) -> str:
     """Say in what two reports differ, nothing where slice and settings are the same, whatever the model's version."""
-    differ = {name: (theirs.get(name), value) for name, value in ours.items() if theirs.get(name) != value}
+    differ = {name: (getattr(theirs, name), one) for name, one in vars(ours).items() if getattr(theirs, name) != one}
     if set(differ) <= {MODEL_VERSION}:
         return ""
     return ", ".join(f"{name} {there} there, {here} here" for name, (there, here) in differ.items())
@@ -425,29 +421,30 @@ class Quoted(Protocol):
     def where(self) -> str: ...  # noqa: D102
 
 
-class PaperRecord(TypedDict):
+@dataclass(frozen=True)
+class PaperWords:
     """The paper's words for a landscape, and where it says them."""
 
-    words: list[WordRecord]
+    words: tuple[QuotedWord, ...]
     where: str
 
 
-class ReportKey(TypedDict):
+@dataclass(frozen=True)
+class ReportKey:
     """What decides a report: its settings, the digest of the slice, and the version of the scene's model."""
 
     points: int
     seed: int
     slice: str
     model_version: int
-    device: NotRequired[str]  # of early versions
 
 
 @dataclass(frozen=True)
 class Report:
     """Hold what was measured of a slice, as `report.json` has it.
 
-    `profile` is what `Profile.record` returns, `paper` the words that the paper has for the scene, None where it has
-    none, and `seconds` what the measuring took. `folder` is where its files are, and `store` the slice's.
+    `paper` has the words that the paper has for the scene, None where it has none, and `seconds` is what the measuring
+    took. `folder` is where its files are, and `store` the slice's.
     """
 
     name: str
@@ -455,13 +452,13 @@ class Report:
     options: dict[str, Any]
     fidelity: str
     device: str
-    profile: ProfileRecord
-    paper: PaperRecord | None
+    profile: Profile
+    paper: PaperWords | None
     seconds: float
     command: str
     key: ReportKey
-    folder: Path | None = field(default=None, compare=False, repr=False)
-    store: Path | None = field(default=None, compare=False, repr=False)
+    folder: Path | None = field(default=None, metadata=NOT_JSON, compare=False, repr=False)
+    store: Path | None = field(default=None, metadata=NOT_JSON, compare=False, repr=False)
 
     @classmethod
     def read(cls, path: Path) -> Report:
@@ -472,58 +469,26 @@ class Report:
         """
         path = path / RECORD if path.is_dir() else path
         with reading(path, "delete it, and the same command measures the slice anew"):
-            report = replace(cls.of_record(read_json(path)), folder=path.parent)
-            report.measures, slices_markdown([report]), by_environment([report])
-            number(report.key["model_version"])
-            own = report.name, report.env, report.device, report.profile.get("errors", "")
-            for said in (*own, *report.verdict_lines()):
-                text(said)
-        return report
-
-    @classmethod
-    def of_record(cls, record: Mapping[str, Any]) -> Report:
-        """Take a report from plain JSON, by the keys of the file; raises KeyError where one is missing."""
-        own = [name for name in cls.__dataclass_fields__ if name not in ("profile", "key", "folder", "store")]
-        profile = {name: record[name] for name in ProfileRecord.__annotations__ if name in record}
-        key = cast("ReportKey", current_identity(record["key"]))
-        return cls(**{name: record[name] for name in own}, profile=cast("ProfileRecord", profile), key=key)
-
-    def record(self) -> dict[str, Any]:
-        """Return it as plain JSON, by the keys of the file."""
-        return {
-            "name": self.name,
-            "env": self.env,
-            "options": self.options,
-            "fidelity": self.fidelity,
-            "device": self.device,
-            **self.profile,
-            "paper": self.paper,
-            "seconds": self.seconds,
-            "command": self.command,
-            "key": self.key,
-        }
+            return replace(from_json(cls, read_json(path)), folder=path.parent)
 
     @property
     def words(self) -> tuple[str, ...]:
         """The words for the landscape."""
-        return tuple(self.profile["verdict"]["words"])
+        return self.profile.words
 
     @property
     def measures(self) -> dict[str, str]:
         """The chief numbers by short names, with 95 % intervals, as a page shows them."""
-        from ..landscapes.measures.profile import named_measures
-
-        return named_measures(self.profile)
+        return self.profile.measures
 
     def verdict_lines(self) -> list[str]:
         """Return the words, each with its reason, and whether the paper has them, a line each."""
-        verdict = self.profile["verdict"]
-        lines = [f"{word}: {verdict['reasons'][word]}" for word in verdict["words"]]
-        if finer := self.profile.get("at_twice"):
-            lines.append(_say_changes(finer["appear"], finer["go"]))
+        lines = [f"{word}: {self.profile.verdict.reasons[word]}" for word in self.words]
+        if self.profile.doubled:
+            lines.append(_describe_changes(self.profile.doubled))
         if self.paper:
-            said = "; ".join(f"{one['word']}: {'yes' if one['measured'] else 'no'}" for one in self.paper["words"])
-            lines.append(f"the paper's words ({self.paper['where']}), measured too? {said}")
+            said = "; ".join(f"{one.word}: {'yes' if one.measured else 'no'}" for one in self.paper.words)
+            lines.append(f"the paper's words ({self.paper.where}), measured too? {said}")
         return lines
 
     def table(self) -> pd.DataFrame:
@@ -545,7 +510,7 @@ class Report:
 
         from ..landscapes.draw.figures.quality import quality_figure
         from ..landscapes.lattice import sampled_lattice
-        from ..landscapes.measures.gradient_quality import compare_samples
+        from ..landscapes.measures.gradient_quality import GradientQuality, compare_samples
         from ..landscapes.storage.bundle import open_bundle
         from ..landscapes.storage.store import open_slice
 
@@ -555,7 +520,7 @@ class Report:
             )
         dataset, kept = sampled_lattice(open_slice(self.store)), open_bundle(self.folder / ARRAYS)
         samples = compare_samples(dataset, deviation=float(np.nan_to_num(kept["noise"]["deviation"])))
-        return partial(quality_figure, dataset, kept["steps"], samples, kept["smooth"])
+        return partial(quality_figure, dataset, GradientQuality(kept["steps"], samples, kept["smooth"]))
 
     def _repr_html_(self) -> str:
         """Show words and numbers in a notebook."""
@@ -565,44 +530,46 @@ class Report:
         return f"<p>{escape(self.name)} ({escape(self.env)})</p><ul>{lines}</ul>{self.table().to_html()}"
 
 
-def _say_changes(appear: Sequence[str], go: Sequence[str]) -> str:
+def _describe_changes(doubled: DoubledResolution) -> str:
     """Say which words would change at twice the resolution."""
-    said = [f"{word} would appear" for word in appear] + [f"{word} would go" for word in go]
-    return f"at twice the resolution: {', '.join(said) or 'no word is seen to change'}"
+    said = [f"{word} would appear" for word in doubled.appear] + [f"{word} would go" for word in doubled.go]
+    return f"at twice the resolution: {', '.join(said) or 'the verdict is the same'}"
 
 
 @dataclass(frozen=True)
 class Reports:
     """Hold the reports of several slices, in their order, and by name what was wrong with those that failed."""
 
+    derived: ClassVar = ("environments",)
+
     reports: tuple[Report, ...]
     failed: dict[str, str]
 
-    def record(self) -> dict[str, Any]:
-        """Return them as plain JSON, with what the environments have in common."""
-        environments: dict[str, EnvironmentRecord] = by_environment(self.reports)
-        reports = [report.record() for report in self.reports]
-        return {"reports": reports, "environments": environments, "failed": self.failed}
+    @property
+    def environments(self) -> dict[str, EnvironmentCounts]:
+        """What the slices of each environment have in common."""
+        return by_environment(self.reports)
 
 
-class EnvironmentRecord(TypedDict):
+@dataclass
+class EnvironmentCounts:
     """In how many `slices` of an environment each word was measured, and each of the paper's."""
 
-    slices: int
-    measured: dict[str, int]
-    paper: dict[str, int]
+    slices: int = 0
+    measured: dict[str, int] = field(default_factory=dict)
+    paper: dict[str, int] = field(default_factory=dict)
 
 
-def by_environment(reports: Sequence[Report]) -> dict[str, EnvironmentRecord]:
+def by_environment(reports: Sequence[Report]) -> dict[str, EnvironmentCounts]:
     """Count by environment in how many of its slices each word was measured, and each of the paper's."""
-    found: dict[str, EnvironmentRecord] = {}
+    found: dict[str, EnvironmentCounts] = {}
     for report in reports:
-        entry = found.setdefault(report.env, {"slices": 0, "measured": {}, "paper": {}})
-        entry["slices"] += 1
+        entry = found.setdefault(report.env, EnvironmentCounts())
+        entry.slices += 1
         for word in report.words:
-            entry["measured"][word] = entry["measured"].get(word, 0) + 1
-        for one in report.paper["words"] if report.paper else []:
-            entry["paper"][one["word"]] = entry["paper"].get(one["word"], 0) + one["measured"]
+            entry.measured[word] = entry.measured.get(word, 0) + 1
+        for one in report.paper.words if report.paper else ():
+            entry.paper[one.word] = entry.paper.get(one.word, 0) + one.measured
     return found
 
 
@@ -629,30 +596,30 @@ def _environment(env: str, reports: Sequence[Report]) -> tuple[str, ...]:
     from ..landscapes.measures.classify import WORDS
 
     words, count = by_environment(reports)[env], len(reports)
-    measured = [_of(word, words["measured"][word], count) for word in WORDS if word in words["measured"]]
+    measured = [_of(word, words.measured[word], count) for word in WORDS if word in words.measured]
     profiles = [report.profile for report in reports]
-    samples = [profile["differences_of_samples"][0] for profile in profiles if profile["differences_of_samples"]]
+    samples = [profile.differences_of_samples[0] for profile in profiles if profile.differences_of_samples]
     return (
         f"`{env}`",
         str(count),
-        _span([profile["losses"]["notable"] for profile in profiles], "{:.0f}"),
-        _span([_value(profile["losses"]["flat"], 100) for profile in profiles], "{:.0f} %"),
-        _span([_value(profile["jumps"]["share"], 100) for profile in profiles], "{:.1f} %"),
-        _span([_value(_small(profile["differences"])["cosine"]) for profile in profiles], "{:z.2f}"),
-        _span([_value(row["cosine"]) for row in samples], "{:z.2f}"),
+        _span([profile.losses.notable for profile in profiles], "{:.0f}"),
+        _span([_value(profile.losses.flat, 100) for profile in profiles], "{:.0f} %"),
+        _span([_value(profile.jumps.share, 100) for profile in profiles], "{:.1f} %"),
+        _span([_value(_small(profile.differences).cosine) for profile in profiles], "{:z.2f}"),
+        _span([_value(row.cosine) for row in samples], "{:z.2f}"),
         ", ".join(measured),
-        ", ".join(_of(word, hits, count) for word, hits in words["paper"].items()),
-        _agreement(list(words["paper"].values()), count),
+        ", ".join(_of(word, hits, count) for word, hits in words.paper.items()),
+        _agreement(list(words.paper.values()), count),
     )
 
 
-def _small(rows: Sequence[ScaleRecord]) -> ScaleRecord:
-    most = max(row["points"] for row in rows)
-    return next(row for row in rows if row["points"] >= MIN_SEEN * most)
+def _small(rows: Sequence[ScaleRow]) -> ScaleRow:
+    most = max(row.points for row in rows)
+    return next(row for row in rows if row.points >= MIN_SEEN * most)
 
 
-def _value(estimate: EstimateRecord | None, scale: float = 1.0) -> float | None:
-    return None if estimate is None or estimate["value"] is None else scale * float(estimate["value"])
+def _value(estimate: Estimate | None, scale: float = 1.0) -> float | None:
+    return None if estimate is None or not math.isfinite(estimate.value) else scale * estimate.value
 
 
 def _span(values: Iterable[float | None], form: str) -> str:
@@ -676,17 +643,17 @@ def _agreement(hits: Sequence[int], count: int) -> str:
 
 
 def _slice(report: Report) -> tuple[str, ...]:
-    losses, samples = report.profile["losses"], report.profile["differences_of_samples"]
-    words = report.paper["words"] if report.paper else []
-    hits = sum(one["measured"] for one in words)
+    losses, samples = report.profile.losses, report.profile.differences_of_samples
+    words = report.paper.words if report.paper else ()
+    hits = sum(one.measured for one in words)
     return (
         report.name,
-        str(losses["notable"]),
-        _span([_value(losses["flat"], 100)], "{:.1f} %"),
-        _span([_value(report.profile["jumps"]["share"], 100)], "{:.1f} %"),
-        _span([_value(samples[0]["cosine"]) if samples else None], "{:z.2f}"),
+        str(losses.notable),
+        _span([_value(losses.flat, 100)], "{:.1f} %"),
+        _span([_value(report.profile.jumps.share, 100)], "{:.1f} %"),
+        _span([_value(samples[0].cosine) if samples else None], "{:z.2f}"),
         ", ".join(report.words),
-        ", ".join(one["word"] for one in words),
+        ", ".join(one.word for one in words),
         f"{hits} of {len(words)}" if words else "",
     )
 

@@ -28,8 +28,7 @@ from ..landscapes.cost import duration, seconds_per_episode
 from ..landscapes.directions import barrier
 from ..landscapes.identity import plane_of, stored_identity, with_stride
 from ..landscapes.lattice import check_gradients, count_gradients
-from ..landscapes.measures.records import UnresolvedRecord
-from ..landscapes.measures.unresolved import attribute_of, find_unresolved, probes, say_unresolved, stored_unresolved
+from ..landscapes.measures.undersampled import Undersampled, find_undersampled, probes
 from ..landscapes.objective import BoxedObjective, Objective, Status, describe_errors, failed
 from ..landscapes.plain import digest, plain_name
 from ..landscapes.plane import Plane
@@ -67,9 +66,9 @@ Draw = Callable[..., "Figure"]  # draw(dataset, width=None): a slice for a scree
 class SliceSummary:
     """Say what a slice cost, as `summary.json` beside it has it; `status` counts points, `flat` those without slope.
 
-    Gradients are at every `gradients_every` samples along each axis. `episodes` are those of the samples; `unresolved`
-    has those that looked between them, and what they found, None where nothing is known of it. `barrier` [loss unit] is
-    that between the ends of a line. `error` is what the first point that raised said.
+    Gradients are at every `gradients_every` samples along each axis. `episodes` are those of the samples;
+    `undersampled` has those that looked between them, and what they found, None where nothing is known of it.
+    `barrier` [loss unit] is that between the ends of a line. `error` is what the first point that raised said.
     """
 
     env: str | None
@@ -86,7 +85,7 @@ class SliceSummary:
     status: dict[str, int]
     loss: dict[str, float | None]
     flat: int | None
-    unresolved: UnresolvedRecord | None
+    undersampled: Undersampled | None
     refinement: Refined | None
     command: str
     files: list[str]
@@ -105,7 +104,7 @@ class SliceSummary:
         share = (self.flat or 0) / asked if asked else 0.0
         flat = f"; gradient exactly zero at {share:.1%} of points" if share else ""
         barred = "" if self.barrier is None else f"; barrier of {self.barrier:.4g} above the line between its ends"
-        hidden = f"; {said}" if (said := say_unresolved(self.unresolved)) else ""
+        hidden = f"; {said}" if self.undersampled and (said := self.undersampled.describe()) else ""
         spent = f"{self.episodes} episodes in {duration(self.seconds)}"
         return f"{spent}; {ends}{raised}; {losses}{flat}{barred}{refined}{hidden}"
 
@@ -357,7 +356,7 @@ class SliceJob(Job[SliceSummary]):
             status=count_statuses(dataset),
             loss=range_of(dataset),
             flat=flat_points(dataset),
-            unresolved=stored_unresolved(dataset),
+            undersampled=Undersampled.of(dataset),
             refinement=Refined.of(dataset),
             command=self.command,
             files=files,
@@ -514,12 +513,13 @@ def identity_of(objective: Objective) -> dict[str, Any]:
 
 
 def look_between(objective: Objective, dataset: xr.Dataset) -> dict[str, Any]:
-    """Return the attribute of a slice that says how much of it is finer than its samples.
+    """Return the attribute of a slice that says which share of its cells is undersampled.
 
     An objective that raises between them has been sampled all the same: that is warned of, and nothing is said.
     """
     try:
-        return attribute_of(find_unresolved(objective, dataset))
+        found = find_undersampled(objective, dataset)
+        return found.attribute() if found else {}
     except (OSError, MemoryError):  # lost workers, a full disk: the slice is finished once they are there again
         raise
     except Exception as error:

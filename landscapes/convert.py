@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from dataclasses import fields, is_dataclass
 from enum import Enum
 from functools import cache
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from .plain import plain
 
@@ -13,14 +15,15 @@ if TYPE_CHECKING:
     from cattrs import Converter
 
 Record = TypeVar("Record")
+NOT_JSON: Final = {"json": False}  # the metadata of a field that JSON leaves out; it needs a default
 
 
 def to_json(record: Any) -> Any:
     """Return a record as JSON has it, at any depth; see `from_json`.
 
-    Dataclasses become dicts of their fields, followed by the properties that their class names in `derived`, which
-    are for readers alone. NaN and infinity become None; arrays, tensors and tuples become lists. Raises TypeError for
-    what has no form in JSON.
+    Dataclasses become dicts of their fields, but for those with the metadata `NOT_JSON`, followed by the properties
+    that their class names in `derived`, which are for readers alone. NaN and infinity become None; arrays, tensors and
+    tuples become lists. Raises TypeError for what has no form in JSON.
     """
     return plain(record)
 
@@ -41,9 +44,17 @@ def _converter() -> Converter:
     from cattrs import Converter
 
     converter = Converter(detailed_validation=False)
+    converter.register_structure_hook_factory(is_dataclass, lambda kind: _reader(kind, converter))
     for kind, read in ((float, _number), (int, _integer), (str, _exactly), (bool, _exactly)):
         converter.register_structure_hook(kind, read)
     return converter
+
+
+def _reader(kind: type[Any], converter: Converter) -> Callable[[Any, Any], Any]:
+    from cattrs.gen import make_dict_structure_fn, override
+
+    left_out: Any = {one.name: override(omit=True) for one in fields(kind) if not one.metadata.get("json", True)}
+    return make_dict_structure_fn(kind, converter, **left_out)
 
 
 def _number(value: Any, _: object) -> float:

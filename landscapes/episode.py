@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 if TYPE_CHECKING:
-    from .draw.figures.page import Picture
+    from .draw.figure import Picture
 
 Point = tuple[float, float, float]
 Shape = Literal[

@@ -39,7 +39,7 @@ def plain(value: Any) -> Any:
     if hasattr(value, "record"):
         return plain(value.record())
     if is_dataclass(value):
-        names = [*(field.name for field in fields(value)), *getattr(value, "derived", ())]
+        names = [*(one.name for one in fields(value) if one.metadata.get("json", True)), *getattr(value, "derived", ())]
         return {name: plain(getattr(value, name)) for name in names}
     if isinstance(value, Mapping):
         return {name: plain(inner) for name, inner in value.items()}

@@ -20,7 +20,7 @@ from .plane import Plane
 if TYPE_CHECKING:
     import pandas as pd
 
-    from .draw.figures.page import Picture
+    from .draw.figure import Picture
     from .measures.profile import Profile
 
 

@@ -5,24 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, TypedDict
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .plain import finite, or_nan
-
 Values = NDArray[np.float64]
 CONFIDENCE = 0.95
 BLOCKS = {1: (16,), 2: (4, 4)}  # parts of a line, or of a plane, that are left out one at a time
-
-
-class EstimateRecord(TypedDict):
-    """An estimate as plain JSON; None where nothing could be measured."""
-
-    value: float | None
-    low: float | None
-    high: float | None
 
 
 @dataclass(frozen=True)
@@ -32,15 +22,6 @@ class Estimate:
     value: float
     low: float
     high: float
-
-    def record(self) -> EstimateRecord:
-        """Return it as plain JSON."""
-        return {"value": finite(self.value), "low": finite(self.low), "high": finite(self.high)}
-
-    @classmethod
-    def of_record(cls, record: EstimateRecord) -> Estimate:
-        """Read it from plain JSON; raises TypeError and KeyError for what is none."""
-        return cls(or_nan(record["value"]), or_nan(record["low"]), or_nan(record["high"]))
 
 
 @dataclass(frozen=True)

@@ -20,8 +20,8 @@ from .command import modules, verbs
 
 PROJECT = tomllib.loads((Path(__file__).parent.parent / "pyproject.toml").read_text())["project"]
 TOLD = {"cyclopts", "rich"}  # a command's words, and its tables
-SLICED = TOLD | {"numpy", "torch", "jaxtyping", "xarray", "pandas", "pyarrow", "zarr", "scipy", "matplotlib"}
-BROUGHT = {"torchgen", "mpl_toolkits", "cloudpickle"}  # by torch, matplotlib and pyarrow
+SLICED = TOLD | {"numpy", "torch", "jaxtyping", "xarray", "pandas", "pyarrow", "zarr", "scipy", "matplotlib", "cattrs"}
+BROUGHT = {"torchgen", "mpl_toolkits", "cloudpickle", "attr", "attrs"}  # by torch, matplotlib, pyarrow and cattrs
 BOWL = """
 from gradscape import Environment, Fidelity, ParameterSpace
 

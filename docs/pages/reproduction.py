@@ -65,8 +65,8 @@ def verdict_of(one: KeptFigure) -> str:
     """Return what the measured words of a slice make of the paper's."""
     if one.report is None:
         return NOT_MEASURED
-    words = one.report.paper["words"] if one.report.paper else []
-    hits = [word["measured"] for word in words]
+    words = one.report.paper.words if one.report.paper else ()
+    hits = [word.measured for word in words]
     if not hits:
         return SAYS_NOTHING
     return CONFIRMED if all(hits) else DIFFERENT if any(hits) else REFUTED
@@ -121,9 +121,9 @@ def _slice(one: KeptFigure, kept: Kept, pictures: Path) -> Iterator[str]:
 def _rows(one: KeptFigure, kept: Kept) -> Mapping[str, str]:
     """Return what stands beside each other, by what it is."""
     words, report = kept.paper.words.get(one.figure.env), one.report
-    reasons = report.profile["verdict"]["reasons"] if report else {}
-    said = report.paper["words"] if report and report.paper else []
-    missing = [word["word"] for word in said if not word["measured"]]
+    reasons = report.profile.verdict.reasons if report else {}
+    said = report.paper.words if report and report.paper else ()
+    missing = [one.word for one in said if not one.measured]
     earlier = "" if one.current or one.slice is None else ", by samples of an earlier version of the scene"
     return {
         "the paper shows": cell(one.figure.caption.says),

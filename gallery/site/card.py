@@ -6,6 +6,7 @@ import shutil
 from dataclasses import asdict
 from pathlib import Path
 
+from ...landscapes.convert import from_json
 from ...landscapes.measures.card import Card
 from ...landscapes.storage.records import read_json, reading
 from ..files import CARD, CARD_PICTURE, CARD_RECORD
@@ -22,7 +23,7 @@ def place_card(data: Path, out: Path, studio: Studio) -> Card | None:
     if not (source / CARD_RECORD).exists() or not (source / CARD_PICTURE).exists():
         return None
     with reading(source / CARD_RECORD, REMAKE.format(source)):
-        card = Card.of_record(read_json(source / CARD_RECORD))
+        card = from_json(Card, read_json(source / CARD_RECORD))
     target.mkdir()
     for name in (CARD_RECORD, CARD_PICTURE):
         shutil.copyfile(source / name, target / name)

@@ -31,7 +31,7 @@ def as_json(value: Any) -> Any:
 class Numbers:
     """Say how a slice's points ended, the ends of their losses, and at what share of them the gradient is zero.
 
-    `unresolved` is the share of its cells that is finer than its samples, with its interval, where that is known.
+    `undersampled` is the share of its cells whose loss its samples do not show, with its interval, where it is known.
     """
 
     points: int
@@ -39,7 +39,7 @@ class Numbers:
     lowest: float | None
     highest: float | None
     flat: float | None
-    unresolved: Mapping[str, float | None] | None = field(default=None, metadata=LEFT_OUT)
+    undersampled: Mapping[str, float | None] | None = field(default=None, metadata=LEFT_OUT)
 
 
 @dataclass(frozen=True)

@@ -9,10 +9,14 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from ...jobs.report import Report
+from ...landscapes.convert import from_json, to_json
 from ...landscapes.identity import MODEL_VERSION, current_identity
 from ...landscapes.measures.classify import WORDS
 from ...landscapes.measures.convergence_record import Convergence
 from ...landscapes.measures.fidelity import cheapest, p95, pareto_front
+from ...landscapes.measures.gradient_quality import ScaleRow
+from ...landscapes.measures.profile import Profile
 from ...landscapes.plain import number, optional, text
 from ...landscapes.storage.records import read_json, reading
 from ..files import DEVICES, REMAKE, REPORT, TRADEOFFS, TradeoffFiles
@@ -26,59 +30,58 @@ TOLERANCE = 0.05  # of the loss error that a picture's description names the qui
 
 def read_report(folder: Path) -> ReportEntry | None:
     """Return what `landscape report` found of a slice, None where there is no report."""
-    path = folder / REPORT
-    if not path.exists():
+    if not (folder / REPORT).exists():
         return None
-    with reading(path, REMAKE.format("reports")):
-        record = read_json(path)
-        return ReportEntry(
-            words=_words(record),
-            where=text(record["paper"]["where"]) if record["paper"] else "",
-            device=text(record["device"]),
-            fidelity=text(record["fidelity"]),
-            picture=_describe_quality(record),
-            file=REPORT,
-        )
+    report = _report_in(folder)
+    return ReportEntry(
+        words=_words(report),
+        where=report.paper.where if report.paper else "",
+        device=report.device,
+        fidelity=report.fidelity,
+        picture=_describe_quality(report.profile),
+        file=REPORT,
+    )
 
 
-def _words(record: Record) -> list[Word]:
+def _report_in(folder: Path) -> Report:
+    with reading(folder / REPORT, REMAKE.format("reports")):
+        return from_json(Report, read_json(folder / REPORT))
+
+
+def _words(report: Report) -> list[Word]:
     """Return every word that was measured or that the paper says."""
-    reasons = record["verdict"]["reasons"]
-    paper = [one["word"] for one in (record["paper"] or {"words": []})["words"]]
+    reasons = report.profile.verdict.reasons
+    paper = [one.word for one in report.paper.words] if report.paper else []
     return [
-        Word(word, word in reasons, text(reasons.get(word, "")), word in reasons if word in paper else None)
+        Word(word, word in reasons, reasons.get(word, ""), word in reasons if word in paper else None)
         for word in WORDS
         if word in reasons or word in paper
     ]
 
 
-def _describe_quality(record: Record) -> str:
+def _describe_quality(profile: Profile) -> str:
     """Say what the picture of gradient quality shows."""
     parts = [
-        f"mean cosine of gradient and difference {_format_signed(row['cosine']['value'])} "
-        f"over {row['scale']:.2g} of the box"
-        for row in [_small(record["differences"]), *record["differences_of_samples"]]
-        if row and row["cosine"]["value"] is not None
+        f"mean cosine of gradient and difference {_format_signed(row.cosine.value)} over {row.scale:.2g} of the box"
+        for row in [_small(profile.differences), *profile.differences_of_samples]
+        if row and math.isfinite(row.cosine.value)
     ]
-    for row in record["smoothing"]:
-        if row["biased"]["value"] is not None:
-            biased = round(row["biased"]["value"] * row["points"])
-            parts.append(
-                f"smoothed over {row['width']:.0%} of it, first order is biased at {biased} of {row['points']}"
-            )
+    for row in profile.smoothing:
+        if math.isfinite(row.biased.value):
+            biased = round(row.biased.value * row.points)
+            parts.append(f"smoothed over {row.width:.0%} of it, first order is biased at {biased} of {row.points}")
     return "Gradient quality over the slice: " + ("; ".join(parts) or "no slope above the noise")
 
 
 def quality_rows(folder: Path) -> list[Record]:
     """Return what the picture of gradient quality shows by scale, a row for each scale of each of its three parts."""
-    with reading(folder / REPORT, REMAKE.format("reports")):
-        record = read_json(folder / REPORT)
-        parts = ("differences", "differences_of_samples", "smoothing")
-        return [{"part": part.replace("_", " "), **row} for part in parts for row in record[part]]
+    profile = _report_in(folder).profile
+    parts = ("differences", "differences_of_samples", "smoothing")
+    return [{"part": part.replace("_", " "), **to_json(row)} for part in parts for row in getattr(profile, part)]
 
 
-def _small(rows: Sequence[Record]) -> Record | None:
-    return next((row for row in rows if row["points"] >= row["of"] / 2), None)
+def _small(rows: Sequence[ScaleRow]) -> ScaleRow | None:
+    return next((row for row in rows if row.points >= row.of / 2), None)
 
 
 def _format_signed(value: float) -> str:

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch
 import xarray as xr
 
 from ...jobs.slice import count_statuses, flat_points
+from ...landscapes.convert import to_json
 from ...landscapes.identity import plane_of
 from ...landscapes.lattice import own_cells
-from ...landscapes.measures.unresolved import contradicted_cells, stored_unresolved
+from ...landscapes.measures.undersampled import Undersampled, contradicted_cells
 from ...landscapes.objective import NOT_EVALUATED, Status
 from ...landscapes.plain import number
 from ...landscapes.plane import Plane
@@ -31,7 +32,7 @@ LINEAR, LOGARITHMIC = "linear", "logarithmic"
 def count_numbers(dataset: xr.Dataset) -> Numbers:
     """Count how the points of a slice ended, and find the range of their losses."""
     loss, status, flat = dataset["loss"].to_numpy(), dataset["status"].to_numpy(), flat_points(dataset)
-    between = stored_unresolved(dataset)
+    between = Undersampled.of(dataset)
     finite, evaluated = loss[np.isfinite(loss)], int(np.isin(status, NOT_EVALUATED, invert=True).sum())
     return Numbers(
         points=int(status.size),
@@ -39,7 +40,7 @@ def count_numbers(dataset: xr.Dataset) -> Numbers:
         lowest=float(finite.min()) if finite.size else None,
         highest=float(finite.max()) if finite.size else None,
         flat=None if flat is None or not evaluated else flat / evaluated,
-        unresolved=dict(cast("Mapping[str, float | None]", between["share"])) if between else None,
+        undersampled=to_json(between.share) if between else None,
     )
 
 

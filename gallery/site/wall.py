@@ -8,10 +8,9 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from ...envs.registry import entries
-from ...landscapes.measures.census_record import Census
+from ...landscapes.convert import from_json
+from ...landscapes.measures.census import Census
 from ...landscapes.measures.classify import GOOD, MISSING, NOISY, OPPOSITE, WORDS, ZERO
 from ...landscapes.storage.records import read_json, reading
 from ...landscapes.storage.store import open_slice
@@ -68,7 +67,7 @@ def _place_census(env: str, data: Path, out: Path, studio: Studio) -> tuple[Cens
         if not record.exists() or not picture.exists():
             continue
         with reading(record, REMAKE.format(env, device)):
-            census = Census.of_record(read_json(record), np.zeros(0, np.float32))
+            census = from_json(Census, read_json(record))
             rows = list(_rows(census))
         folder = out / CENSUSES
         folder.mkdir(exist_ok=True)

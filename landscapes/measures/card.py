@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any, Literal, cast, get_args
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Literal
 
 from ..conformance.finding import FAIL, UNEXPECTED, WARN
-from ..plain import number, text
+from ..convert import NOT_JSON
 
 if TYPE_CHECKING:
     import pandas as pd
     from jaxtyping import Float, Int
     from numpy.typing import NDArray
 
-    from ..draw.figures.page import Picture
+    from ..draw.figure import Picture
 
 Outcome = Literal["passes", "fails", "not installed"]
 Checks = Sequence[Mapping[str, Any]]
@@ -42,22 +42,6 @@ class Grade:
     check: str
     slice: str
 
-    @classmethod
-    def of_record(cls, record: Mapping[str, Any]) -> Grade:
-        """Read it from plain JSON; raises TypeError, KeyError and ValueError for what is none."""
-        outcome = text(record["outcome"])
-        if outcome not in get_args(Outcome):
-            raise ValueError(f"an outcome is {', '.join(get_args(Outcome))}; got {outcome}")
-        words = ("scene", "engine", "env", "fidelity", "finding", "check", "slice")
-        return cls(
-            **{name: text(record[name]) for name in words},
-            options=dict(record["options"]),
-            dims=list(map(text, record["dims"])),
-            versions={name: text(at) for name, at in dict(record["versions"]).items()},
-            outcome=cast("Outcome", outcome),
-            counts={end: int(number(count)) for end, count in dict(record["counts"]).items()},
-        )
-
 
 @dataclass(frozen=True, eq=False)
 class CardSlice:
@@ -76,11 +60,11 @@ class CardSlice:
 class Card:
     """Hold the grades, and for drawing the slice of each that was sampled, by its place among them."""
 
-    grades: Sequence[Grade]
+    grades: tuple[Grade, ...]
     created: str
     device: str
     command: str
-    slices: Mapping[int, CardSlice]
+    slices: Mapping[int, CardSlice] = field(default_factory=dict, metadata=NOT_JSON)
 
     def table(self) -> pd.DataFrame:
         """Return a row for each engine in each scene: `outcome`, `finding`, `check`."""
@@ -96,9 +80,9 @@ class Card:
 
     def plot(self, width: float | None = None) -> Picture:
         """Draw the slices, a row for each scene; `width` is that of a page for print [mm]."""
-        from ..draw.figures.card import card_figure
+        from ..draw.figure import figure_of
 
-        return card_figure(self, width=width)
+        return figure_of(self, width)
 
     @property
     def failed(self) -> int:
@@ -108,21 +92,6 @@ class Card:
     def engines(self) -> list[str]:
         """Return what was measured, packages with their versions."""
         return list(dict.fromkeys(f"{name} {at}" for one in self.grades for name, at in one.versions.items()))
-
-    @classmethod
-    def of_record(cls, record: Mapping[str, Any]) -> Card:
-        """Read it from plain JSON, without slices; raises TypeError, KeyError and ValueError for what is none."""
-        about = {name: text(record[name]) for name in ("created", "device", "command")}
-        return cls([Grade.of_record(one) for one in record["grades"]], **about, slices={})
-
-    def record(self) -> dict[str, Any]:
-        """Return it as plain JSON, without the slices."""
-        return {
-            "created": self.created,
-            "device": self.device,
-            "command": self.command,
-            "grades": [asdict(one) for one in self.grades],
-        }
 
 
 def first_finding(checks: Checks) -> str:

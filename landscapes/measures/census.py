@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field
 from itertools import combinations
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -16,17 +16,23 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ..convert import NOT_JSON
 from ..directions import orthonormal
 from ..identity import plane_of
 from ..lattice import count_gradients
 from ..objective import Objective, evaluate, in_box
 from ..plane import Plane
 from ..space import ParameterSpace
-from ..statistics import Estimate
-from .classify import Verdict, classify
+from ..statistics import CONFIDENCE, Estimate
+from .classify import WORDS, Verdict, classify
 from .discontinuities import EVALUATIONS_PER_PAIR, Jumps, find_jumps_abreast
 from .gradient_quality import compare_samples
 from .ruggedness import Ruggedness, ruggedness
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from ..draw.figure import Picture
 
 Array = NDArray[np.float64]
 PAIRS, RANDOM = "pairs", "random"
@@ -50,8 +56,13 @@ MEASURES = (
 )  # as a report has them: means over the axes, shares, and the range of the losses in their unit
 
 
+RESAMPLES = 999
+ROUNDING = 1e-9  # of a measure, below which it does not vary
+QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
+
+
 @dataclass(frozen=True)
-class Cut:
+class PlaneSpec:
     """Hold the two directions of a slice, and what they are called.
 
     `dims` are the numbers of two parameters; else `directions`, shape (2, dim), are orthonormal in widths of the box.
@@ -80,7 +91,7 @@ class CensusDesign:
 
     space: ParameterSpace
     bases: Float[Tensor, "base dim"]
-    cuts: tuple[Cut, ...]
+    cuts: tuple[PlaneSpec, ...]
     resolution: int
     gradients: int = 1
 
@@ -101,10 +112,12 @@ class CensusDesign:
         generator = np.random.default_rng(seed)
         count = math.isqrt(slices)
         if along == RANDOM:
-            cuts = [Cut(None, tuple(map(tuple, orthonormal(generator, space.dim).tolist()))) for _ in range(count)]
+            cuts = [
+                PlaneSpec(None, tuple(map(tuple, orthonormal(generator, space.dim).tolist()))) for _ in range(count)
+            ]
         else:
             every = list(combinations(range(space.dim), 2))
-            cuts = [Cut(every[at]) for at in sorted(generator.permutation(len(every))[:count])]
+            cuts = [PlaneSpec(every[at]) for at in sorted(generator.permutation(len(every))[:count])]
         many = 1 if along == PAIRS and space.dim == 2 else slices // len(cuts)
         bases = space.from_unit(torch.from_numpy(generator.random((many, space.dim))))
         return cls(space, bases, tuple(cuts), resolution, gradients)
@@ -268,3 +281,249 @@ def ordered(measures: Sequence[Array]) -> list[int]:
     keyed = [MEASURES.index(name) for name in ("turns", "notable minima")]
     keys = [tuple(np.nan_to_num(one[keyed], nan=-1.0)) for one in measures]
     return sorted(range(len(keys)), key=lambda number: keys[number])
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Hold how a measure is distributed over the slices: its quantiles, and its median with a 95 % interval."""
+
+    quantiles: tuple[float, ...]
+    median: Estimate
+
+
+@dataclass(frozen=True)
+class VarianceComponents:
+    """Hold what shares of a measure's variance over slices go with what; NaN where it does not vary or is not known.
+
+    `base` and `cut` are what the point and the cut do by themselves, `both` what is left: what they do together.
+    `resolution` and `fidelity` are the variance that measuring otherwise adds, as shares of the same variance.
+    """
+
+    base: float
+    cut: float
+    both: float
+    resolution: float
+    fidelity: float
+
+
+@dataclass(frozen=True)
+class CensusedSlice:
+    """Say what one slice of a census is: the numbers of its base point and cut, its axes, range and words.
+
+    `range` [loss unit] is from its lowest to its highest loss, None where all failed; `measures` are by the order of
+    `census.MEASURES`; `failed` is the share of its samples without a loss.
+    """
+
+    base: int
+    cut: int
+    axes: tuple[str, ...]
+    range: tuple[float, float] | None
+    failed: float
+    measures: tuple[float | None, ...]
+    words: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Census:
+    """Hold what many slices of an environment are like.
+
+    `words` says of every word which share of the slices it fits, `spreads` and `parts` say of every measure how it is
+    distributed and what its variance goes with. `other` is the fidelity that some slices were measured at, too, empty
+    where there is none. Slices have gradients at every so many samples along each axis, `gradients`. `losses`
+    [loss unit] are those of the slices, shape (slice, v, u), in a file of their own.
+    """
+
+    env: str
+    fidelity: str
+    other: str
+    loss_unit: str
+    along: str
+    resolution: int
+    gradients: int
+    seed: int
+    episodes: int
+    slices: tuple[CensusedSlice, ...]
+    words: dict[str, Estimate]
+    spreads: dict[str, Spread]
+    parts: dict[str, VarianceComponents]
+    identity: dict[str, Any]
+    provenance: dict[str, Any]
+    command: str
+    losses: NDArray[np.float32] = field(
+        default_factory=lambda: np.zeros(0, np.float32), metadata=NOT_JSON, repr=False, compare=False
+    )
+
+    @property
+    def order(self) -> list[int]:
+        """The numbers of the slices, the least rugged first."""
+        return ordered([np.array([np.nan if m is None else m for m in one.measures]) for one in self.slices])
+
+    def table(self) -> pd.DataFrame:
+        """Return a row for each measure, indexed by `measure`.
+
+        Columns: the quantiles over the slices, `median` with `low` and `high`, and the shares of the variance that go
+        with `base`, `cut`, `both`, `resolution` and `fidelity`.
+        """
+        import pandas as pd
+
+        rows = []
+        for name, one in self.spreads.items():
+            quantiles = dict(zip([f"{q:.0%}" for q in QUANTILES], one.quantiles, strict=True))
+            middle = {"median": one.median.value, "low": one.median.low, "high": one.median.high}
+            rows.append({"measure": name, **quantiles, **middle, **asdict(self.parts[name])})
+        return pd.DataFrame(rows).set_index("measure")
+
+    def plot(self, width: float | None = None) -> Picture:
+        """Draw every slice small, the least rugged first, for a screen, or for a page so wide [mm]."""
+        from ..draw.figure import figure_of
+
+        return figure_of(self, width)
+
+    def _repr_html_(self) -> str:
+        """Show the table in a notebook."""
+        return str(self.table().to_html())
+
+
+def conclude(
+    design: CensusDesign,
+    found: Sequence[SurveyedSlice],
+    others: Mapping[int, SurveyedSlice],
+    *,
+    env: str,
+    fidelity: str,
+    other: str,
+    loss_unit: str,
+    seed: int,
+    identity: Mapping[str, Any],
+    provenance: Mapping[str, Any],
+    command: str,
+) -> Census:
+    """Sum up the slices of a design, and those that were measured at another fidelity, too, by their numbers."""
+    drawn = bootstrap(design.places, seed=seed)
+    shape = len(design.bases), len(design.cuts)
+    whole, halved = (
+        np.array([getattr(one, name) for one in found]).reshape(*shape, -1) for name in ("measures", "halved")
+    )
+    spreads, parts = {}, {}
+    for k, name in enumerate(MEASURES):
+        spreads[name] = spread(whole[..., k].ravel(), drawn)
+        elsewhere = {at: float(one.measures[k]) for at, one in others.items()}
+        parts[name] = divide(whole[..., k], halved[..., k], elsewhere, design.places)
+    places = zip(design.places, found, strict=True)
+    return Census(
+        along="random" if design.cuts[0].dims is None else "pairs",
+        resolution=design.resolution,
+        gradients=design.gradients,
+        seed=seed,
+        episodes=sum(one.episodes for one in (*found, *others.values())),
+        slices=tuple(_sum_up(one, *place, design.plane(*place).labels) for place, one in places),
+        words=word_shares([one.words for one in found], drawn),
+        spreads=spreads,
+        parts=parts,
+        losses=np.array([one.loss for one in found], dtype=np.float32),
+        env=env,
+        fidelity=fidelity,
+        other=other,
+        loss_unit=loss_unit,
+        identity=dict(identity),
+        provenance=dict(provenance),
+        command=command,
+    )
+
+
+def _sum_up(found: SurveyedSlice, base: int, cut: int, axes: tuple[str, ...]) -> CensusedSlice:
+    known = found.loss[np.isfinite(found.loss)]
+    ends = (float(known.min()), float(known.max())) if known.size else None
+    measures = tuple(None if not np.isfinite(one) else float(one) for one in found.measures)
+    return CensusedSlice(base, cut, axes, ends, 1 - known.size / found.loss.size, measures, found.words)
+
+
+def bootstrap(places: Sequence[tuple[int, int]], *, seed: int) -> NDArray[np.int64]:
+    """Draw how often each slice counts, shape (resample, slice): base points and cuts are drawn, each by themselves.
+
+    Slices that share a point or a cut depend on each other (pigeonhole bootstrap: Owen 2007, Ann. Appl. Stat. 1(2)).
+    Where there is but one of either it is kept.
+    """
+    generator, at = np.random.default_rng(seed), np.array(places)
+    counts = [
+        generator.multinomial(many, np.full(many, 1 / many), size=RESAMPLES)
+        if many > 1
+        else np.ones((RESAMPLES, 1), int)
+        for many in at.max(axis=0) + 1
+    ]
+    return np.asarray(counts[0][:, at[:, 0]] * counts[1][:, at[:, 1]], dtype=np.int64)
+
+
+def word_shares(words: Sequence[Sequence[str]], drawn: NDArray[np.int64]) -> dict[str, Estimate]:
+    """Return the share of slices that each word fits, with the percentile interval of the resamples."""
+    return {word: _share(np.array([word in one for one in words], dtype=float), drawn) for word in WORDS}
+
+
+def _share(hits: Array, drawn: NDArray[np.int64]) -> Estimate:
+    weights = drawn.sum(axis=1)
+    found = (drawn @ hits)[weights > 0] / weights[weights > 0]
+    return Estimate(float(hits.mean()), *_interval(found))
+
+
+def spread(values: Array, drawn: NDArray[np.int64]) -> Spread:
+    """Return how the values of a measure are distributed, NaN left out."""
+    known = np.isfinite(values)
+    if not known.any():
+        return Spread((np.nan,) * len(QUANTILES), Estimate(np.nan, np.nan, np.nan))
+    middle = Estimate(float(np.median(values[known])), *_interval(_medians(values[known], drawn[:, known])))
+    return Spread(tuple(float(one) for one in np.quantile(values[known], QUANTILES)), middle)
+
+
+def _medians(values: Array, drawn: NDArray[np.int64]) -> Array:
+    """Return the median of each resample in which there are values: the mean of the one or two in its middle."""
+    order = np.argsort(values, kind="stable")
+    upto = np.cumsum(drawn[:, order], axis=1)  # how many of a resample there are up to each value
+    upto = upto[upto[:, -1] > 0]
+    last = upto[:, -1:] - 1
+    below, above = (values[order][(upto <= at).sum(axis=1)] for at in (last // 2, (last + 1) // 2))
+    return np.asarray((below + above) / 2)
+
+
+def _interval(found: Array) -> tuple[float, float]:
+    tail = (1 - CONFIDENCE) / 2
+    low, high = np.quantile(found, [tail, 1 - tail])
+    return float(low), float(high)
+
+
+def divide(
+    table: Array, halved: Array, others: Mapping[int, float], places: Sequence[tuple[int, int]]
+) -> VarianceComponents:
+    """Divide the variance of a measure, shape (base, cut), by what the slices differ in.
+
+    Two-way random effects without repetition, by mean squares (Searle, Casella & McCulloch 1992, section 4.3), shares
+    below zero cut off. `halved` is the measure at half the resolution, `others` that of some slices, by their numbers
+    among `places`, at another fidelity: half the mean square of a difference is the variance that either adds.
+    """
+    values = np.array([table[place] for place in places])
+    total = float(np.nanvar(values, ddof=1)) if np.isfinite(values).sum() > 1 else 0.0
+    if not total > (ROUNDING * np.nanmax(np.abs(values), initial=0.0)) ** 2:
+        return VarianceComponents(*(np.nan,) * 5)
+    other = np.array([others.get(number, np.nan) for number in range(len(values))])
+    added = [_added(values, one) / total for one in (np.array([halved[place] for place in places]), other)]
+    base, cut, both = _components(table)
+    whole = base + cut + both
+    shares = [one / whole if whole > 0 else np.nan for one in (base, cut, both)]
+    return VarianceComponents(*shares, *added)
+
+
+def _added(values: Array, others: Array) -> float:
+    squares = np.square(values - others)
+    return float(np.nanmean(squares) / 2) if np.isfinite(squares).any() else np.nan
+
+
+def _components(table: Array) -> tuple[float, float, float]:
+    """Return the variance components of rows, columns and the rest; NaN where a cell is missing or there is one row."""
+    rows, columns = table.shape
+    if not np.isfinite(table).all() or min(rows, columns) < 2:
+        return np.nan, np.nan, np.nan
+    by_row, by_column, mean = table.mean(axis=1), table.mean(axis=0), table.mean()
+    rest = table - by_row[:, None] - by_column + mean
+    error = float(np.square(rest).sum() / ((rows - 1) * (columns - 1)))
+    base = (columns * float(by_row.var(ddof=1)) - error) / columns
+    cut = (rows * float(by_column.var(ddof=1)) - error) / rows
+    return max(base, 0.0), max(cut, 0.0), error

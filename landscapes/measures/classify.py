@@ -10,13 +10,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
-from ..plain import finite
 from ..statistics import Values
 from .discontinuities import Jumps
-from .records import WordRecord
 from .ruggedness import Ruggedness
 
 VERY_SMOOTH, SMOOTH, RUGGED, EXTREME = "very smooth", "smooth with local minima", "rugged", "extremely rugged"
@@ -35,8 +34,18 @@ OFTEN = 1 / 3  # share of gradients that point uphill: fine ripples make it 0.3 
 
 
 @dataclass(frozen=True)
+class QuotedWord:
+    """Hold a word of somebody else's for a landscape, and whether it was measured too."""
+
+    word: str
+    measured: bool
+
+
+@dataclass(frozen=True)
 class Verdict:
     """Hold the words for a landscape, each with the measure it comes from."""
+
+    derived: ClassVar = ("words",)
 
     reasons: dict[str, str]
 
@@ -45,9 +54,9 @@ class Verdict:
         """The words, in the order of `WORDS`."""
         return tuple(word for word in WORDS if word in self.reasons)
 
-    def beside(self, said: Sequence[str]) -> list[WordRecord]:
+    def compare_words(self, said: Sequence[str]) -> tuple[QuotedWord, ...]:
         """Return each word of somebody else's, and whether it was measured."""
-        return [{"word": word, "measured": word in self.reasons} for word in said]
+        return tuple(QuotedWord(word, word in self.reasons) for word in said)
 
 
 def classify(found: Ruggedness, jumps: Jumps | None, cosine: Values) -> Verdict:
@@ -73,10 +82,10 @@ def judge(found: Ruggedness, jumps: Jumps | None, average: float, uphill: float)
     reasons = dict([_surface(found)])
     if found.level.value >= MUCH:
         reasons[LARGE_FLAT] = f"{found.level.value:.0%} of the samples are level with their neighbours"
-    if jumps is not None and len(jumps.height):
+    if jumps is not None and jumps.found:
         share = jumps.share
         reasons.pop(VERY_SMOOTH, None)
-        reasons[DISCONTINUOUS] = f"jumps found: {len(jumps.height)}, between {share.value:.1%} of neighbouring samples"
+        reasons[DISCONTINUOUS] = f"jumps found: {len(jumps.found)}, between {share.value:.1%} of neighbouring samples"
     return Verdict(reasons | _gradients(found, average, uphill))
 
 
@@ -110,13 +119,13 @@ def _gradients(found: Ruggedness, average: float, uphill: float) -> dict[str, st
     return reasons
 
 
-def thresholds() -> dict[str, float | None]:
+def thresholds() -> dict[str, float]:
     """Return the thresholds by name, to be stated with results."""
     return {
-        "few turns": finite(FEW_TURNS),
-        "many turns": finite(MANY_TURNS),
-        "few minima": finite(FEW_MINIMA),
-        "large share": finite(MUCH),
-        "good cosine": finite(AGREE),
-        "often uphill": finite(OFTEN),
+        "few turns": FEW_TURNS,
+        "many turns": MANY_TURNS,
+        "few minima": FEW_MINIMA,
+        "large share": MUCH,
+        "good cosine": AGREE,
+        "often uphill": OFTEN,
     }

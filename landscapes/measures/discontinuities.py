@@ -5,20 +5,19 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 import torch
 import xarray as xr
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
 from ..identity import plane_of
 from ..objective import Objective, evaluate
-from ..plain import finite
 from ..plane import Plane
 from ..statistics import Estimate, share
-from .records import JumpRecord, JumpsRecord
 
 HALVINGS = 12  # a gap between samples is looked into down to 1/4096 of it
 EVALUATIONS_PER_PAIR = 2 + HALVINGS
@@ -27,18 +26,28 @@ Count = Callable[[Tensor], Mapping[str, Tensor]]
 
 
 @dataclass(frozen=True)
-class Jumps:
-    """Hold the jumps that were found, and how often they occur between neighbouring samples.
+class Jump:
+    """Hold where a jump is [plane units] and its height [loss unit].
 
-    `place` [plane units], shape (count, rank), `height` [loss unit] and `counted`, whether some event happens more or
-    less often on the other side (None where the objective counts none), shape (count,). Of `neighbours` pairs of
-    samples `steep` differ by at least `least`; `checked` of these were looked into and `undecided` could not be, as an
-    evaluation there failed.
+    `event` says whether some event happens more or less often on its other side, None where the objective counts none.
     """
 
-    place: Float[Tensor, "count rank"]
-    height: Float[Tensor, " count"]
-    counted: Bool[Tensor, " count"] | None
+    place: tuple[float, ...]
+    height: float
+    event: bool | None
+
+
+@dataclass(frozen=True)
+class Jumps:
+    """Hold the jumps that were `found`, the highest first, and how often they occur between neighbouring samples.
+
+    Of `neighbours` pairs of samples `steep` differ by at least `least` [loss unit]; `checked` of these were looked into
+    and `undecided` could not be, as an evaluation there failed.
+    """
+
+    derived: ClassVar = ("share", "explained_by_events")
+
+    found: tuple[Jump, ...]
     least: float
     neighbours: int
     steep: int
@@ -51,32 +60,16 @@ class Jumps:
         decided, part = self.checked - self.undecided, self.steep / self.neighbours if self.neighbours else math.nan
         if self.steep == 0:
             return Estimate(0.0, 0.0, 0.0)
-        found = share(len(self.height), decided)
+        found = share(len(self.found), decided)
         if decided == self.steep:
             return Estimate(found.value * part, found.value * part, found.value * part)
         return Estimate(found.value * part, found.low * part, found.high * part)
 
     @property
-    def share_explained(self) -> Estimate | None:
-        """Share of the jumps across which an event is counted differently."""
-        return None if self.counted is None else share(int(self.counted.sum()), len(self.counted))
-
-    def record(self) -> JumpsRecord:
-        """Return it as plain JSON, the highest jumps first."""
-        order = self.height.argsort(descending=True)
-        counted = [None] * len(order) if self.counted is None else self.counted[order].tolist()
-        rows = zip(self.place[order].tolist(), self.height[order].tolist(), counted, strict=True)
-        found: list[JumpRecord] = [{"place": place, "height": height, "event": event} for place, height, event in rows]
-        return {
-            "share": self.share.record(),
-            "explained_by_events": self.share_explained.record() if self.share_explained else None,
-            "least": finite(self.least),
-            "neighbours": self.neighbours,
-            "steep": self.steep,
-            "checked": self.checked,
-            "undecided": self.undecided,
-            "found": found,
-        }
+    def explained_by_events(self) -> Estimate | None:
+        """Share of the jumps across which an event is counted differently, None where there is no jump or no event."""
+        explained = [jump.event for jump in self.found]
+        return share(sum(map(bool, explained)), len(explained)) if explained and None not in explained else None
 
 
 def find_jumps(
@@ -118,7 +111,10 @@ def find_jumps_abreast(
         found = decided & (last >= bound) & (last > earlier / 2)
         counted = _differ(events, plane.lift(low[found]), plane.lift(high[found])) if events else None
         place, undecided = (low + high)[found] / 2, int((~decided).sum())
-        jumps.append(Jumps(place, last[found], counted, bound, neighbours, len(ends), len(low), undecided))
+        events_there = [None] * len(place) if counted is None else counted.tolist()
+        each = map(Jump, map(tuple, place.tolist()), last[found].tolist(), events_there)
+        highest_first = tuple(sorted(each, key=lambda jump: -jump.height))
+        jumps.append(Jumps(highest_first, bound, neighbours, len(ends), len(low), undecided))
     return jumps
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -17,10 +18,8 @@ from torch import Tensor
 
 from ..identity import plane_of
 from ..objective import Objective, evaluate
-from ..plain import finite
 from ..plane import Plane
-from ..statistics import Values, mean, share, student
-from .records import ScaleRecord, WidthRecord
+from ..statistics import Estimate, Values, mean, share, student
 from .ruggedness import box_slopes
 
 SCALES = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1)
@@ -28,6 +27,46 @@ STRIDES = (1, 2, 4)  # of the slice's own samples
 WIDTHS = (0.01, 0.03)
 CHANCE = 0.001  # a bias is beyond chance where Student's test says that chance alone would show it this rarely,
 NOTABLE_BIAS = 0.1  # and worth a word where first and zeroth order disagree by more than this
+
+
+@dataclass(frozen=True, eq=False)
+class GradientQuality:
+    """Hold what is drawn of a slice's gradients.
+
+    `steps` is what `compare_differences` returns, `samples` what `compare_samples` does, `smooth` `smoothed_slopes`.
+    """
+
+    steps: xr.Dataset
+    samples: xr.Dataset
+    smooth: xr.Dataset
+
+
+@dataclass(frozen=True)
+class ScaleRow:
+    """How gradients compare with differences over one `scale`, a fraction of the box.
+
+    Of `of` points `points` show a slope; `error` is their median.
+    """
+
+    scale: float
+    points: int
+    of: int
+    cosine: Estimate
+    sign: Estimate
+    uphill: Estimate
+    error: float
+
+
+@dataclass(frozen=True)
+class WidthRow:
+    """How first- and zeroth-order slopes compare under a Gaussian of one `width`, a fraction of the box."""
+
+    width: float
+    points: int
+    of: int
+    biased: Estimate
+    disagreement: Estimate
+    variance_ratio: float
 
 
 def subgrid(plane: Plane, points: int) -> Float[Tensor, "count rank"]:
@@ -102,24 +141,24 @@ def agreement(slope: Values, difference: Values, noise: float) -> dict[str, Valu
     return {name: np.where(seen, part, np.nan) for name, part in (("cosine", cosine), ("sign", sign), ("error", error))}
 
 
-def scale_table(found: xr.Dataset) -> list[ScaleRecord]:
-    """Return one plain row per scale: points that show a slope, their mean cosine and sign agreement, median error."""
-    rows = list[ScaleRecord]()
+def scale_table(found: xr.Dataset) -> tuple[ScaleRow, ...]:
+    """Return a row for each scale: points that show a slope, their mean cosine and sign agreement, median error."""
+    rows = list[ScaleRow]()
     for scale in found["scale"].to_numpy():
         cosine, sign, error = (found[name].sel(scale=scale).to_numpy() for name in ("cosine", "sign", "error"))
         seen = np.isfinite(cosine)
         rows.append(
-            {
-                "scale": float(scale),
-                "points": int(seen.sum()),
-                "of": int(cosine.size),
-                "cosine": mean(cosine[seen], least=-1, most=1).record(),
-                "sign": mean(sign[seen], least=0, most=1).record(),
-                "uphill": share(int((cosine[seen] < 0).sum()), int(seen.sum())).record(),
-                "error": finite(float(np.median(error[seen]))) if seen.any() else None,
-            }
+            ScaleRow(
+                scale=float(scale),
+                points=int(seen.sum()),
+                of=int(cosine.size),
+                cosine=mean(cosine[seen], least=-1, most=1),
+                sign=mean(sign[seen], least=0, most=1),
+                uphill=share(int((cosine[seen] < 0).sum()), int(seen.sum())),
+                error=float(np.median(error[seen])) if seen.any() else math.nan,
+            )
         )
-    return rows
+    return tuple(rows)
 
 
 def smoothed_slopes(
@@ -178,9 +217,9 @@ def disagreement(found: xr.Dataset) -> xr.DataArray:
     return apart
 
 
-def width_table(found: xr.Dataset) -> list[WidthRecord]:
-    """Return one plain row per width: points, share biased, disagreement, and zeroth order's variance over first's."""
-    rows = list[WidthRecord]()
+def width_table(found: xr.Dataset) -> tuple[WidthRow, ...]:
+    """Return a row for each width: points, share biased, disagreement, and zeroth order's variance over first's."""
+    rows = list[WidthRow]()
     for width in found["width"].to_numpy():
         part = found.sel(width=width)
         known = np.isfinite(part["bias"].to_numpy()).all(axis=-1)
@@ -189,16 +228,16 @@ def width_table(found: xr.Dataset) -> list[WidthRecord]:
             ratio = zeroth / first
         flags = find_bias(found).sel(width=width).to_numpy()[known]
         rows.append(
-            {
-                "width": float(width),
-                "points": int(known.sum()),
-                "of": len(known),
-                "biased": share(int(flags.sum()), int(known.sum())).record(),
-                "disagreement": mean(disagreement(found).sel(width=width).to_numpy()[known], least=0, most=1).record(),
-                "variance_ratio": finite(float(np.nanmedian(ratio))) if np.isfinite(ratio).any() else None,
-            }
+            WidthRow(
+                width=float(width),
+                points=int(known.sum()),
+                of=len(known),
+                biased=share(int(flags.sum()), int(known.sum())),
+                disagreement=mean(disagreement(found).sel(width=width).to_numpy()[known], least=0, most=1),
+                variance_ratio=float(np.nanmedian(ratio)) if np.isfinite(ratio).any() else math.nan,
+            )
         )
-    return rows
+    return tuple(rows)
 
 
 def _central_differences(loss: Values, axis: int, stride: int) -> Values:

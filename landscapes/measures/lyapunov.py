@@ -7,13 +7,10 @@ exp(rate x t) where neighbours part for good. What only flies on grows like a po
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
-from ..plain import number, or_nan, plain
 from ..statistics import Estimate, Values, fit_line, mean
 
 FEWEST = 4  # horizons that a rate is fitted to
@@ -42,7 +39,7 @@ class GradientGrowth:
         """Whether gradients grow like an exponential: nearer to it than to a power, and beyond chance."""
         return bool(self.rate.low > 0 and self.misfit[0] < self.misfit[1])
 
-    def say(self) -> str:
+    def describe(self) -> str:
         """Say in a line how gradients grow."""
         if not math.isfinite(self.rate.value):
             return f"how gradients grow is not known: at {self.known} of {self.points} points they are at every horizon"
@@ -51,24 +48,6 @@ class GradientGrowth:
             return f"gradients grow like exp({self.rate.value:z.3g} t), t in s ({low:z.3g} to {high:z.3g}/s)"
         low, high = self.power.low, self.power.high
         return f"gradients grow like t^{self.power.value:z.2g} ({low:z.2g} to {high:z.2g}), not exponentially"
-
-    def record(self) -> dict[str, Any]:
-        """Return it as plain JSON."""
-        return {name: plain(value) for name, value in asdict(self).items()}
-
-    @classmethod
-    def of_record(cls, record: Mapping[str, Any]) -> GradientGrowth:
-        """Read it from plain JSON; raises TypeError and KeyError for what is none."""
-        first, second = (or_nan(one) for one in record["misfit"])
-        return cls(
-            Estimate.of_record(record["rate"]),
-            Estimate.of_record(record["power"]),
-            (first, second),
-            tuple(map(number, record["time"])),
-            tuple(map(or_nan, record["norm"])),
-            int(record["known"]),
-            int(record["points"]),
-        )
 
 
 def measure_growth(time: Values, norm: Values) -> GradientGrowth:

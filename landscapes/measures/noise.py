@@ -10,8 +10,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..objective import Objective, evaluate
-from ..plain import finite
-from .records import NoiseRecord
 
 
 @dataclass(frozen=True)
@@ -31,15 +29,6 @@ class Noise:
     def deviation(self) -> float:
         """The largest of the three [loss unit]."""
         return max(self.again, self.batch, self.rounding)
-
-    def record(self) -> NoiseRecord:
-        """Return it as plain JSON."""
-        return {
-            "again": finite(self.again),
-            "batch": finite(self.batch),
-            "rounding": finite(self.rounding),
-            "points": finite(self.points),
-        }
 
     def floor(self, samples: int) -> float:
         """Return how far apart noise alone should put the extremes of so many samples [loss unit].

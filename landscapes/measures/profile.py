@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -13,18 +13,18 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..capacity import Need
+from ..convert import NOT_JSON
 from ..identity import errors_of, plane_of
 from ..objective import Evaluation, Objective, ObjectiveWrapper, evaluate, in_box
-from ..statistics import EstimateRecord
+from ..statistics import Estimate
 from . import gradient_quality as gradients
 from .classify import Verdict, classify, thresholds
 from .discontinuities import Count, Jumps, find_jumps
+from .doubled_resolution import DoubledResolution, double_resolution, doubling_episodes
 from .lyapunov import GradientGrowth
 from .noise import Noise, noise
-from .records import ProfileRecord, UnresolvedRecord
 from .ruggedness import Ruggedness, ruggedness
-from .twice import Twice, at_twice, episodes_at_twice
-from .unresolved import find_unresolved, probes, say_share, stored_unresolved
+from .undersampled import Undersampled, find_undersampled, probes
 
 PRECISION = {"float32": 2.0**-23, "float64": 2.0**-52}  # relative, of an engine that computes in it
 NOISE_POINTS, REPEATS, PAIRS = 16, 4, 12
@@ -32,50 +32,80 @@ SECONDS, BYTES = (1.0, 4e-5), (80_000_000, 300)  # that a slice takes, and each 
 PAIRS_PER_POINT = 8  # steep pairs of samples that are looked into, for each point of a side of the subgrid
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
+class OutsideBounds:
+    """Count the evaluations that were `asked` for, and those `cut` as they lay outside the bounds."""
+
+    asked: int
+    cut: int
+
+
+@dataclass(frozen=True)
 class Profile:
     """Hold the measures of a slice: of its losses, of its noise, of its jumps and of its gradients at several scales.
 
-    `steps`, `samples` and `smooth` are what `gradients.ladder`, `of_samples` and `smoothed_slopes` return. `cut` of
-    `asked` evaluations would have been beyond the box of an objective that does not invite that, and were left out.
-    `unresolved` and `at_twice` say what its samples hide, None where that is not known; `errors` says how many of them
-    raised and what the first of them said.
+    `differences`, `differences_of_samples` and `smoothing` sum up `quality`, which is drawn. `beyond_the_box` counts
+    the probes that the objective does not allow. `undersampled` and `doubled` say what the samples hide, None where
+    that is not known; `errors` says how many of them raised and what the first of them said. `growth` is that of
+    gradients with the length of episodes, None where it was not measured.
     """
 
     losses: Ruggedness
     noise: Noise
     jumps: Jumps
-    steps: xr.Dataset
-    samples: xr.Dataset
-    smooth: xr.Dataset
+    differences: tuple[gradients.ScaleRow, ...]
+    differences_of_samples: tuple[gradients.ScaleRow, ...]
+    smoothing: tuple[gradients.WidthRow, ...]
     verdict: Verdict
-    asked: int
-    cut: int
-    unresolved: UnresolvedRecord | None = None
-    at_twice: Twice | None = None
-    errors: str = ""
+    thresholds: dict[str, float]
+    beyond_the_box: OutsideBounds
+    undersampled: Undersampled | None
+    doubled: DoubledResolution | None
+    errors: str
+    growth: GradientGrowth | None = None
+    quality: gradients.GradientQuality | None = field(default=None, metadata=NOT_JSON, compare=False, repr=False)
 
     @property
     def words(self) -> tuple[str, ...]:
         """The words for the landscape, in the order of `classify.WORDS`."""
         return self.verdict.words
 
-    def record(self) -> ProfileRecord:
-        """Return it as plain JSON."""
-        return {
-            "losses": self.losses.record(),
-            "noise": self.noise.record(),
-            "jumps": self.jumps.record(),
-            "differences": gradients.scale_table(self.steps),
-            "differences_of_samples": gradients.scale_table(self.samples),
-            "smoothing": gradients.width_table(self.smooth),
-            "verdict": {"words": list(self.verdict.words), "reasons": self.verdict.reasons},
-            "thresholds": thresholds(),
-            "beyond_the_box": {"asked": self.asked, "cut": self.cut},
-            "unresolved": self.unresolved,
-            "at_twice": self.at_twice.record() if self.at_twice else None,
-            "errors": self.errors,
+    @property
+    def measures(self) -> dict[str, str]:
+        """The chief numbers by short names, with 95 % intervals, as a page shows them."""
+        losses, jumps = self.losses, self.jumps
+        near = self.differences_of_samples[0]
+        lacking = losses.missing
+        fewest, most = losses.minima_halved
+        named = {
+            "Samples that failed": _percent(losses.failed / losses.samples) if losses.failed else "",
+            "Points that raised": self.errors,
+            "Gradients missing beside a loss": _shares(lacking) if lacking and lacking.value else "",
+            "Local minima above the noise": f"{losses.minima} ({fewest} to {most} at half the resolution)",
+            "Local minima deeper than 1 % of the range": str(losses.notable),
+            "Basin of the lowest sample": _percent(losses.lowest_basin),
+            "Noise floor": f"{losses.floor:.2g}",
+            "Gradient effectively zero": _shares(losses.flat),
+            "Samples level with their neighbours": _shares(losses.level),
+            "Neighbours with a jump between them": _shares(jumps.share),
+            "Jumps explained by an event": _shares(jumps.explained_by_events),
+            "Correlation length, of the box": ", ".join(map(_shares, losses.correlation_length)),
+            "Hölder exponent": _along_axes(losses.holder),
+            "Total variation, in ranges": _along_axes(losses.total_variation),
+            "Information content": _number(losses.information),
+            "Dispersion of the best 5 %": _number(losses.dispersion),
+            "Fitness-distance correlation": _number(losses.fitness_distance),
+            f"Cosine of gradient and difference over {near.scale:.1%} of the box": _number(near.cosine),
+            f"Gradients uphill over {near.scale:.1%} of the box": _shares(near.uphill),
+            "Undersampled cells": self.undersampled.format_share() if self.undersampled else "",
         }
+        if cut := self.beyond_the_box.cut:
+            named["Probes beyond the bounds, left out"] = f"{cut} of {self.beyond_the_box.asked}"
+        if self.growth:
+            named["Growth with the length of episodes"] = self.growth.describe()
+        for row in self.smoothing:
+            named[f"First order biased, smoothed over {row.width:.0%} of the box"] = _shares(row.biased)
+        return {name: text for name, text in named.items() if text}
 
 
 def effort(rank: int, points: int, shape: Sequence[int] = ()) -> tuple[int, int]:
@@ -88,7 +118,7 @@ def effort(rank: int, points: int, shape: Sequence[int] = ()) -> tuple[int, int]
     losses += places * rank * 2 * len(gradients.SCALES)
     slopes = places * (1 + 2 * PAIRS * len(gradients.WIDTHS))
     if shape:
-        anew = episodes_at_twice(shape)
+        anew = doubling_episodes(shape)
         losses, slopes = losses + probes(math.prod(shape), grad=True) + anew[0], slopes + anew[1]
     return losses, slopes
 
@@ -133,13 +163,23 @@ def measure_profile(
     smooth = gradients.smoothed_slopes(objective, plane, places, pairs=PAIRS, seed=seed)
     samples = gradients.compare_samples(dataset, deviation=deviation)
     cosine = samples["cosine"].isel(scale=0).to_numpy()
-    words = classify(found, jumps, cosine)
-    between = stored_unresolved(dataset)
-    if between is None and (looked := find_unresolved(objective, dataset, floor=floor, seed=seed)):
-        between = looked.record()
-    twice = at_twice(objective, dataset, found, jumps, cosine, deviation=deviation, seed=seed)
-    asked = objective.asked, objective.cut
-    return Profile(found, fuzz, jumps, steps, samples, smooth, words, *asked, between, twice, errors_of(dataset))
+    between = Undersampled.of(dataset) or find_undersampled(objective, dataset, floor=floor, seed=seed)
+    doubled = double_resolution(objective, dataset, found, jumps, cosine, deviation=deviation, seed=seed)
+    return Profile(
+        losses=found,
+        noise=fuzz,
+        jumps=jumps,
+        differences=gradients.scale_table(steps),
+        differences_of_samples=gradients.scale_table(samples),
+        smoothing=gradients.width_table(smooth),
+        verdict=classify(found, jumps, cosine),
+        thresholds=thresholds(),
+        beyond_the_box=OutsideBounds(objective.asked, objective.cut),
+        undersampled=between,
+        doubled=doubled,
+        errors=errors_of(dataset),
+        quality=gradients.GradientQuality(steps, samples, smooth),
+    )
 
 
 class _Within(ObjectiveWrapper):
@@ -157,64 +197,27 @@ class _Within(ObjectiveWrapper):
         return evaluate(self.objective, x, grad=grad)
 
 
-def named_measures(record: ProfileRecord) -> dict[str, str]:
-    """Return the chief numbers of a profile's `record`, by short names, as a page shows them."""
-    losses, jumps = record["losses"], record["jumps"]
-    near, smooth = record["differences_of_samples"][0], record["smoothing"]
-    fewest, most = losses["minima_halved"]
-    lacking = losses.get("missing")
-    named = {
-        "Samples that failed": _percent(losses["failed"] / losses["samples"]) if losses["failed"] else "",
-        "Points that raised": record.get("errors", ""),
-        "Gradients missing beside a loss": _shares(lacking) if lacking and lacking["value"] else "",
-        "Local minima above the noise": f"{losses['minima']} ({fewest} to {most} at half the resolution)",
-        "Local minima deeper than 1 % of the range": str(losses["notable"]),
-        "Basin of the lowest sample": _percent(losses["lowest_basin"]),
-        "Noise floor": f"{losses['floor']:.2g}",
-        "Gradient effectively zero": _shares(losses["flat"]),
-        "Samples level with their neighbours": _shares(losses["level"]),
-        "Neighbours with a jump between them": _shares(jumps["share"]),
-        "Jumps explained by an event": _shares(jumps["explained_by_events"]),
-        "Correlation length, of the box": ", ".join(map(_shares, losses["correlation_length"])),
-        "Hölder exponent": _along_axes(losses.get("holder", [])),
-        "Total variation, in ranges": _along_axes(losses["total_variation"]),
-        "Information content": _number(losses["information"]),
-        "Dispersion of the best 5 %": _number(losses["dispersion"]),
-        "Fitness-distance correlation": _number(losses["fitness_distance"]),
-        f"Cosine of gradient and difference over {near['scale']:.1%} of the box": _number(near["cosine"]),
-        f"Gradients uphill over {near['scale']:.1%} of the box": _shares(near["uphill"]),
-    }
-    if between := say_share(record.get("unresolved")):
-        named["Cells finer than the samples"] = between
-    if cut := record.get("beyond_the_box", {}).get("cut"):
-        named["Probes beyond the bounds, left out"] = f"{cut} of {record['beyond_the_box']['asked']}"
-    if grown := record.get("growth"):
-        named["Growth with the length of episodes"] = GradientGrowth.of_record(grown).say()
-    for row in smooth:
-        named[f"First order biased, smoothed over {row['width']:.0%} of the box"] = _shares(row["biased"])
-    return {name: text for name, text in named.items() if text}
-
-
-def _shares(estimate: EstimateRecord | None) -> str:
+def _shares(estimate: Estimate | None) -> str:
     return _with_interval(estimate, _percent)
 
 
-def _along_axes(values: Sequence[EstimateRecord | None]) -> str:
-    """Say a number for each axis, a dash where one is not known, nothing where none is."""
+def _along_axes(values: Sequence[Estimate]) -> str:
+    """Write a number for each axis, a dash where one is not known, nothing where none is."""
     said = list(map(_number, values))
     return ", ".join(one or "\N{EN DASH}" for one in said) if any(said) else ""
 
 
-def _number(estimate: EstimateRecord | None) -> str:
+def _number(estimate: Estimate) -> str:
     return _with_interval(estimate, lambda value: f"{value:z.2f}".replace("-", "\N{MINUS SIGN}"))
 
 
-def _with_interval(estimate: EstimateRecord | None, write: Callable[[float], str]) -> str:
-    if estimate is None or estimate["value"] is None:
+def _with_interval(estimate: Estimate | None, write: Callable[[float], str]) -> str:
+    if estimate is None or not math.isfinite(estimate.value):
         return ""
-    said, low, high = write(estimate["value"]), estimate["low"], estimate["high"]
-    return said if low is None or high is None or low == high else f"{said} ({write(low)} to {write(high)})"
+    said, low, high = write(estimate.value), estimate.low, estimate.high
+    known = math.isfinite(low) and math.isfinite(high) and low != high
+    return f"{said} ({write(low)} to {write(high)})" if known else said
 
 
-def _percent(share: float | None) -> str:
-    return "" if share is None else f"{100 * share:.1f} %"
+def _percent(share: float) -> str:
+    return f"{100 * share:.1f} %" if math.isfinite(share) else ""

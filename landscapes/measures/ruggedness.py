@@ -10,7 +10,6 @@ import math
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import cast
 
 import numpy as np
 import torch
@@ -20,9 +19,7 @@ from numpy.typing import NDArray
 from ..identity import plane_of
 from ..large import refuse_large
 from ..objective import Status
-from ..plain import plain
 from ..statistics import Estimate, Values, fit_line, jackknife, share
-from .records import LossesRecord
 
 FLAT_SLOPE = 1e-3  # a slope below it is effectively zero [ranges of the losses per side of the box]
 NOTABLE = 0.01  # the least depth of a notable minimum, as a fraction of the range
@@ -241,7 +238,7 @@ class Ruggedness:
     minima: int
     minima_halved: tuple[int, int]
     notable: int
-    curve: dict[float, int]
+    curve: dict[str, int]
     largest_basin: float
     lowest_basin: float
     zero: Estimate | None
@@ -256,10 +253,6 @@ class Ruggedness:
     turns: Estimate
     dispersion: Estimate
     fitness_distance: Estimate
-
-    def record(self) -> LossesRecord:
-        """Return it as plain JSON."""
-        return cast("LossesRecord", plain(vars(self)))
 
 
 def ruggedness(dataset: xr.Dataset, *, floor: float, estimate: Callable[..., Estimate] = jackknife) -> Ruggedness:
@@ -278,7 +271,7 @@ def ruggedness(dataset: xr.Dataset, *, floor: float, estimate: Callable[..., Est
         minima=found.count(floor),
         minima_halved=minima_of_halves(loss, floor),
         notable=len(notable),
-        curve={part: found.count(part * whole) for part in THRESHOLDS},
+        curve={f"{part:g}": found.count(part * whole) for part in THRESHOLDS},
         largest_basin=float(shares.max()),
         lowest_basin=float(shares[0]),
         zero=None if slopes is None else estimate(_mean, _below(slopes, 0.0), least=0.0, most=1.0),

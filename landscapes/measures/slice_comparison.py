@@ -5,14 +5,24 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import torch
 import xarray as xr
 from numpy.typing import NDArray
 
-from ..identity import differing_settings, plane_of, simulator_parts, stored_identity, stored_provenance, stored_scales
+from ..convert import NOT_JSON
+from ..identity import (
+    ABSENT,
+    differing_settings,
+    plane_of,
+    simulator_parts,
+    stored_identity,
+    stored_provenance,
+    stored_scales,
+)
 from ..large import refuse_large
 from ..lattice import sampled_lattice
 from ..objective import Status
@@ -20,9 +30,11 @@ from ..space import scaled_labels
 from ..statistics import Estimate, jackknife
 from .fidelity import gradient_error, median_of, p95_of, spearman
 from .ruggedness import box_slopes, span
-from .slice_comparison_record import LossDifference, Parting, SliceComparison, SlopeDifference, StatusPair, exactly
 
 if TYPE_CHECKING:
+    import pandas as pd
+
+    from ..draw.figure import Picture
     from ..plane import Plane
 
 Values = NDArray[np.float64]
@@ -30,6 +42,144 @@ PLACING = ("plane", "cut", "boxed", "parameters")  # in a slice's identity: wher
 PARTS = {"basis": "directions", "lower": "lower ends", "upper": "upper ends", "origin": "points they go through"}
 ROUNDING = 1e-9  # planes that are no farther apart, relatively, are the same
 ANYTHING = "give the name of an environment as B, which is then sampled on A's plane"
+POINTS, RANGE = "of the points", "of A's range"  # what shares are of
+
+
+@dataclass(frozen=True)
+class LossDifference:
+    """Hold how far losses are apart [loss unit]: `median`, 95th percentile, `largest`; and the `range` of A's losses.
+
+    Nothing is estimated by the largest, which has no interval.
+    """
+
+    derived: ClassVar = ("shares",)
+
+    median: Estimate
+    p95: Estimate
+    largest: Estimate
+    range: float
+
+    @property
+    def shares(self) -> dict[str, Estimate]:
+        """Return the three as shares of the range, NaN where A's losses are all the same."""
+        whole = self.range or math.nan
+        return {name: _share(getattr(self, name), whole) for name in ("median", "p95", "largest")}
+
+
+@dataclass(frozen=True)
+class SlopeDifference:
+    """Hold how gradients differ along the plane, whose sides count as 1: two that are exactly zero agree.
+
+    Medians of `cosine` and of `ratio`, B's length to A's; `opposing` is the share of points with a cosine below 0.
+    """
+
+    cosine: Estimate
+    opposing: Estimate
+    ratio: Estimate
+
+
+@dataclass(frozen=True)
+class Parting:
+    """Say where losses are farthest apart: coordinates by the labels of the plane's axes, and both losses there."""
+
+    place: dict[str, float]
+    a: float
+    b: float
+
+
+@dataclass(frozen=True)
+class StatusPair:
+    """Count the points that ended in one way in A and in another in B."""
+
+    a: str
+    b: str
+    points: int
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class SliceComparison:
+    """Hold B against A, two slices of one plane; `a` and `b` name what they are of.
+
+    Of `points`, `compared` have a loss in both; `statuses` counts those that ended differently. `slopes` and `cosine`
+    are None where either has no gradients, `parting` where no point is compared. `differing` has both values of every
+    setting that is not the same, by its name. `data` are the samples: of refined slices the finest lattice that both
+    sampled. Over them, NaN where either has none: `difference`, B's losses less A's [loss unit], and `cosine`, that of
+    the angle between gradients along the plane.
+    """
+
+    a: str
+    b: str
+    loss_unit: str
+    points: int
+    compared: int
+    statuses: tuple[StatusPair, ...]
+    loss: LossDifference
+    spearman: Estimate
+    slopes: SlopeDifference | None
+    parting: Parting | None
+    differing: dict[str, tuple[str, str]]
+    data: tuple[xr.Dataset, xr.Dataset] = field(metadata=NOT_JSON)
+    difference: xr.DataArray = field(metadata=NOT_JSON)
+    cosine: xr.DataArray | None = field(metadata=NOT_JSON)
+    command: str
+
+    @property
+    def shared(self) -> dict[str, tuple[str, str]]:
+        """Those of the settings that differ which both slices have."""
+        return {name: values for name, values in self.differing.items() if ABSENT not in values}
+
+    def settings(self) -> list[str]:
+        """Return a line for each setting that differs, and one for those that only one of the two has."""
+        said = [f"{name}: {a} in A, {b} in B" for name, (a, b) in self.shared.items()]
+        for side, letter in enumerate("AB"):
+            if alone := [name for name, values in self.differing.items() if values[1 - side] == ABSENT]:
+                said.append(f"only {letter} has {', '.join(alone)}")
+        return said
+
+    def table(self) -> pd.DataFrame:
+        """Return a row for each number, indexed by `measure`: its `value`, its interval `low` to `high`, its `unit`.
+
+        The unit of a share is what it is a share of.
+        """
+        import pandas as pd
+
+        rows = [(name, one.value, one.low, one.high, unit) for name, one, unit in self._numbers()]
+        return pd.DataFrame(rows, columns=["measure", "value", "low", "high", "unit"]).set_index("measure")
+
+    def _numbers(self) -> list[tuple[str, Estimate, str]]:
+        """Return each number with its name and unit."""
+        names = {
+            "median": "median difference",
+            "p95": "difference, 95 % of the points",
+            "largest": "largest difference",
+        }
+        rows = [("loss in both", exactly(self.compared / self.points), POINTS)]
+        rows += [(name, getattr(self.loss, field), self.loss_unit) for field, name in names.items()]
+        shares = self.loss.shares
+        rows += [(f"{name}, relative", shares[field], RANGE) for field, name in names.items()]
+        rows += [("rank correlation", self.spearman, "")]
+        if self.slopes:
+            rows += [("cosine of gradients, median", self.slopes.cosine, "")]
+            rows += [("opposing gradients", self.slopes.opposing, POINTS)]
+            rows += [("length of gradients, B to A, median", self.slopes.ratio, "")]
+        return rows
+
+    def plot(self, width: float | None = None) -> Picture:
+        """Draw both losses on one scale, their difference, and the cosine of gradients.
+
+        The picture is matplotlib's figure; `width` is that of a page [mm], and none that of a screen.
+        """
+        from ..draw.figure import figure_of
+
+        return figure_of(self, width)
+
+    def __repr__(self) -> str:
+        """Return in a line what is compared and what came out."""
+        return f"<SliceComparison of {self.a} and {self.b}: rank correlation {self.spearman.value:.3g}>"
+
+    def _repr_html_(self) -> str:
+        """Show the table in a notebook."""
+        return str(self.table().to_html())
 
 
 def compare_slices(a: xr.Dataset, b: xr.Dataset, *, command: str = "") -> SliceComparison:
@@ -94,10 +244,10 @@ def check_planes(ours: Plane, theirs: Plane) -> None:
     if ours.resolution != theirs.resolution:
         sizes = (" x ".join(map(str, one.resolution)) for one in (ours, theirs))
         raise ValueError("slices to compare have the same points; A has {} and B {}; ".format(*sizes) + ANYTHING)
-    for field, said in PARTS.items():
-        one, other = getattr(ours, field), getattr(theirs, field)
+    for name, said in PARTS.items():
+        one, other = getattr(ours, name), getattr(theirs, name)
         if not torch.allclose(one, other, rtol=ROUNDING, atol=ROUNDING * float(one.abs().max())):
-            values = _name_axes(ours, theirs) if field == "basis" else _where_apart(one, other)
+            values = _name_axes(ours, theirs) if name == "basis" else _where_apart(one, other)
             raise ValueError(f"slices to compare lie on one plane; the {said} differ: {values}; {ANYTHING}")
 
 
@@ -217,3 +367,12 @@ def _over_blocks(
         return float(statistic(*(one.ravel()[rows] for one in fields))) if len(rows) else math.nan
 
     return jackknife(of, numbers, least=least, most=most)
+
+
+def exactly(value: float) -> Estimate:
+    """Return a number that is of these samples, and estimates nothing."""
+    return Estimate(value, math.nan, math.nan)
+
+
+def _share(estimate: Estimate, whole: float) -> Estimate:
+    return Estimate(estimate.value / whole, estimate.low / whole, estimate.high / whole)

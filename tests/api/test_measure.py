@@ -7,6 +7,7 @@ import torch
 
 import gradscape as gs
 from gradscape.landscapes import cost
+from gradscape.landscapes.convert import to_json
 from gradscape.landscapes.measures import fidelity
 from gradscape.landscapes.storage.records import read_json
 
@@ -26,9 +27,9 @@ def test_a_slice_and_its_folder_have_the_same_report_which_is_read_again(tmp_pat
     cut = gs.slice("branin", (0, 1), resolution=24, out=tmp_path / "cut")
     told = gs.report(cut, points_per_axis=2, out=tmp_path / "told")
     assert told.words == ("smooth with local minima", "gradients good")
-    assert told.profile["losses"]["notable"] == 3  # Branin's minima
+    assert told.profile.losses.notable == 3  # Branin's minima
     assert told.table().loc["Local minima deeper than 1 % of the range", "value"] == "3"
-    assert told.record() == read_json(tmp_path / "told/report.json")
+    assert to_json(told) == read_json(tmp_path / "told/report.json")
     assert told.plot()._repr_png_().startswith(b"\x89PNG")
     assert "smooth with local minima" in told._repr_html_()
     before = (tmp_path / "told/report.json").stat().st_mtime_ns
@@ -38,7 +39,7 @@ def test_a_slice_and_its_folder_have_the_same_report_which_is_read_again(tmp_pat
 
 def test_a_scene_without_a_slice_is_sampled_for_its_report() -> None:
     told = gs.report("beale", points_per_axis=2)
-    assert (told.env, told.key["points"]) == ("beale", 2)
+    assert (told.env, told.key.points) == ("beale", 2)
     assert told.store is not None
     assert gs.open_slice(told.store.parent).plane.resolution == (24, 24)
 

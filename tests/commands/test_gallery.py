@@ -22,7 +22,7 @@ from gradscape.gallery.figures import Figure
 from gradscape.gallery.paper import PaperCaption
 from gradscape.jobs.slice import SliceCost, SliceJob
 from gradscape.landscapes.identity import stored_identity
-from gradscape.landscapes.measures.unresolved import probes
+from gradscape.landscapes.measures.undersampled import probes
 from gradscape.landscapes.storage.store import open_slice
 from gradscape.landscapes.verification import POINTS
 

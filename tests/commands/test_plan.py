@@ -5,10 +5,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from gradscape.landscapes.measures.unresolved import probes
 
 import gradscape as gs
 from gradscape.jobs import plan as module
-from gradscape.landscapes.measures.unresolved import probes
 
 from ..command import Said
 

@@ -11,6 +11,7 @@ import gradscape as gs
 from gradscape.gallery.site.page_data import count_numbers
 from gradscape.jobs.slice import SliceJob
 from gradscape.jobs.watch import Stopped, Watch
+from gradscape.landscapes.convert import to_json
 from gradscape.landscapes.draw.figures.contour import landscape_figure
 from gradscape.landscapes.draw.figures.profile import profile_figure
 from gradscape.landscapes.draw.figures.thumbnail import thumbnail_figure
@@ -38,8 +39,8 @@ def test_a_refined_slice_says_what_was_sampled_and_is_there_the_second_time(run:
     assert f"{said['episodes']} of 1089 points sampled" in first.stderr
     again = json.loads(run(*REFINED.split(), "made", cwd=tmp_path).stdout)
     assert (again["episodes"], again["resumed"]) == (0, said["episodes"])
-    assert {name: again[name] for name in ("status", "loss", "unresolved")} == {
-        name: said[name] for name in ("status", "loss", "unresolved")
+    assert {name: again[name] for name in ("status", "loss", "undersampled")} == {
+        name: said[name] for name in ("status", "loss", "undersampled")
     }
     other = run(*REFINED.replace("5%", "4%").split(), "made", cwd=tmp_path)
     assert other.returncode == 2
@@ -148,19 +149,19 @@ def test_pictures_draw_each_sample_as_large_as_what_it_stands_for(tmp_path: Path
 def test_a_slice_says_at_its_foot_and_on_its_page_what_it_hides(tmp_path: Path) -> None:
     cut = gs.slice("pinball-2", (0, 1), resolution=12, fidelity="draft", device="cpu", out=tmp_path / "cut")
     numbers = count_numbers(cut.data)
-    assert numbers.unresolved is not None
-    assert (numbers.unresolved["value"] or 0) > 0.1
-    said = f"finer than the samples: {100 * (numbers.unresolved['value'] or 0):.0f} % of cells ("
+    assert numbers.undersampled is not None
+    assert (numbers.undersampled["value"] or 0) > 0.1
+    said = f"undersampled cells: {100 * (numbers.undersampled['value'] or 0):.0f} % ("
     assert said in foot(landscape_figure(cut.data))
     older = cut.data.drop_attrs(deep=False).assign_attrs(
         {name: value for name, value in cut.data.attrs.items() if name != "unresolved"}
     )
-    assert "finer" not in foot(landscape_figure(older))
-    assert count_numbers(older).unresolved is None
-    assert cut.report(points=2).record()["unresolved"] == json.loads(cut.data.attrs["unresolved"])
-    looked = gs.Slice(older, None, cut.remake).report(points=2).record()["unresolved"]
+    assert "undersampled" not in foot(landscape_figure(older))
+    assert count_numbers(older).undersampled is None
+    assert to_json(cut.report(points=2).undersampled) == json.loads(cut.data.attrs["unresolved"])
+    looked = gs.Slice(older, None, cut.remake).report(points=2).undersampled
     assert looked is not None
-    assert (looked["share"]["value"] or 0) > 0.1
+    assert looked.share.value > 0.1
 
 
 def test_runs_lie_over_what_the_picture_of_a_refined_slice_shows(tmp_path: Path) -> None:

@@ -4,15 +4,21 @@ import json
 import re
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from gradscape.envs.functions import Function
+from gradscape.gallery.files import DATA
 from gradscape.gallery.paper import read_paper
 from gradscape.jobs import report as job
-from gradscape.jobs.report import Report, environments_markdown
+from gradscape.jobs.report import PaperWords, Report, environments_markdown
+from gradscape.landscapes.convert import from_json
+from gradscape.landscapes.measures.classify import Verdict
+from gradscape.landscapes.measures.gradient_quality import ScaleRow
+from gradscape.landscapes.measures.slice_comparison import exactly
 from gradscape.landscapes.storage.records import read_json, write_record
 
 from ..command import Said, make
@@ -37,9 +43,9 @@ def test_a_slice_is_reported_in_numbers_and_words(run: Run, cut: Path, tmp_path:
     assert done.returncode == 0, done.stderr
     record = json.loads(done.stdout)
     assert record == {**read_json(tmp_path / "told/report.json"), "folder": "told"}
-    assert record["losses"]["notable"] == 3  # Branin's minima
-    assert record["verdict"]["words"] == ["smooth with local minima", "gradients good"]
-    assert record["noise"]["again"] == record["noise"]["batch"] == 0
+    assert record["profile"]["losses"]["notable"] == 3  # Branin's minima
+    assert record["profile"]["verdict"]["words"] == ["smooth with local minima", "gradients good"]
+    assert record["profile"]["noise"]["again"] == record["profile"]["noise"]["batch"] == 0
     assert record["paper"] is None
     assert "with gradients: about" in done.stderr
     assert re.search(r"s, and 1\.0 s to measure 576 samples; [\d.]+ [MG]B of memory\n", done.stderr)
@@ -83,7 +89,7 @@ def test_all_makes_a_table_with_the_papers_words(run: Run, tmp_path: Path) -> No
     assert "all/bounce-x is there already" in again.stderr
     assert (tmp_path / "all/pinball-2-0-1/report.json").exists()
     assert "pinball-2-0-1" in again.stdout
-    measured = environments_markdown([Report.of_record(record) for record in summary["reports"]]).splitlines()
+    measured = environments_markdown([from_json(Report, record) for record in summary["reports"]]).splitlines()
     assert len({line.count("|") for line in measured}) == 1
     assert measured[3].startswith("| `pinball-2` | 1 |")
 
@@ -139,23 +145,22 @@ def test_a_report_beside_its_slice_is_copied_unless_it_is_another(run: Run, cut:
 
 
 def test_a_row_of_an_environment_spans_its_slices_and_says_whether_the_paper_agrees() -> None:
-    def report(notable: int, cosine: float, words: list[str]) -> Report:
-        def scale(points: int, value: float) -> dict[str, Any]:
-            return {"points": points, "cosine": {"value": value}}
+    known = Report.read(DATA / "fluid-0-1")
 
-        own = dict.fromkeys(("name", "options", "fidelity", "device", "seconds", "command"))
-        record = {
-            **own,
-            "key": {},
-            "env": "fluid",
-            "losses": {"notable": notable, "flat": {"value": notable / 100}},
-            "jumps": {"share": {"value": None}},
-            "differences": [scale(3, -1.0), scale(20, cosine), scale(36, 0.0)],  # the first: few show any slope
-            "differences_of_samples": [scale(30, cosine / 2)],
-            "verdict": {"words": words},
-            "paper": {"words": [{"word": word, "measured": word in words} for word in ("rugged", "gradients good")]},
-        }
-        return Report.of_record(record)
+    def report(notable: int, cosine: float, words: list[str]) -> Report:
+        def scale(points: int, value: float) -> ScaleRow:
+            return replace(known.profile.differences[0], points=points, cosine=exactly(value))
+
+        profile = replace(
+            known.profile,
+            losses=replace(known.profile.losses, notable=notable, flat=exactly(notable / 100)),
+            jumps=replace(known.profile.jumps, found=(), steep=3, neighbours=0),
+            differences=(scale(3, -1.0), scale(20, cosine), scale(36, 0.0)),  # the first: few show any slope
+            differences_of_samples=(scale(30, cosine / 2),),
+            verdict=Verdict(dict.fromkeys(words, "")),
+        )
+        paper = PaperWords(profile.verdict.compare_words(("rugged", "gradients good")), "")
+        return replace(known, profile=profile, paper=paper)
 
     two = [report(2, 0.5, ["rugged"]), report(12, -0.25, ["rugged", "gradients good"])]
     row = environments_markdown(two).splitlines()[2]
@@ -226,5 +231,5 @@ def test_a_function_whose_box_is_its_own_is_asked_beyond_it(
     assert done.returncode == 0, done.stderr
     report = run("report", "cut", "--out", "told", "--json", cwd=tmp_path)
     assert report.returncode == 0, report.stderr
-    beyond = json.loads(report.stdout)["beyond_the_box"]
+    beyond = json.loads(report.stdout)["profile"]["beyond_the_box"]
     assert beyond["cut"] == 0 < beyond["asked"]

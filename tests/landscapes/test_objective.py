@@ -8,7 +8,7 @@ from gradscape import Evaluation, ParameterSpace, Plane, Status, from_numpy, sam
 from gradscape.landscapes.conformance.suite import check
 from gradscape.landscapes.measures.fidelity import measure
 from gradscape.landscapes.measures.gradient_quality import compare_differences, subgrid
-from gradscape.landscapes.measures.profile import measure_profile, named_measures
+from gradscape.landscapes.measures.profile import OutsideBounds, measure_profile
 from gradscape.landscapes.measures.sensitivity import Design, explore
 from gradscape.landscapes.objective import BoxedObjective, Objective, evaluate, failed, has_loss
 from gradscape.landscapes.storage.checkpoint import Checkpoint
@@ -66,16 +66,18 @@ def test_a_report_leaves_out_what_it_may_not_ask_for_and_says_how_much(dims):
     strict, free = (
         measure_profile(one, sample(one, plane(*dims)), rounding=1e-16, points=8) for one in (Strict(), Inviting())
     )
-    assert 0 < strict.cut < strict.asked / 10
-    assert strict.asked == free.asked
-    said = f"{strict.cut} of {strict.asked}"
-    assert named_measures(strict.record())["Probes beyond the bounds, left out"] == said
-    assert free.cut == 0
-    assert "Probes beyond the bounds, left out" not in named_measures(free.record())
+    probes = strict.beyond_the_box
+    assert 0 < probes.cut < probes.asked / 10
+    assert free.beyond_the_box == OutsideBounds(probes.asked, 0)
+    said = f"{probes.cut} of {probes.asked}"
+    assert strict.measures["Probes beyond the bounds, left out"] == said
+    assert "Probes beyond the bounds, left out" not in free.measures
     assert strict.verdict.words == free.verdict.words
-    known = np.isfinite(strict.smooth["first"])
+    known = np.isfinite(strict.quality.smooth["first"])
     assert float(known.mean()) > 0.9
-    np.testing.assert_allclose(strict.smooth["first"].where(known), free.smooth["first"].where(known), atol=1.0)
+    np.testing.assert_allclose(
+        strict.quality.smooth["first"].where(known), free.quality.smooth["first"].where(known), atol=1.0
+    )
 
 
 def test_differences_over_long_steps_are_there_where_both_ends_are():

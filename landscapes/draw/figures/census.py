@@ -15,7 +15,7 @@ from .. import style
 from . import page, panel
 
 if TYPE_CHECKING:
-    from ...measures.census_record import Census
+    from ...measures.census import Census
 
 PITCH, ACROSS = 8.0, 8  # room on a screen [inch]; slices side by side
 FOOT = 4  # words that the legend has, the most frequent first

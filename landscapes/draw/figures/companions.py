@@ -20,7 +20,7 @@ TALL = 1.05  # height of a row of panels, in that of their room
 
 
 @dataclass(frozen=True, eq=False)
-class Cut:
+class CompanionSlice:
     """The losses of a cut through a named point, of shape (v, u), or (u) of a line; NaN where an episode failed."""
 
     through: str
@@ -43,7 +43,9 @@ def spoken(through: str) -> str:
     return f"the example {name}" if kind == "example" else f"random point {name}" if kind == "random" else through
 
 
-def companions_figure(cuts: Sequence[Cut], dataset: xr.Dataset, *, width: float | None = None) -> page.Picture:
+def companions_figure(
+    cuts: Sequence[CompanionSlice], dataset: xr.Dataset, *, width: float | None = None
+) -> page.Picture:
     """Draw cuts side by side on one scale; the first is the slice `dataset` itself, whose axes all have.
 
     What failed is grey. Raises ValueError where the page is too narrow or too wide.
@@ -68,7 +70,7 @@ def companions_figure(cuts: Sequence[Cut], dataset: xr.Dataset, *, width: float 
     return picture
 
 
-def _draw(ax: Axes, cut: Cut, dataset: xr.Dataset, scale: style.Scale) -> None:
+def _draw(ax: Axes, cut: CompanionSlice, dataset: xr.Dataset, scale: style.Scale) -> None:
     plane = plane_of(dataset)
     ax.set_box_aspect(1)
     ends = [(float(low), float(high)) for low, high in zip(plane.lower, plane.upper, strict=True)]

@@ -19,7 +19,7 @@ from .. import style
 from . import contour, page, panel
 
 if TYPE_CHECKING:
-    from ...measures.slice_comparison_record import SliceComparison
+    from ...measures.slice_comparison import SliceComparison
     from ...statistics import Estimate
 
 PITCH, LEAST = 4.8, 40.0  # room of a panel: on a screen [inch], and at least in print [mm]
@@ -170,7 +170,7 @@ def _say(found: SliceComparison) -> list[Patch]:
     """Return legend entries without a sign: the chief numbers, and the settings that differ."""
     if not found.compared:
         return [Patch(visible=False, label="no point has a loss in both")]
-    percent = style.number(100 * found.loss.shares()["median"].value, ".2g")
+    percent = style.number(100 * found.loss.shares["median"].value, ".2g")
     unit = f" {found.loss_unit}" if found.loss_unit else ""
     said = [f"median difference: {style.number(found.loss.median.value)}{unit}, {percent} % of A's range"]
     said.append(f"rank correlation: {_interval(found.spearman)}")

@@ -54,7 +54,7 @@ def landscape_figure(dataset: xr.Dataset, *, width: float | None = None) -> page
         frame(ax, dataset, plane)
         panel.name_outer(ax, *plane.labels)
     page.head(picture, axes[0], dataset)
-    page.finish(picture, [*entries, *page.failure_key(dataset), *page.unresolved_key(dataset)])
+    page.finish(picture, [*entries, *page.failure_key(dataset), *page.sampling_key(dataset)])
     return picture
 
 

@@ -18,7 +18,7 @@ from scipy.ndimage import binary_dilation
 
 from ...storage.files import replacing
 from .. import style
-from .page import Picture
+from ..figure import Picture
 
 Colours = NDArray[np.float64]
 

@@ -56,7 +56,7 @@ def overlay_figure(dataset: xr.Dataset, runs: Runs, *, width: float | None = Non
     page.head(picture, over, dataset, f"{page.title(dataset)} · {_describe_runs(runs)}")
     entries = [*_run_entries(sheet, runs), *_order_entries(sheet, runs), *_kind_entries(sheet, runs)]
     entries += [*_distance_entries(sheet, runs, reach), *_count_entries(sheet, runs)]
-    keys = [*page.failure_key(dataset), *page.unresolved_key(dataset)]
+    keys = [*page.failure_key(dataset), *page.sampling_key(dataset)]
     page.finish(picture, [*entries, *keys], heading=HEADING)
     _number_improvements(over, runs, plane)
     return picture

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -13,19 +12,18 @@ import xarray as xr
 from matplotlib import rc_context
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties
 from matplotlib.patches import Patch
-from matplotlib.text import Text
 
 from ...identity import PACKAGE, VERSIONS, simulator_parts, stored_identity, stored_provenance
 from ...lattice import with_gradients
-from ...measures.unresolved import say_unresolved, stored_unresolved
+from ...measures.undersampled import Undersampled
 from ...objective import Status
 from ...sampling.refine import Refined
 from ...storage.files import print_width, replacing, visible_files
 from .. import style
+from ..figure import Picture as Picture
 from .typesetting import MARGIN, settle, title_room, wrap_text
 
 HANDLE = 4.5  # room of a legend's sign, in the height of its type
@@ -34,27 +32,6 @@ HANDLE = 4.5  # room of a legend's sign, in the height of its type
 EMBEDDED: Any = {"pdf.fonttype": 42, "svg.fonttype": "path", "svg.hashsalt": "gradscape"}
 DATED: dict[str, dict[str, Any]] = {"png": {}, "pdf": {"CreationDate": None}, "svg": {"Date": None}}
 _settings = threading.Lock()  # matplotlib's, which are of the whole process
-
-
-class Picture(Figure):
-    """A figure that knows its sheet, draws without a window or any global state, and shows in a notebook.
-
-    `settle` lays it out, once. It has no layout engine: `savefig` draws a figure that has one twice.
-    """
-
-    def __init__(self, sheet: style.Sheet, height: float) -> None:
-        super().__init__(figsize=(sheet.width, height), layout="none")  # type: ignore[arg-type] # missing in its stub
-        self.sheet = sheet
-        self.fitted: dict[
-            Text, tuple[str, Callable[[], float]]
-        ] = {}  # what is wrapped to how much room there is [inch]
-        FigureCanvasAgg(self)
-
-    def _repr_png_(self) -> bytes:
-        """Return the picture as a notebook shows it."""
-        with io.BytesIO() as raw:
-            self.savefig(raw, format="png", dpi=style.DPI)
-            return raw.getvalue()
 
 
 def head(picture: Picture, ax: Axes, dataset: xr.Dataset, name: str | None = None) -> None:
@@ -149,15 +126,16 @@ def gradient_key(dataset: xr.Dataset) -> list[Patch]:
     return [Patch(**style.NO_GRADIENT_LOOK, label=label)] if lacking else []
 
 
-def unresolved_key(dataset: xr.Dataset) -> list[Patch]:
-    """Return legend entries of how exact a refined slice is, and how much is finer than the samples, where known."""
+def sampling_key(dataset: xr.Dataset) -> list[Patch]:
+    """Return legend entries of how exact a refined slice is, and which share of its cells is undersampled."""
     refined = Refined.of(dataset)
     exact = (
         f"interpolated points: 95 % within {100 * refined.error:.2g} % of the range"
         if refined and refined.error is not None
         else ""
     )
-    lines = [exact, say_unresolved(stored_unresolved(dataset))]
+    between = Undersampled.of(dataset)
+    lines = [exact, between.describe() if between else ""]
     return [Patch(facecolor="none", edgecolor="none", label=said) for said in lines if said]
 
 

@@ -16,7 +16,8 @@ from ...plane import Plane
 from ...space import LOG10
 from .. import style
 from ..decades import mark_decades
-from .page import Picture, picture_of, sheet_of, write_over
+from ..figure import Picture
+from .page import picture_of, sheet_of, write_over
 from .typesetting import side_room, title_room
 
 NARROW = 1.8  # room of a panel that has fewer ticks [inch]

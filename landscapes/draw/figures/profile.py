@@ -59,7 +59,7 @@ def profile_figure(
     panel.name_axes(panels[-1], plane.labels[0])
     picture.align_ylabels(panels)
     page.head(picture, [*strips, *panels][0], whole)
-    page.finish(picture, [*entries, *page.failure_key(whole), *page.unresolved_key(whole)])
+    page.finish(picture, [*entries, *page.failure_key(whole), *page.sampling_key(whole)])
     return picture
 
 

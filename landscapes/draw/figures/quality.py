@@ -17,7 +17,7 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 from ...identity import gradient_stride, plane_of, stored_identity
 from ...lattice import with_gradients
-from ...measures.gradient_quality import disagreement, find_bias, scale_table
+from ...measures.gradient_quality import GradientQuality, disagreement, find_bias, scale_table
 from ...measures.ruggedness import box_slopes
 from .. import style
 from . import contour, page, panel
@@ -28,18 +28,15 @@ FLAT = 0.3  # height of the line's panel, against its width
 LINE, SCALES, ORDERS = "line", "scales", ("narrow", "wide")
 
 
-def quality_figure(
-    dataset: xr.Dataset, steps: xr.Dataset, samples: xr.Dataset, smooth: xr.Dataset, *, width: float | None = None
-) -> page.Picture:
+def quality_figure(dataset: xr.Dataset, quality: GradientQuality, *, width: float | None = None) -> page.Picture:
     """Draw gradient quality: first over the slice's own samples, then by scale and under smoothing.
 
-    `steps` is of `gradients.ladder`, `samples` of `gradients.of_samples` and `smooth` of `gradients.smoothed_slopes`.
     Panels that show the same by the same colours share a colour bar, beside the last of them. Six panels one below the
     other would be higher than a printed page: on a narrow one they are in pairs.
 
     Raises ValueError where the page is too narrow or too wide.
     """
-    plane = plane_of(dataset)
+    plane, samples = plane_of(dataset), quality.samples
     sheet = style.Sheet.of(width, pitch=PITCH, columns=3, least=LEAST)
     maps = [str(number) for number in range(samples.sizes["scale"])] if plane.rank == 2 else []
     rows = _rows([*maps, SCALES, *ORDERS], sheet.columns)
@@ -51,10 +48,10 @@ def quality_figure(
     entries = _slope_lines(axes[LINE], dataset) if plane.rank == 1 else []
     for number, name in enumerate(maps):
         _cosine_map(axes[name], dataset, samples.isel(scale=number), last=name == maps[-1])
-    entries += _scales(axes[SCALES], steps, samples)
+    entries += _scales(axes[SCALES], quality.steps, samples)
     for number, name in enumerate(ORDERS):
         draw = _disagreement_map if plane.rank == 2 else _two_orders
-        entries += draw(axes[name], dataset, smooth, number)
+        entries += draw(axes[name], dataset, quality.smooth, number)
     for kind in (maps, ORDERS):
         _share_names(axes, rows, kind)
     page.entitle(picture, f"{page.title(dataset)}: gradient quality")
@@ -125,12 +122,12 @@ def _scales(ax: Axes, steps: xr.Dataset, samples: xr.Dataset) -> list[Artist]:
     """Draw mean cosine and share of uphill gradients over the scale of the difference."""
     sheet, entries = page.sheet_of(ax), list[Artist]()
     for found, filled in ((steps, True), (samples, False)):
-        rows = [row for row in scale_table(found) if row["points"]]
-        scale = [row["scale"] for row in rows]
+        rows = [row for row in scale_table(found) if row.points]
+        scale = [row.scale for row in rows]
         for name, colour, label in (("cosine", style.LOSS_LINE, "mean cosine"), ("uphill", style.SLOPE_LINE, "uphill")):
-            estimates = [row["cosine"] if name == "cosine" else row["uphill"] for row in rows]
-            value = np.array([one["value"] for one in estimates], dtype=float)
-            ends = np.array([(one["low"], one["high"]) for one in estimates], dtype=float).reshape(-1, 2)
+            estimates = [row.cosine if name == "cosine" else row.uphill for row in rows]
+            value = np.array([one.value for one in estimates], dtype=float)
+            ends = np.array([(one.low, one.high) for one in estimates], dtype=float).reshape(-1, 2)
             reach = np.abs(np.nan_to_num(ends - value[:, None])).T
             look = sheet.look({"linewidth": 1.1, "markersize": 4.5, "markeredgewidth": 1.0, "capsize": 2.0})
             look |= {"color": colour, "marker": "o" if name == "cosine" else "v"}

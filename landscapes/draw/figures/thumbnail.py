@@ -8,7 +8,7 @@ import xarray as xr
 from ...identity import plane_of
 from ...lattice import own_cells, sampled_line
 from .. import style
-from .page import Picture
+from ..figure import Picture
 
 WIDTH, SHAPE = 2.4, 0.75  # of the page [inch]; its height, against its width
 

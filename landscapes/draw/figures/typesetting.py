@@ -18,7 +18,7 @@ from matplotlib.textpath import text_to_path
 from .. import style
 
 if TYPE_CHECKING:
-    from .page import Picture
+    from ..figure import Picture
 
 MARGIN = 0.1  # between type and the edge of the page [inch]
 HINTED = 1.06  # small type whose letters are moved to whole pixels is up to so much wider

@@ -3,6 +3,7 @@
 import json
 import subprocess
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,15 +12,19 @@ import pytest
 import torch
 
 from gradscape.gallery.figures import Figure
-from gradscape.gallery.files import RUN_SUFFIX, RUNS, LeagueFiles, LeagueSliceFiles
+from gradscape.gallery.files import DATA, RUN_SUFFIX, RUNS, LeagueFiles, LeagueSliceFiles
 from gradscape.gallery.paper import PaperCaption
 from gradscape.gallery.runs import save_run
 from gradscape.gallery.site.build import build_site
+from gradscape.jobs.report import PaperWords, Report
 from gradscape.landscapes.convert import to_json
+from gradscape.landscapes.measures.classify import Verdict
+from gradscape.landscapes.measures.gradient_quality import ScaleRow
 from gradscape.landscapes.objective import Evaluation, Objective
 from gradscape.landscapes.plane import Plane
 from gradscape.landscapes.sampling.fill import sample
 from gradscape.landscapes.space import ParameterSpace
+from gradscape.landscapes.statistics import Estimate
 from gradscape.landscapes.storage.records import write_record
 from gradscape.landscapes.storage.store import SliceStore
 from gradscape.optim.league import SceneStandings
@@ -54,20 +59,23 @@ SWEEP = {
 MEASURES = {"local minima": 7, "noise floor": "none"}
 
 
-def cosine(scale: float, points: int, value: float | None) -> dict[str, Any]:
-    return {"scale": scale, "points": points, "of": 36, "cosine": {"value": value, "low": value, "high": value}}
+def kept_report() -> Report:
+    """Return the report of a shipped slice with other words and other gradients."""
+    known = Report.read(DATA / "fluid-0-1")
+    row, width = known.profile.differences[0], known.profile.smoothing[0]
 
+    def cosine(scale: float, points: int, value: float) -> ScaleRow:
+        return replace(row, scale=scale, points=points, of=36, cosine=Estimate(value, value, value))
 
-REPORT: dict[str, Any] = {
-    "fidelity": "standard", "device": "cuda",
-    "verdict": {"words": ["rugged", "gradients noisy"], "reasons": {"rugged": "minima: 12", "gradients noisy": "0.5"}},
-    "paper": {"where": "A.2.1", "words": [
-        {"word": "rugged", "measured": True}, {"word": "gradients good", "measured": False}
-    ]},
-    "differences": [cosine(1e-6, 2, 0.1), cosine(1e-5, 30, 0.99)],
-    "differences_of_samples": [cosine(0.04, 36, -0.5)],
-    "smoothing": [{"width": 0.01, "points": 36, "biased": {"value": 0.25}}],
-}  # fmt: skip
+    profile = replace(
+        known.profile,
+        verdict=Verdict({"rugged": "minima: 12", "gradients noisy": "0.5"}),
+        differences=(cosine(1e-6, 2, 0.1), cosine(1e-5, 30, 0.99)),
+        differences_of_samples=(cosine(0.04, 36, -0.5),),
+        smoothing=(replace(width, width=0.01, points=36, biased=Estimate(0.25, 0.1, 0.5)),),
+    )
+    paper = PaperWords(profile.verdict.compare_words(("rugged", "gradients good")), "A.2.1")
+    return replace(known, profile=profile, paper=paper)
 
 
 def rung(name: str, ladder: str, milliseconds: float, error: float | None) -> dict[str, Any]:
@@ -226,7 +234,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (full / "episodes.json").write_text(json.dumps(EPISODES))
     (full / "sweep.json").write_text(json.dumps(SWEEP))
     (full / "measures.json").write_text(json.dumps(MEASURES))
-    (full / "report.json").write_text(json.dumps(REPORT))
+    write_record(full / "report.json", to_json(kept_report()))
     picture(full / "gradient-quality.png")
     (full / "companions.json").write_text(json.dumps({"slices": COMPANIONS}))
     picture(full / "companions.png")

@@ -14,7 +14,7 @@ from scipy.stats import rankdata
 
 from gradscape.landscapes.draw.style import LOSS_MAP, Scale
 from gradscape.landscapes.lattice import own_cells
-from gradscape.landscapes.measures.unresolved import contradicted_cells
+from gradscape.landscapes.measures.undersampled import contradicted_cells
 from gradscape.landscapes.objective import Status
 from gradscape.landscapes.storage.store import open_slice
 

@@ -5,8 +5,17 @@ import pytest
 import torch
 
 from gradscape.envs.adapters import from_torch
-from gradscape.landscapes.measures.census import MEASURES, CensusDesign, sample_cuts, survey, thin_out
-from gradscape.landscapes.measures.census_statistics import bootstrap, divide, spread, word_shares
+from gradscape.landscapes.measures.census import (
+    MEASURES,
+    CensusDesign,
+    bootstrap,
+    divide,
+    sample_cuts,
+    spread,
+    survey,
+    thin_out,
+    word_shares,
+)
 from gradscape.landscapes.objective import Evaluation, Objective, evaluate
 from gradscape.landscapes.plane import Plane
 from gradscape.landscapes.space import ParameterSpace

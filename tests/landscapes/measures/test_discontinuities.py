@@ -31,16 +31,16 @@ def step(x: torch.Tensor) -> torch.Tensor:
 def test_a_step_is_one_jump_at_its_place_and_of_its_height() -> None:
     objective, dataset = sampled(step, (0,), 50)
     found = find_jumps(objective, dataset, least=0.1)
-    assert len(found.height) == 1
-    assert float(found.place) == pytest.approx(EDGE, abs=2 / 49 / 4096)
-    assert float(found.height) == pytest.approx(3, abs=1e-3)
+    assert len(found.found) == 1
+    assert found.found[0].place[0] == pytest.approx(EDGE, abs=2 / 49 / 4096)
+    assert found.found[0].height == pytest.approx(3, abs=1e-3)
     assert found.share.value == pytest.approx(1 / 49)
 
 
 def test_every_row_of_a_plane_crosses_it_once() -> None:
     objective, dataset = sampled(step)
     found = find_jumps(objective, dataset, least=0.5)
-    assert (len(found.height), found.steep, found.neighbours) == (24, 24, 2 * 24 * 23)
+    assert (len(found.found), found.steep, found.neighbours) == (24, 24, 2 * 24 * 23)
     assert found.share.value == found.share.low == found.share.high == pytest.approx(24 / found.neighbours)
     some = find_jumps(objective, dataset, least=0.5, most=8)
     assert some.share.low < some.share.value == found.share.value
@@ -50,23 +50,23 @@ def test_a_steep_slope_between_two_samples_is_no_jump() -> None:
     objective, dataset = sampled(lambda x: torch.tanh((x[:, 0] - EDGE) * 200), (0,), 20)  # a tenth of a step wide
     found = find_jumps(objective, dataset, least=1e-6)
     assert found.checked > 0
-    assert len(found.height) == 0
+    assert len(found.found) == 0
 
 
 def test_a_jump_beside_a_failure_is_left_undecided() -> None:
     objective, dataset = sampled(lambda x: torch.where((x[:, 0] - EDGE).abs() < 1e-3, torch.nan, step(x)), (0,), 50)
     found = find_jumps(objective, dataset, least=0.5)
-    assert (found.checked, found.undecided, len(found.height)) == (1, 1, 0)
+    assert (found.checked, found.undecided, len(found.found)) == (1, 1, 0)
 
 
 def test_jumps_are_tied_to_what_is_counted_differently_across_them() -> None:
     objective, dataset = sampled(lambda x: step(x) + 2.0 * (x[:, 1] > EDGE))
     found = find_jumps(objective, dataset, least=0.5, events=lambda x: {"bounces": (x[:, 0] > EDGE).int()})
-    assert found.share_explained is not None
-    assert found.share_explained.value == 0.5
-    assert found.record()["found"][0]["event"] is True  # the highest
+    assert found.explained_by_events is not None
+    assert found.explained_by_events.value == 0.5
+    assert found.found[0].event is True  # the highest
     unseen = find_jumps(objective, dataset, least=0.5, events=lambda x: {})
-    assert unseen.share_explained is None
+    assert unseen.explained_by_events is None
 
 
 def test_a_constant_slice_has_no_steep_pair() -> None:

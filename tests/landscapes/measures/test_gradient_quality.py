@@ -31,15 +31,15 @@ def test_a_quadratic_agrees_at_every_scale() -> None:
 def test_a_gradient_of_the_wrong_sign_points_uphill() -> None:
     wrong = from_numpy(lambda x: ((x**2).sum(axis=1), -2 * x), SPACE)
     for row in gradients.scale_table(gradients.compare_differences(wrong, PLANE, gradients.subgrid(PLANE, 4))):
-        assert row["cosine"]["value"] == pytest.approx(-1)
-        assert (row["uphill"]["value"], row["sign"]["value"]) == (1, 0)
-        assert row["error"] == pytest.approx(2)
+        assert row.cosine.value == pytest.approx(-1)
+        assert (row.uphill.value, row.sign.value) == (1, 0)
+        assert row.error == pytest.approx(2)
 
 
 def test_fine_ripples_agree_closely_and_mislead_at_the_scale_of_a_picture() -> None:
     rippled = from_torch(lambda x: (x**2 + 1e-2 * torch.sin(1e4 * x)).sum(1), SPACE)
     rows = gradients.scale_table(gradients.compare_differences(rippled, PLANE, gradients.subgrid(PLANE, 5)))
-    by_scale = {row["scale"]: row["cosine"]["value"] for row in rows}
+    by_scale = {row.scale: row.cosine.value for row in rows}
     assert by_scale[1e-6] == pytest.approx(1, abs=1e-3)
     assert abs(by_scale[1e-2]) < 0.5
 
@@ -107,4 +107,4 @@ def test_failed_samples_are_left_out_and_too_few_say_nothing() -> None:
     assert 3 < int(found["count"][0, 0]) < 16
     np.testing.assert_allclose(found["zeroth"][0, 0], [4, 4])
     assert bool(found["zeroth"][0, 1].isnull().all())
-    assert gradients.width_table(found)[0]["points"] == 1
+    assert gradients.width_table(found)[0].points == 1

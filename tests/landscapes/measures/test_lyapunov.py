@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from gradscape.landscapes.convert import from_json, to_json
 from gradscape.landscapes.measures.lyapunov import GradientGrowth, measure_growth
 
 TIME = np.array([0.4, 0.8, 1.2, 1.6, 2.0])
@@ -26,7 +27,7 @@ def test_the_logistic_map_diverges_by_ln_2_a_step() -> None:
     assert found.is_exponential
     assert found.rate.low <= math.log(2) <= found.rate.high
     assert found.rate.value == pytest.approx(math.log(2), abs=0.02)
-    assert "exp(0.69" in found.say()
+    assert "exp(0.69" in found.describe()
 
 
 @pytest.mark.parametrize("rate", [3.0, 0.5])
@@ -45,7 +46,7 @@ def test_a_flight_grows_by_a_power_of_time_and_does_not_diverge(power: float) ->
     found = measure_growth(TIME, TIME[:, None] ** power * noise)
     assert not found.is_exponential
     assert found.power.value == pytest.approx(power, abs=0.05)
-    assert f"t^{power:.2g}" in found.say()
+    assert f"t^{power:.2g}" in found.describe()
 
 
 def test_what_stays_or_shrinks_does_not_diverge() -> None:
@@ -63,12 +64,12 @@ def test_points_without_a_gradient_are_left_out_and_too_few_say_nothing() -> Non
     norm[0, :9] = 0.0
     nothing = measure_growth(TIME, norm)
     assert math.isnan(nothing.rate.value)
-    assert nothing.say().startswith("how gradients grow is not known: at 7 of 16 points")
+    assert nothing.describe().startswith("how gradients grow is not known: at 7 of 16 points")
     assert math.isnan(measure_growth(TIME[:3], norm[:3, 9:]).rate.value)
 
 
 def test_it_is_read_as_it_was_written() -> None:
     found = measure_growth(TIME, np.exp(TIME)[:, None] * np.linspace(1, 2, 8))
-    assert GradientGrowth.of_record(json.loads(json.dumps(found.record()))) == found
+    assert from_json(GradientGrowth, json.loads(json.dumps(to_json(found)))) == found
     with pytest.raises(ValueError, match="ascend"):
         measure_growth(TIME[::-1], np.ones((5, 4)))

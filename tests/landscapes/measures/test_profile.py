@@ -8,11 +8,12 @@ import pytest
 import torch
 
 from gradscape import ParameterSpace, Plane, from_torch, sample
+from gradscape.landscapes.convert import to_json
 from gradscape.landscapes.draw.figures.page import save
 from gradscape.landscapes.draw.figures.quality import quality_figure
 from gradscape.landscapes.measures import gradient_quality as gradients
-from gradscape.landscapes.measures.classify import WORDS
-from gradscape.landscapes.measures.profile import Profile, effort, measure_profile, named_measures
+from gradscape.landscapes.measures.classify import WORDS, QuotedWord
+from gradscape.landscapes.measures.profile import Profile, effort, measure_profile
 from gradscape.landscapes.objective import Evaluation, Objective, Status
 
 Function = Callable[[torch.Tensor], torch.Tensor]
@@ -89,7 +90,7 @@ def test_gradients_that_are_missing_are_said_to_be_and_losses_beside_them_count(
     half = Partly(0.5, 0.0).profile()
     assert set(half.words) == {"very smooth", "gradients missing"}
     assert half.verdict.reasons["gradients missing"] == "gradient missing at 50.0% of the points that have a loss"
-    named = named_measures(half.record())
+    named = half.measures
     assert named["Gradients missing beside a loss"].startswith("50.0 %")
     assert "Samples that failed" not in named
     assert half.losses.failed == 0
@@ -109,7 +110,7 @@ def test_a_slice_that_mostly_failed_is_called_nothing_else() -> None:
     found = Partly(0.0, 0.6).profile()
     share = f"{found.losses.failed / found.losses.samples:.0%}"
     assert found.verdict.reasons == {"mostly failed": f"no loss at {share} of the samples"}
-    named = named_measures(found.record())
+    named = found.measures
     assert named["Samples that failed"].startswith(share[:2])
     assert named["Points that raised"] == f"{found.losses.failed} points raised: first 'RuntimeError: too much work'"
     assert Partly(0.0, 1.1).profile().words == ("mostly failed",)
@@ -117,17 +118,17 @@ def test_a_slice_that_mostly_failed_is_called_nothing_else() -> None:
 
 def test_somebody_elses_words_are_held_against_ours() -> None:
     verdict = profile(lambda x: x.square().sum(1), -1, 1).verdict
-    assert verdict.beside(("very smooth", "rugged")) == [
-        {"word": "very smooth", "measured": True},
-        {"word": "rugged", "measured": False},
-    ]
+    assert verdict.compare_words(("very smooth", "rugged")) == (
+        QuotedWord("very smooth", True),
+        QuotedWord("rugged", False),
+    )
     assert list(verdict.words) == [word for word in WORDS if word in verdict.words]
 
 
 def test_a_character_is_the_same_again_and_has_plain_names() -> None:
     found = [profile(rastrigin, -2, 2) for _ in range(2)]
-    assert found[0].record() == found[1].record()
-    named = named_measures(found[0].record())
+    assert to_json(found[0]) == to_json(found[1])
+    named = found[0].measures
     assert (
         named["Local minima deeper than 1 % of the range"] == "25"
     )  # and at the borders, where it is lower than inside
@@ -161,7 +162,7 @@ def test_the_picture_of_gradient_quality_is_written(tmp_path: Path, dims: tuple[
     plane, points = Plane.through(space, space.center, dims, resolution=12), 3 if len(dims) == 2 else 9
     places = gradients.subgrid(plane, points)
     steps, smooth = (of(objective, plane, places) for of in (gradients.compare_differences, gradients.smoothed_slopes))
-    figure = quality_figure(dataset, steps, gradients.compare_samples(dataset), smooth)
+    figure = quality_figure(dataset, gradients.GradientQuality(steps, gradients.compare_samples(dataset), smooth))
     save(figure, tmp_path / "quality.png")
     assert (tmp_path / "quality.png").read_bytes().startswith(b"\x89PNG")
     titles = [ax.get_title() for ax in figure.axes]

@@ -11,6 +11,7 @@ import torch
 import xarray as xr
 
 from gradscape.envs.adapters import from_torch
+from gradscape.landscapes.convert import to_json
 from gradscape.landscapes.measures.slice_comparison import compare_slices
 from gradscape.landscapes.objective import Status
 from gradscape.landscapes.plane import Plane
@@ -41,7 +42,7 @@ def test_a_constant_changes_losses_alone() -> None:
     for value in (found.loss.median.value, found.loss.p95.value, found.loss.largest.value):
         assert value == pytest.approx(0.5)
     assert found.loss.range == pytest.approx(2.0)
-    assert found.loss.shares()["p95"].value == pytest.approx(0.25)
+    assert found.loss.shares["p95"].value == pytest.approx(0.25)
     assert found.spearman.value == pytest.approx(
         1.0, abs=1e-4
     )  # losses that are the same but for rounding change ranks
@@ -135,7 +136,7 @@ def test_what_failed_is_counted_and_compared_nowhere() -> None:
 def test_where_nothing_is_left_nothing_is_said() -> None:
     found = compare(bowl, lambda x: bowl(x) * torch.nan)
     assert (found.compared, found.parting) == (0, None)
-    record = found.record()
+    record = to_json(found)
     assert record["loss"]["median"]["value"] is record["spearman"]["value"] is record["parting"] is None
     assert json.loads(json.dumps(record, allow_nan=False)) == record
 
@@ -150,17 +151,17 @@ def test_the_same_slice_twice_differs_nowhere() -> None:
 def test_a_flat_slice_has_no_order_and_no_range() -> None:
     found = compare(lambda x: 0 * x[0], bowl)
     assert np.isnan(found.spearman.value)
-    assert np.isnan(found.loss.shares()["median"].value)
+    assert np.isnan(found.loss.shares["median"].value)
     assert found.slopes is not None
     assert found.slopes.ratio.value == np.inf
-    assert found.record()["slopes"]["ratio"]["value"] is None
+    assert to_json(found)["slopes"]["ratio"]["value"] is None
 
 
 def test_without_gradients_losses_alone_are_compared() -> None:
     found = compare_slices(cut(bowl), cut(bowl, grad=False))
     assert found.slopes is None
     assert "gradients" not in "".join(found.table().index)
-    assert found.record()["slopes"] is None
+    assert to_json(found)["slopes"] is None
     assert found.differing == {"gradients": ("True", "False")}
     assert found.cosine is None
 

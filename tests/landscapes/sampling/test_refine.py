@@ -13,10 +13,11 @@ import xarray as xr
 from torch import Tensor
 
 from gradscape import ParameterSpace, Plane, from_numpy, from_torch, sample
+from gradscape.landscapes.convert import to_json
 from gradscape.landscapes.export import frame
 from gradscape.landscapes.identity import DamagedError, StoreMismatchError, plane_of
 from gradscape.landscapes.lattice import own_cells, sampled_lattice
-from gradscape.landscapes.measures.unresolved import find_unresolved
+from gradscape.landscapes.measures.undersampled import find_undersampled
 from gradscape.landscapes.objective import Evaluation, Objective, Status
 from gradscape.landscapes.sampling.quadtree import Quadtree
 from gradscape.landscapes.sampling.refine import Refined, Refinement, refine
@@ -112,13 +113,13 @@ def test_samples_lie_where_the_loss_jumps() -> None:
     assert (np.nan_to_num(off(dataset, jumping, 129)) > 0.02).mean() < 0.001
 
 
-def test_a_thin_ridge_is_unresolved_at_32_and_resolved_by_refinement() -> None:
+def test_a_thin_ridge_is_undersampled_at_32_and_resolved_by_refinement() -> None:
     objective = from_torch(ridged, SPACE)
-    coarse = find_unresolved(objective, sample(objective, plane(32)))
+    coarse = find_undersampled(objective, sample(objective, plane(32)))
     assert coarse is not None
     assert coarse.share.low > 0.01
     dataset = refined(ridged, 513)
-    fine = find_unresolved(objective, dataset)
+    fine = find_undersampled(objective, dataset)
     assert fine is not None
     assert fine.share.high < 0.01
     assert sampled(dataset).mean() < 0.06
@@ -271,7 +272,7 @@ def test_nothing_interpolated_enters_a_measure() -> None:
         assert report.losses.range < 3
         assert report.losses.samples == lattice["loss"].size
         assert report.losses.failed == 0
-    assert report.record() == Slice(dataset, None, lambda: objective).report(points=2).record()
+    assert to_json(report) == to_json(Slice(dataset, None, lambda: objective).report(points=2))
     table = frame(dataset)
     assert set(table["status"]) == {"ok", "interpolated"}
     assert table["loss"][table["status"] == "interpolated"].isna().all()

@@ -16,10 +16,10 @@ import gradscape as gs
 from gradscape import ParameterSpace, Plane, from_torch
 from gradscape.jobs.slice import SliceJob
 from gradscape.landscapes.draw.figures.contour import arrows_along, landscape_figure
+from gradscape.landscapes.measures.doubled_resolution import DoubledResolution, double_resolution
 from gradscape.landscapes.measures.gradient_quality import compare_samples
 from gradscape.landscapes.measures.ruggedness import ruggedness
-from gradscape.landscapes.measures.twice import Twice, at_twice
-from gradscape.landscapes.measures.unresolved import find_unresolved
+from gradscape.landscapes.measures.undersampled import find_undersampled
 from gradscape.landscapes.objective import Evaluation, Objective, Status
 from gradscape.landscapes.sampling.distribution import equal_groups
 from gradscape.landscapes.sampling.fill import Progress, sample
@@ -276,16 +276,16 @@ def both_of(every: int) -> Iterator[xr.Dataset]:
 def test_what_is_finer_than_the_samples_is_looked_for_as_without_gradients() -> None:
     plane, objective = Plane.through(SPACE, SPACE.center, (0, 1), resolution=41), from_torch(waves, SPACE)
     _, strided = both_of(4)
-    assert find_unresolved(objective, strided) == find_unresolved(objective, sample(objective, plane, gradients=0))
+    assert find_undersampled(objective, strided) == find_undersampled(objective, sample(objective, plane, gradients=0))
 
 
 def test_twice_the_resolution_is_measured_as_with_all_gradients() -> None:
     objective = from_torch(waves, SPACE)
     dense, strided = both_of(4)
     found, cosine = ruggedness(dense, floor=0.0), compare_samples(dense)["cosine"].isel(scale=0).to_numpy()
-    one, other = (at_twice(objective, data, found, None, cosine, deviation=0.0) for data in (dense, strided))
-    assert isinstance(one, Twice)
-    assert isinstance(other, Twice)
+    one, other = (double_resolution(objective, data, found, None, cosine, deviation=0.0) for data in (dense, strided))
+    assert isinstance(one, DoubledResolution)
+    assert isinstance(other, DoubledResolution)
     assert one.measures == other.measures
 
 

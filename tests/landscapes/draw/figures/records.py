@@ -9,8 +9,7 @@ import xarray as xr
 from gradscape.jobs.league import simulated_scenes
 from gradscape.landscapes.draw import style
 from gradscape.landscapes.measures.card import Card, CardSlice, Grade
-from gradscape.landscapes.measures.census import MEASURES, CensusDesign, SurveyedSlice
-from gradscape.landscapes.measures.census_record import Census, conclude
+from gradscape.landscapes.measures.census import MEASURES, Census, CensusDesign, SurveyedSlice, conclude
 from gradscape.landscapes.measures.classify import WORDS
 from gradscape.landscapes.measures.convergence import Shapes
 from gradscape.landscapes.measures.convergence_record import (
@@ -153,7 +152,7 @@ def card() -> Card:
         )  # type: ignore[arg-type] # each of its kind
         for (scene, engine), end in zip(names, ends, strict=True)
     ]
-    return Card(grades, "2030-01-01", "cpu", "landscape card", slices)
+    return Card(tuple(grades), "2030-01-01", "cpu", "landscape card", slices)
 
 
 def census() -> Census:

@@ -10,7 +10,7 @@ from gradscape.landscapes.draw.figures.profile import profile_figure
 from gradscape.landscapes.large import in_unit
 from gradscape.landscapes.measures.ruggedness import ruggedness
 from gradscape.landscapes.measures.slice_comparison import compare_slices
-from gradscape.landscapes.measures.unresolved import find_unresolved
+from gradscape.landscapes.measures.undersampled import find_undersampled
 
 SPACE = gs.ParameterSpace({"a": (-1, 1), "b": (-1, 1)})
 LARGE = {
@@ -40,7 +40,7 @@ def test_large_losses_are_drawn_and_looked_between(name, gradients):
         assert picture._repr_png_().startswith(b"\x89PNG")
         labels = [text for ax in picture.axes for text in (ax.get_ylabel(), ax.get_xlabel())]
         assert ("loss [10³⁰⁸ J]" if name != "gradients" else "loss [J]") in labels
-        find_unresolved(objective, dataset)
+        find_undersampled(objective, dataset)
 
 
 def test_a_unit_changes_no_ratio_and_no_ordinary_slice():

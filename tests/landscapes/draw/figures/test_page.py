@@ -18,7 +18,7 @@ from gradscape.landscapes import draw
 from gradscape.landscapes.draw.figures import page, typesetting
 from gradscape.landscapes.draw.figures.card import card_figure
 from gradscape.landscapes.draw.figures.census import census_figure
-from gradscape.landscapes.draw.figures.companions import Cut, companions_figure
+from gradscape.landscapes.draw.figures.companions import CompanionSlice, companions_figure
 from gradscape.landscapes.draw.figures.comparison import comparison_figure
 from gradscape.landscapes.draw.figures.contact import Caption, episode_figure
 from gradscape.landscapes.draw.figures.contour import landscape_figure
@@ -38,8 +38,7 @@ from gradscape.landscapes.draw.figures.wall import Landscape, wall_figure
 from gradscape.landscapes.draw.render.surface import surface_figure
 from gradscape.landscapes.episode import Episode, Part, View
 from gradscape.landscapes.measures import gradient_quality as gradients
-from gradscape.landscapes.measures.slice_comparison import compare_slices
-from gradscape.landscapes.measures.slice_comparison_record import SliceComparison
+from gradscape.landscapes.measures.slice_comparison import SliceComparison, compare_slices
 from gradscape.landscapes.objective import Status
 from gradscape.landscapes.sampling.fill import sample
 from gradscape.landscapes.storage.files import print_width
@@ -70,7 +69,7 @@ def quality(dataset):
     flat = plane(*dataset["loss"].shape[::-1], dims=("speed", "lift")[: dataset["loss"].ndim])
     places = gradients.subgrid(flat, 4 if flat.rank == 2 else 16)
     steps, smooth = gradients.compare_differences(Bowl(), flat, places), gradients.smoothed_slopes(Bowl(), flat, places)
-    return dataset, steps, gradients.compare_samples(dataset), smooth
+    return dataset, gradients.GradientQuality(steps, gradients.compare_samples(dataset), smooth)
 
 
 SHIFTED = DATASET.assign(
@@ -96,7 +95,9 @@ CAPTION = Caption(
     "episode.json", COMMAND,
 )  # fmt: skip
 PARTS = {f"the walls' friction, number {number}": 0.01 * 1.5**number for number in range(12)}
-CUTS = [Cut("center", np.full((4, 4), np.nan)), Cut("random:3", np.arange(16.0).reshape(4, 4))]
+AIM = CompanionSlice("example:aim", PLANE["loss"].to_numpy())
+CENTER, RANDOM = (CompanionSlice(name, LONG["loss"].to_numpy()) for name in ("center", "random:3"))
+CUTS = [CompanionSlice("center", np.full((4, 4), np.nan)), CompanionSlice("random:3", np.arange(16.0).reshape(4, 4))]
 HUNG = [
     Landscape("swing-velocity", "smooth with local minima 100 %, discontinuous 100 %, large flat regions 100 %", PLANE)
 ]
@@ -139,9 +140,13 @@ FIGURES: dict[str, list[Callable[[float | None], page.Picture]]] = {
     "convergence_figure": [lambda width: convergence_figure(convergence(), width=width)],
     "model_figure": [lambda width: model_figure(study(PARTS, failing=True), width=width)],
     "companions_figure": [
-        lambda width: companions_figure([Cut("example:aim", PLANE["loss"].to_numpy()), *CUTS], PLANE, width=width),
         lambda width: companions_figure(
-            [Cut("center", LONG["loss"].to_numpy()), Cut("random:3", LONG["loss"].to_numpy())], LONG, width=width
+            [CompanionSlice("example:aim", PLANE["loss"].to_numpy()), *CUTS], PLANE, width=width
+        ),
+        lambda width: companions_figure(
+            [CompanionSlice("center", LONG["loss"].to_numpy()), CompanionSlice("random:3", LONG["loss"].to_numpy())],
+            LONG,
+            width=width,
         ),
     ],
     "card_figure": [lambda width: card_figure(card(), width=width)],

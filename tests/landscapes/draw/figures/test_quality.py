@@ -36,9 +36,10 @@ def test_ticks_of_many_digits_are_powers_of_ten(value: float, said: str) -> None
 
 
 def test_a_mean_that_rounds_to_zero_is_written_without_a_sign_and_titles_keep_apart() -> None:
-    dataset, steps, samples, smooth = quality(PLANE)
+    dataset, found = quality(PLANE)
+    samples = found.samples
     samples["cosine"][:] = np.where(np.isfinite(samples["cosine"]), -1e-3, np.nan)
-    figure = quality_figure(dataset, steps, samples, smooth)
+    figure = quality_figure(dataset, found)
     titles = [ax.title for ax in figure.axes if ax.get_title()]
     assert any("mean cosine 0.00" in title.get_text() for title in titles)
     assert not any("−0.00" in title.get_text() for title in titles)

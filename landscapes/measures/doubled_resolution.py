@@ -1,4 +1,4 @@
-"""What would be said of a slice at twice its resolution, estimated from a random tenth of its cells.
+"""The verdict on a slice at twice its resolution, estimated from a random tenth of its cells.
 
 The cells are drawn in blocks, two along each axis, which are sampled anew half a step apart. What can be measured
 within a block is measured there twice, of all samples and of the slice's own alone. The mean of the difference is added
@@ -25,17 +25,16 @@ from ..statistics import Estimate, Values, mean
 from .classify import judge, likeness
 from .discontinuities import Jumps
 from .gradient_quality import agreement
-from .records import TwiceRecord
 from .ruggedness import FLAT_SLOPE, Ruggedness, box_slopes
 
 PART = 0.1  # of the cells
 SIDE = 5  # samples along a block's side at twice the resolution: two cells
 LOCAL = ("turns", "level", "flat", "cosine", "uphill")
-LEAST = {"cosine": -1.0}  # of a measure; the others are shares
+LOWEST = {"cosine": -1.0}  # of a measure; the others are shares
 
 
 @dataclass(frozen=True)
-class Twice:
+class DoubledResolution:
     """Hold the local measures of a slice as they would be at twice its resolution, and which words would change.
 
     A word would `appear` or `go` only where the whole interval of a measure is on the other side of its threshold.
@@ -47,24 +46,14 @@ class Twice:
     appear: tuple[str, ...]
     go: tuple[str, ...]
 
-    def record(self) -> TwiceRecord:
-        """Return it as plain JSON."""
-        return {
-            "blocks": self.blocks,
-            "episodes": self.episodes,
-            "measures": {name: one.record() for name, one in self.measures.items()},
-            "appear": list(self.appear),
-            "go": list(self.go),
-        }
 
-
-def episodes_at_twice(shape: Sequence[int]) -> tuple[int, int]:
+def doubling_episodes(shape: Sequence[int]) -> tuple[int, int]:
     """Return how many losses and how many gradients, at most, are evaluated for a slice of such a shape."""
     inner, border = _places(len(shape), every=True)
     return _drawn(shape) * len(border), _drawn(shape) * len(inner)
 
 
-def at_twice(
+def double_resolution(
     objective: Objective,
     dataset: xr.Dataset,
     found: Ruggedness,
@@ -73,7 +62,7 @@ def at_twice(
     *,
     deviation: float,
     seed: int = 0,
-) -> Twice | None:
+) -> DoubledResolution | None:
     """Measure blocks of a slice at twice its resolution; None where there are none of samples that did not fail.
 
     `found`, `jumps` and `cosine` are what its words are from, `deviation` [loss unit] is that of the losses' noise.
@@ -105,9 +94,9 @@ def at_twice(
     }
     estimates = {}
     for at, name in enumerate(LOCAL):
-        estimates[name] = _moved(whole[name], np.array(then)[:, at] - np.array(now)[:, at], LEAST.get(name, 0.0))
+        estimates[name] = _moved(whole[name], np.array(then)[:, at] - np.array(now)[:, at], LOWEST.get(name, 0.0))
     appear, go = _changes(found, jumps, whole, estimates)
-    return Twice(len(drawn), episodes, estimates, appear, go)
+    return DoubledResolution(len(drawn), episodes, estimates, appear, go)
 
 
 def _drawn(shape: Sequence[int]) -> int:

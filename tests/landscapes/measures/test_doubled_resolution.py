@@ -11,9 +11,9 @@ from torch import Tensor
 
 from gradscape import ParameterSpace, Plane, from_torch, sample
 from gradscape.landscapes.measures.classify import classify, likeness
+from gradscape.landscapes.measures.doubled_resolution import DoubledResolution, double_resolution, doubling_episodes
 from gradscape.landscapes.measures.gradient_quality import compare_samples
 from gradscape.landscapes.measures.ruggedness import Ruggedness, ruggedness
-from gradscape.landscapes.measures.twice import Twice, at_twice, episodes_at_twice
 
 Function = Callable[[Tensor], Tensor]
 SPACE = ParameterSpace.box(("x", "y"), -1.0, 1.0)
@@ -39,11 +39,11 @@ def measured(function: Function, points: int, dims: tuple[int, ...]) -> tuple[xr
     return dataset, ruggedness(dataset, floor=0.0), cosine
 
 
-def twice(function: Function, points: int, dims: tuple[int, ...] = (0, 1), seed: int = 0) -> Twice:
+def twice(function: Function, points: int, dims: tuple[int, ...] = (0, 1), seed: int = 0) -> DoubledResolution:
     dataset, found, cosine = measured(function, points, dims)
-    result = at_twice(from_torch(function, SPACE), dataset, found, None, cosine, deviation=0.0, seed=seed)
+    result = double_resolution(from_torch(function, SPACE), dataset, found, None, cosine, deviation=0.0, seed=seed)
     assert result is not None
-    losses, gradients = episodes_at_twice(dataset["loss"].shape)
+    losses, gradients = doubling_episodes(dataset["loss"].shape)
     own = (losses + gradients) // (17 if len(dims) == 2 else 3)  # one gradient of each block is the slice's own
     assert result.episodes == losses + gradients - own
     return result
@@ -79,8 +79,8 @@ def test_of_what_the_samples_show_no_word_changes(function: Function) -> None:
 
 
 def test_a_tenth_of_the_cells_is_sampled() -> None:
-    assert episodes_at_twice((41, 41)) == (40 * 8, 40 * 9)  # in blocks of four cells
-    assert episodes_at_twice((201,)) == (0, 10 * 3)
+    assert doubling_episodes((41, 41)) == (40 * 8, 40 * 9)  # in blocks of four cells
+    assert doubling_episodes((201,)) == (0, 10 * 3)
 
 
 def test_blocks_with_a_failure_are_left_out_and_few_say_nothing() -> None:
@@ -89,4 +89,4 @@ def test_blocks_with_a_failure_are_left_out_and_few_say_nothing() -> None:
     objective = from_torch(lambda x: torch.where(x[:, 0] > -0.95, torch.nan, waves(x)), SPACE)
     dataset = sample(objective, Plane.through(SPACE, SPACE.center, (0, 1), resolution=9))
     _, found, cosine = measured(waves, 9, (0, 1))
-    assert at_twice(objective, dataset, found, None, cosine, deviation=0.0) is None
+    assert double_resolution(objective, dataset, found, None, cosine, deviation=0.0) is None

@@ -1,6 +1,6 @@
 """What the samples of a slice do not show: jumps, ridges and ripples finer than they are, as a share of its cells.
 
-A cell lies between neighbouring samples: two along a line, four of a plane. It is unresolved if the loss between them
+A cell lies between neighbouring samples: two along a line, four of a plane. It is undersampled if the loss between them
 is not what they tell, in one of two ways. At a point halfway it differs from both the mean of the samples around it and
 what their gradients say (exact for a quadratic) by more than half a step of a ramp through the range of the losses. Or
 a difference of as much keeps more than a quarter of itself while the interval it lies in is halved three times, as a
@@ -23,23 +23,22 @@ import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from ..convert import from_json, to_json
 from ..identity import plane_of
 from ..large import LARGE, in_unit, unit_of
 from ..lattice import has_all_gradients, lift_between
 from ..objective import Objective, Status, evaluate
-from ..plain import finite
 from ..plane import Plane
 from ..statistics import Estimate, Values, share
-from .records import UnresolvedRecord
 from .ruggedness import box_slopes, span
 
-UNRESOLVED = "unresolved"  # the attribute of a slice that holds its record
+ATTRIBUTE = "unresolved"  # the attribute of a slice that holds its record
 COST = {True: 5, False: 10}  # samples of a slice, with or without gradients, that cost ten times as much as a loss
 HALVINGS, KEPT = 3, 1 / 4  # of an edge, and what a jump keeps more than of its height; a slope keeps an eighth
 PLACES = np.arange(1, 16) / 16  # of an edge, where its cubic is looked at
@@ -51,10 +50,10 @@ Cells = NDArray[np.intp]  # lower corners of cells, shape (count, rank), in arra
 
 
 @dataclass(frozen=True)
-class Unresolved:
-    """Hold the `share` of a slice's cells that are finer than its samples.
+class Undersampled:
+    """Hold the `share` of a slice's cells whose loss its samples do not show.
 
-    Of `cells` between samples that did not fail `probed` were looked into, `found` unresolved, and `undecided` as an
+    Of `cells` between samples that did not fail `probed` were looked into, `found` undersampled, and `undecided` as an
     evaluation failed there, with so many `episodes`. A difference counts from `least` on [loss unit].
     """
 
@@ -66,14 +65,35 @@ class Unresolved:
     undecided: int
     episodes: int
 
-    def record(self) -> UnresolvedRecord:
-        """Return it as plain JSON."""
-        return cast("UnresolvedRecord", {**vars(self), "share": self.share.record(), "least": finite(self.least)})
+    def format_share(self) -> str:
+        """Return the share with its interval, nothing where it is not known."""
+        if not math.isfinite(self.share.value):
+            return ""
+        value, low, high = (100 * part for part in (self.share.value, self.share.low, self.share.high))
+        interval = f" ({_round(low)} to {_round(high)} %)" if low else f" (95 % upper bound {_round(high)} %)"
+        return f"{_round(value)} %{interval if high > low else ''}"
+
+    def describe(self) -> str:
+        """Say in a line which share of the cells is undersampled; nothing where that is not known."""
+        said = self.format_share()
+        return f"undersampled cells: {said}" if said else ""
+
+    def attribute(self) -> dict[str, str]:
+        """Return the attribute that a slice holds it in, as text."""
+        return {ATTRIBUTE: json.dumps(to_json(self))}
+
+    @classmethod
+    def of(cls, dataset: xr.Dataset) -> Undersampled | None:
+        """Read it from a slice, None where the slice has none or what it has is none."""
+        try:
+            return from_json(cls, json.loads(dataset.attrs[ATTRIBUTE]))
+        except Exception:  # text of any content makes the converter raise anything at all
+            return None
 
 
-def find_unresolved(
+def find_undersampled(
     objective: Objective, dataset: xr.Dataset, *, floor: float = 0.0, seed: int = 0
-) -> Unresolved | None:
+) -> Undersampled | None:
     """Look between the samples of a slice, at no more than a tenth of its own cost; None where that is too little.
 
     `floor` [loss unit] is the least difference that is more than noise. A slice whose range is zero has steps of zero,
@@ -97,7 +117,7 @@ def find_unresolved(
         drawn = stratum[np.sort(generator.permutation(len(stratum))[:most])]
         parts.append((len(stratum), len(drawn), look.middles(drawn) if name == QUIET else look.edges(drawn, name)))
     decided = [result[np.isfinite(result)] for _, _, result in parts]
-    return Unresolved(
+    return Undersampled(
         share=_combine(
             [(count, int(one.sum()), len(one)) for (count, _, _), one in zip(parts, decided, strict=True)],
             of=math.prod(points - 1 for points in loss.shape) if _evaluated(dataset) < loss.size else cells,
@@ -131,31 +151,6 @@ def _most(name: str, strata: dict[str, Cells], budget: int, left: int) -> int:
     return min(max(1, int(part) // HALVINGS), left // HALVINGS)
 
 
-def stored_unresolved(dataset: xr.Dataset) -> UnresolvedRecord | None:
-    """Return the record that a slice holds, None where it has none or what it has is none."""
-    try:
-        found = json.loads(dataset.attrs[UNRESOLVED])
-        float(found["share"]["value"])
-        return cast("UnresolvedRecord", found)
-    except (KeyError, TypeError, ValueError):
-        return None
-
-
-def say_unresolved(record: UnresolvedRecord | None) -> str:
-    """Say in a line how much of a slice is finer than its samples; nothing where that is not known."""
-    said = say_share(record)
-    return f"finer than the samples: {said.replace(' %', ' % of cells', 1)}" if said else ""
-
-
-def say_share(record: UnresolvedRecord | None) -> str:
-    """Return the share with its interval, nothing where it is not known."""
-    if record is None or record["share"]["value"] is None:
-        return ""
-    value, low, high = (100 * (part or 0.0) for part in cast("dict[str, float]", record["share"]).values())
-    interval = f" ({_round(low)} to {_round(high)} %)" if low else f" (at most {_round(high)} %)"
-    return f"{_round(value)} %{interval if high > low else ''}"
-
-
 def _round(percent: float) -> str:
     return f"{percent:.1f}" if 0 < percent < 1 else f"{percent:.0f}"
 
@@ -166,9 +161,9 @@ def contradicted_cells(dataset: xr.Dataset) -> NDArray[np.bool_]:
     A cell with a corner that failed or was not sampled is none. A difference counts from what the slice's own record
     says on, and without a record from half a step of a ramp through the range.
     """
-    record, unit, dataset = stored_unresolved(dataset), unit_of(dataset["loss"].to_numpy()), in_unit(dataset)
+    known, unit, dataset = Undersampled.of(dataset), unit_of(dataset["loss"].to_numpy()), in_unit(dataset)
     loss = dataset["loss"].transpose("v", "u", missing_dims="ignore").to_numpy()
-    least = _least(loss, 0.0) if record is None or record["least"] is None else record["least"] / unit
+    least = known.least / unit if known and math.isfinite(known.least) else _least(loss, 0.0)
     found = np.zeros([points - 1 for points in loss.shape], dtype=bool)
     found[tuple(_strata(loss, _step_slopes(dataset, loss), least)[CONTRADICTED].T)] = True
     return found
@@ -241,7 +236,7 @@ def _of_cells(edges: Sequence[Values]) -> Values:
 class _Look:
     """Look into cells of a slice by new evaluations, and count them.
 
-    An answer is 1 for a cell that is unresolved, 0 for one that is not, NaN where an evaluation failed.
+    An answer is 1 for a cell that is undersampled, 0 for one that is not, NaN where an evaluation failed.
     """
 
     def __init__(
@@ -332,8 +327,3 @@ def _combine(strata: Sequence[tuple[int, int, int]], *, of: int) -> Estimate:
         below += (weight * (one.value - one.low)) ** 2
         above += (weight * (one.high - one.value)) ** 2
     return Estimate(value, max(0.0, value - math.sqrt(below)), min(1.0, value + math.sqrt(above)))
-
-
-def attribute_of(found: Unresolved | None) -> dict[str, Any]:
-    """Return the attribute that a slice holds it in, as text: none where nothing was found out."""
-    return {} if found is None else {UNRESOLVED: json.dumps(found.record())}

@@ -1,6 +1,5 @@
 """What the samples of a slice hide: functions whose jumps, ridges and slopes have a known width."""
 
-import json
 import math
 import warnings
 from collections.abc import Callable
@@ -13,14 +12,12 @@ from torch import Tensor
 
 from gradscape.envs.adapters import from_numpy, from_torch
 from gradscape.jobs.slice import look_between
-from gradscape.landscapes.measures.unresolved import (
-    UNRESOLVED,
-    Unresolved,
+from gradscape.landscapes.measures.undersampled import (
+    ATTRIBUTE,
+    Undersampled,
     contradicted_cells,
-    find_unresolved,
+    find_undersampled,
     probes,
-    say_unresolved,
-    stored_unresolved,
 )
 from gradscape.landscapes.objective import Evaluation, Objective
 from gradscape.landscapes.plane import Plane
@@ -58,8 +55,8 @@ def cut(
 
 def look(
     function: Callable[[Tensor], Tensor], points: int = 32, dims: tuple[int, ...] = (0, 1), **how: bool
-) -> Unresolved:
-    found = find_unresolved(*cut(function, points, dims, **how))
+) -> Undersampled:
+    found = find_undersampled(*cut(function, points, dims, **how))
     assert found is not None
     return found
 
@@ -146,14 +143,14 @@ def test_it_takes_a_tenth_of_the_slice_at_most(points: int, grad: bool) -> None:
 
     objective, dataset = cut(counted, points, grad=grad)
     asked = 0
-    found = find_unresolved(objective, dataset)
+    found = find_undersampled(objective, dataset)
     assert found is not None
     assert asked == found.episodes <= probes(points**2, grad=grad) <= points**2 / (5 if grad else 10)
 
 
 @pytest.mark.parametrize("points", [2, 3, 4])
 def test_of_few_samples_nothing_is_said(points: int) -> None:
-    assert find_unresolved(*cut(jumping, points)) is None
+    assert find_undersampled(*cut(jumping, points)) is None
 
 
 def test_failures_are_left_out() -> None:
@@ -163,7 +160,7 @@ def test_failures_are_left_out() -> None:
     found = look(failing)
     assert found.cells == 20 * 31  # between the samples that did not fail
     assert found.share.value > 0
-    assert find_unresolved(*cut(lambda x: torch.nan * x[:, 0])) is None
+    assert find_undersampled(*cut(lambda x: torch.nan * x[:, 0])) is None
 
     def failing_between(x: Tensor) -> Tensor:
         steps = (x + 1) / 2 * 31
@@ -172,19 +169,19 @@ def test_failures_are_left_out() -> None:
     found = look(failing_between)
     assert found.undecided == found.probed > 0
     assert math.isnan(found.share.value)
-    assert say_unresolved(found.record()) == ""
+    assert found.describe() == ""
 
 
 def test_it_is_the_same_every_time_and_travels_as_text() -> None:
     objective, dataset = cut(jumping)
     said = look_between(objective, dataset)
     assert said == look_between(objective, dataset)
-    assert isinstance(said[UNRESOLVED], str)
-    record = stored_unresolved(dataset.assign_attrs(said))
-    assert record == json.loads(said[UNRESOLVED])
-    assert "finer than the samples: 4 % of cells" in say_unresolved(record)
-    assert stored_unresolved(dataset) is None
-    assert stored_unresolved(dataset.assign_attrs({UNRESOLVED: "["})) is None
+    found = Undersampled.of(dataset.assign_attrs(said))
+    assert found is not None
+    assert found.attribute() == said
+    assert "undersampled cells: 4 %" in found.describe()
+    assert Undersampled.of(dataset) is None
+    assert Undersampled.of(dataset.assign_attrs({ATTRIBUTE: "["})) is None
 
 
 def test_what_raises_between_the_samples_is_warned_of() -> None:

@@ -1,0 +1,64 @@
+"""The picture of a record: `figure_of` finds the function that draws it by the name of the record's class."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, cast
+
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.text import Text
+
+if TYPE_CHECKING:
+    from . import style
+
+# The function "module:name" of the package that draws records of a class, imported when one is drawn. It takes the
+# record and the keyword `width`.
+FIGURES = {
+    "Card": "landscapes.draw.figures.card:card_figure",
+    "Census": "landscapes.draw.figures.census:census_figure",
+    "Convergence": "landscapes.draw.figures.convergence:convergence_figure",
+    "Episode": "landscapes.draw.figures.contact:episode_figure",
+    "Extremes": "landscapes.draw.figures.extremes:extremes_figure",
+    "ModelStudy": "landscapes.draw.figures.model:model_figure",
+    "SliceComparison": "landscapes.draw.figures.comparison:comparison_figure",
+}
+_PACKAGE = __name__.partition(".landscapes.")[0]
+
+
+class Picture(Figure):
+    """A figure that knows its sheet, draws without a window or any global state, and shows in a notebook.
+
+    `settle` lays it out, once. It has no layout engine: `savefig` draws a figure that has one twice.
+    """
+
+    def __init__(self, sheet: style.Sheet, height: float) -> None:
+        super().__init__(figsize=(sheet.width, height), layout="none")  # type: ignore[arg-type] # missing in its stub
+        self.sheet = sheet
+        self.fitted: dict[
+            Text, tuple[str, Callable[[], float]]
+        ] = {}  # what is wrapped to how much room there is [inch]
+        FigureCanvasAgg(self)
+
+    def _repr_png_(self) -> bytes:
+        """Return the picture as a notebook shows it."""
+        from .style import DPI
+
+        with io.BytesIO() as raw:
+            self.savefig(raw, format="png", dpi=DPI)
+            return raw.getvalue()
+
+
+def figure_of(record: Any, width: float | None = None) -> Picture:
+    """Draw a record for a screen, or for a page so wide [mm].
+
+    Raises TypeError where no figure is made of its class, ValueError where the page is too narrow or too wide.
+    """
+    for kind in type(record).__mro__:
+        if place := FIGURES.get(kind.__name__):
+            module, name = place.split(":")
+            draw = getattr(import_module(f"{_PACKAGE}.{module}"), name)
+            return cast("Picture", draw(record, width=width))
+    raise TypeError(f"{type(record).__name__} has no figure; those of {', '.join(sorted(FIGURES))} are drawn")
