@@ -15,7 +15,7 @@ import xarray as xr
 from zarr.storage import ZipStore
 
 import gradscape as gs
-from gradscape.cli import app
+from gradscape.cli import main
 from gradscape.envs.engines import runtime
 from gradscape.gallery.figures import Figure
 from gradscape.gallery.paper import PaperCaption
@@ -113,7 +113,8 @@ def test_lines_of_python_make_the_slice_that_the_command_makes(tmp_path: Path, m
     made = eval(call.removeprefix("s = "), {"gs": gs})
     words = shlex.split(figure.command("cpu"))
     assert words[0] == "landscape"
-    app([*words[1:], "--out", "command"], standalone_mode=False)
+    with pytest.raises(SystemExit):
+        main([*words[1:], "--out", "command"])
     by_command = gs.open_slice("command")
     assert (made.data["loss"] == by_command.data["loss"]).all()
     assert json.loads(made.data.attrs["identity"]) == json.loads(by_command.data.attrs["identity"])
