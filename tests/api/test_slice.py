@@ -12,6 +12,7 @@ import torch
 
 import gradscape as gs
 from gradscape.jobs.slice import SliceSummary
+from gradscape.landscapes.convert import from_json
 from gradscape.landscapes.identity import StoreMismatchError, stored_identity
 from gradscape.landscapes.objective import Objective
 
@@ -77,7 +78,7 @@ def test_what_raised_is_counted_and_said_and_a_loss_without_gradient_is_no_failu
         assert one.errors == said
         assert said in repr(one)
     assert float(cut.data["loss"].min()) == 0.0
-    summary = SliceSummary(**json.loads((tmp_path / "cut" / "summary.json").read_text()))
+    summary = from_json(SliceSummary, json.loads((tmp_path / "cut" / "summary.json").read_text()))
     assert "76 ok, 4 error, 1 no gradient; " + said in summary.outcome()
     assert gs.slice(bowl(), (0, 1), resolution=3).errors == ""
 
