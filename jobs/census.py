@@ -19,9 +19,8 @@ from ..landscapes.storage.files import replacing
 from ..landscapes.storage.records import read_json, reading
 from .folder import CENSUS, ROOT, folder_named
 from .job import CheckpointedJob
-from .plan import Work
 from .scene import SceneSpec, provenance
-from .watch import PREPARING, Watch
+from .watch import PREPARING, Watch, Work
 from .workers import recipe
 
 if TYPE_CHECKING:

@@ -12,9 +12,8 @@ from ..landscapes.capacity import Need, require
 from ..landscapes.conformance.finding import Finding
 from ..landscapes.cost import duration, episode_cost
 from ..landscapes.plain import plain
-from .plan import Work
 from .scene import SceneSpec
-from .watch import PREPARING, Say, Stopped, Watch
+from .watch import PREPARING, Say, Stopped, Watch, Work
 
 if TYPE_CHECKING:
     from collections.abc import Callable

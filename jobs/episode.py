@@ -14,9 +14,8 @@ from ..landscapes.objective import Status, failed, has_loss
 from ..landscapes.storage.files import tidy, write_json
 from .folder import EPISODE, folder_named
 from .job import Job
-from .plan import Work
 from .scene import named_point, provenance
-from .watch import Watch
+from .watch import Watch, Work
 
 if TYPE_CHECKING:
     from jaxtyping import Float

@@ -14,9 +14,8 @@ from ..landscapes.storage.checkpoint import Checkpoint
 from ..landscapes.storage.files import tidy
 from ..landscapes.storage.records import write_record
 from .folder import Results
-from .plan import Work
 from .studies import going_on
-from .watch import Watch, resumable
+from .watch import Watch, Work, resumable
 
 if TYPE_CHECKING:
     from ..envs.base import Environment

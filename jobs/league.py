@@ -25,10 +25,9 @@ from ..optim.registry import optimizer_class
 from ..optim.runs.journal import Journal
 from .folder import LEAGUE, ROOT, RUN_STORE, folder_named
 from .methods import check_methods, divide_methods
-from .plan import Work
 from .race import RaceJob, lockstep_seconds
 from .scene import AT, SceneSpec
-from .watch import PREPARING, Stopped, Watch, resumable
+from .watch import PREPARING, Stopped, Watch, Work, resumable
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor

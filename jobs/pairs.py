@@ -13,9 +13,8 @@ from ..landscapes.measures.sensitivity import Design, Pair, default_samples, exp
 from ..landscapes.storage.checkpoint import Checkpoint
 from .folder import PAIRS, ROOT, folder_named
 from .job import CheckpointedJob
-from .plan import Work
 from .scene import SceneSpec, provenance
-from .watch import PREPARING, Watch
+from .watch import PREPARING, Watch, Work
 
 if TYPE_CHECKING:
     import pandas as pd

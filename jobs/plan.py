@@ -6,27 +6,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
+from ..landscapes.capacity import peak_memory
 from ..landscapes.cost import seconds_per_episode
-from .watch import PREPARING, Watch
+from .watch import PREPARING, Watch, Work
 
 if TYPE_CHECKING:
     from ..landscapes.objective import Objective
 
 MEASURED = "measured here, now"
-
-
-@dataclass(frozen=True)
-class Work:
-    """Hold what a job has to simulate: `losses` without gradients and `gradients` with, and the bytes it leaves.
-
-    `memory` is what its own arrays take [bytes], without the simulation's.
-    """
-
-    objective: Objective
-    losses: int
-    gradients: int = 0
-    disk: float = 0.0
-    memory: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -123,8 +110,6 @@ def plan_work(works: Sequence[Work], command: str, watch: Watch, *, device: str 
 
 
 def _plan_part(work: Work, device: str | None) -> PlannedWork:
-    from .slice import peak_memory
-
     objective, identity = work.objective, work.objective.identity()
     counts, rate = {False: work.losses, True: work.gradients}, MEASURED
     if device is not None:

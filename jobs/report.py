@@ -32,9 +32,8 @@ from ..landscapes.storage.records import read_json, reading, write_record
 from ..landscapes.verification import RESAMPLE, verify_dataset
 from . import growth
 from .folder import REPORT, REPORTS, ROOT, SLICE_STORE, folder_named, store_in
-from .plan import Work
 from .scene import environment_of
-from .watch import PREPARING, Watch, resumable
+from .watch import PREPARING, Watch, Work, resumable
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -274,8 +273,8 @@ def estimate_seconds(env: Environment, losses: int, gradients: int) -> float:
 
 def _announce(env: Environment, dataset: xr.Dataset, points: int, watch: Watch) -> None:
     """Say what a report takes: its episodes, and what is measured of the slice itself."""
+    from ..landscapes.capacity import peak_memory
     from ..landscapes.measures.profile import effort, need_of, own_cost
-    from .slice import peak_memory
 
     rank = dataset["loss"].ndim
     losses, gradients = effort(rank, points, dataset["loss"].shape)

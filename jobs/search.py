@@ -23,10 +23,9 @@ from ..optim.runs.run import Run
 from ..optim.runs.store import RunStore
 from ..optim.search import SearchProgress, search
 from .folder import ROOT, RUN, SUMMARY, folder_named
-from .plan import Work
 from .scene import provenance
 from .studies import filling
-from .watch import PREPARING, Watch, resumable
+from .watch import PREPARING, Watch, Work, resumable
 
 if TYPE_CHECKING:
     from ..envs.base import Environment

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import resource
-import sys
 import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -22,7 +20,7 @@ import xarray as xr
 from jaxtyping import Float
 from torch import Tensor
 
-from ..landscapes.capacity import size
+from ..landscapes.capacity import peak_memory, size
 from ..landscapes.convert import to_json
 from ..landscapes.cost import duration, seconds_per_episode
 from ..landscapes.directions import barrier
@@ -45,9 +43,8 @@ from ..landscapes.storage.tiles import Tile
 from ..landscapes.verification import verify_dataset, verify_store
 from .folder import ROOT, SLICE, SUMMARY, folder_named
 from .job import Job
-from .plan import Work
 from .scene import provenance
-from .watch import PREPARING, Watch, resumable
+from .watch import PREPARING, Watch, Work, resumable
 from .workers import recipe
 
 if TYPE_CHECKING:
@@ -449,12 +446,6 @@ def first_points(store: SliceStore, tiles: Sequence[Tile], count: int) -> Float[
             parts.append(store.points(tile))
             size += len(parts[-1])
     return torch.cat(parts)[:count]
-
-
-def peak_memory() -> int:
-    """Return the most memory this process has held [bytes]."""
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak if sys.platform == "darwin" else 1024 * peak
 
 
 def default_folder(

@@ -32,10 +32,9 @@ from ..landscapes.storage.paths import check_replaceable, filling_path, slice_ex
 from ..landscapes.storage.store import SliceStore
 from .folder import ROOT, SWEEP, folder_named
 from .job import Job
-from .plan import Work
 from .scene import provenance
 from .slice import MAX_NAME_LETTERS, SliceCost, count_statuses, estimate_cost, flat_points, kind_of, range_of, say_range
-from .watch import PREPARING, Advance, Watch
+from .watch import PREPARING, Advance, Watch, Work
 from .workers import recipe
 
 if TYPE_CHECKING:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..landscapes.storage.disk import until_full
 
 if TYPE_CHECKING:
-    from .plan import Work
+    from ..landscapes.objective import Objective
 
 Advance = Callable[..., None]  # advance(done, said=""): so much is done, and what is said beside the bar
 AdvanceOne = Callable[[str, int, str], None]  # advance(name, done, said): the same, of one of several
@@ -18,6 +19,20 @@ Say = Callable[[str], None]  # say(text): what is being done now
 
 
 PREPARING = "preparing (kernels are compiled once, then kept)"
+
+
+@dataclass(frozen=True)
+class Work:
+    """Hold what a job has to simulate: `losses` without gradients and `gradients` with, and the bytes it leaves.
+
+    `memory` is what its own arrays take [bytes], without the simulation's.
+    """
+
+    objective: Objective
+    losses: int
+    gradients: int = 0
+    disk: float = 0.0
+    memory: float = 0.0
 
 
 class Stopped(KeyboardInterrupt):

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import resource
 import shutil
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -61,6 +63,12 @@ def available_memory() -> float:
         return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
     lines = dict(line.split(":") for line in MEMINFO.read_text().splitlines())
     return min([1024.0 * int(lines["MemAvailable"].split()[0]), *_group_limits()])
+
+
+def peak_memory() -> int:
+    """Return the most memory this process has held [bytes]."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else 1024 * peak
 
 
 def free_disk(folder: Path) -> float:
