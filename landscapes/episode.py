@@ -105,6 +105,6 @@ class Episode:
 
         Raises ValueError where the episode has no `parts`, which say what things look like.
         """
-        from .draw.figures.contact import episode_figure
+        from .draw.figure import figure_of
 
-        return episode_figure(self, keys=keys)
+        return figure_of(self, keys=keys)

@@ -51,8 +51,8 @@ class Picture(Figure):
             return raw.getvalue()
 
 
-def figure_of(record: Any, width: float | None = None) -> Picture:
-    """Draw a record for a screen, or for a page so wide [mm].
+def figure_of(record: Any, width: float | None = None, **options: Any) -> Picture:
+    """Draw a record for a screen, or for a page so wide [mm]; `options` are its figure's own.
 
     Raises TypeError where no figure is made of its class, ValueError where the page is too narrow or too wide.
     """
@@ -60,5 +60,5 @@ def figure_of(record: Any, width: float | None = None) -> Picture:
         if place := FIGURES.get(kind.__name__):
             module, name = place.split(":")
             draw = getattr(import_module(f"{_PACKAGE}.{module}"), name)
-            return cast("Picture", draw(record, width=width))
+            return cast("Picture", draw(record, width=width, **options))
     raise TypeError(f"{type(record).__name__} has no figure; those of {', '.join(sorted(FIGURES))} are drawn")
