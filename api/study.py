@@ -81,9 +81,9 @@ def study(
     seed
         Random seed.
     settings
-        Settings to change, a,b or repeated; the default is all that the environment has. fidelity takes dt, resolution,
-        particles, precision, stiffness, engine and device; convergence takes dt, resolution, particles, joint and
-        precision; extremes takes dt, resolution, box, horizon and options that are positive numbers.
+        Settings to change, a,b or repeated. Of fidelity: dt, resolution, particles, precision, stiffness, engine,
+        device. Of convergence: dt, resolution, particles, joint, precision. Of extremes: dt, resolution, box, horizon
+        and options that are positive numbers. The default is all that the environment has.
     pairs
         Of extremes: pairs of settings to map, as dt:ke, or none. The default is dt with each other setting.
     precisions

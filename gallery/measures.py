@@ -89,7 +89,7 @@ class FidelityPart(FigurePart):
 
     def seconds_each(self) -> float:
         """Estimate all variants by the work of their episodes."""
-        return self._open().study.forecast().total
+        return sum(self._open().seconds().values())
 
     def make(self, watch: Watch) -> str:
         """Measure every variant; those that are measured stay in a folder of their own under out/ until the last is."""
@@ -101,7 +101,7 @@ class FidelityPart(FigurePart):
         found = job.run(watch)
         files = StudyFiles.of(self.root, self.figure.env, found.device, found.kind)
         make_folder(files.record.parent)
-        shutil.copyfile(job.folder / job.files[1], files.picture)
+        shutil.copyfile(job.folder / job.results.picture, files.picture)
         lighten(files.picture)
         write_record(files.record, to_json(found))
         return f"{len(found.table())} variants at {found.points} points"

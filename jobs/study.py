@@ -76,18 +76,25 @@ class StudyJob(CheckpointedJob[StudyRecord]):
         """Say how much of it is on disk."""
         return self.study.describe_kept()
 
+    def seconds(self) -> dict[str, float]:
+        """Estimate the seconds of each variant that is left, by the work of an episode."""
+        env = self.study.env
+        left = [(one, expected_work(one.env)) for one in self.study.expected()]
+        if not left:
+            return {}
+        base = env.remake(fidelity=next(iter(env.fidelities)))
+        base.prepare()
+        rate = seconds_per_episode(base, base.space.sobol(len(self.study.x), seed=0), grad=True) / expected_work(base)
+        return {one.name: one.seconds + rate * work * one.episodes for one, work in left}
+
     def _announce(self, watch: Watch) -> None:
-        """Say what is left to measure and about how long that takes, by the work of an episode."""
+        """Say what is left to measure and about how long that takes."""
         study, env = self.study, self.study.env
         watch.note(f"{env.name} · {env.fidelity.name} · {env.device} · {env.engine} · {self.folder}")
         watch.note(f"{study.describe_left()} at {len(study.x)} points")
         with watch.busy(f"{env.name}: {PREPARING}"):
-            if not (left := list(study.expected())):
-                return
-            base = env.remake(fidelity=next(iter(env.fidelities)))
-            base.prepare()
-            rate = seconds_per_episode(base, base.space.sobol(len(study.x), seed=0), grad=True) / expected_work(base)
-        seconds = {one.name: one.seconds + rate * expected_work(one.env) * one.episodes for one in left}
-        dearest = max(seconds, key=lambda name: seconds[name])
-        most = f"{duration(seconds[dearest])} of it {dearest}, " if len(seconds) > 1 else ""
-        watch.note(f"about {duration(sum(seconds.values()))}, {most}by the work of an episode; {study.advice}")
+            seconds = self.seconds()
+        if seconds:
+            dearest = max(seconds, key=lambda name: seconds[name])
+            most = f"{duration(seconds[dearest])} of it {dearest}, " if len(seconds) > 1 else ""
+            watch.note(f"about {duration(sum(seconds.values()))}, {most}by the work of an episode; {study.advice}")

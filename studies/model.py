@@ -243,7 +243,7 @@ class ModelStudy(VariantStudy):
         return Expected(variant.name, env, len(self.x) + timed, seconds=samples.MIN_SECONDS)
 
     def run(self, watch: Watch, provenance: Mapping[str, Any], command: str) -> ModelRecord:
-        """Measure what is missing and return the record."""
+        """Measure what is missing and return the record. Raises ValueError where the full model cannot be measured."""
         arrays = self.measure_all(watch)
         if AGAIN not in arrays:
             raise ValueError(f"{self.env.name} cannot be repeated: {self.refused[AGAIN]}")

@@ -348,7 +348,10 @@ class VariantStudy(Study):
         return evaluate_points(self._make(variant), self.x, follow).arrays()
 
     def measure_all(self, watch: Watch) -> dict[str, dict[str, Any]]:
-        """Return the arrays of each variant that can be measured, by its name; what is kept is not measured again."""
+        """Return the arrays of each variant that can be measured, by its name; what is kept is not measured again.
+
+        Raises ValueError where the first, the reference, cannot be measured.
+        """
         found: dict[str, dict[str, Any]] = {}
         with watch.progress(len(self.variants), self.what) as advance:
             for number, variant in enumerate(self.variants):

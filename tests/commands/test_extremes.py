@@ -119,7 +119,7 @@ def test_the_table_says_what_is_beyond(run: Command, tmp_path: Path) -> None:
         (["--settings", "speed"], "stepping has settings dt, box; got speed"),
         (["--pairs", "dt"], "--pairs takes two settings as dt:box, or none; got 'dt'"),
         (["--tolerance", "-1"], "--tolerance takes a share"),
-        (["--against", "exact"], "to be judged by; got 'exact'"),
+        (["--reference", "exact"], "to be judged by; got 'exact'"),
     ],
 )
 def test_what_cannot_be_is_refused(arguments: list[str], said: str, run: Command, tmp_path: Path) -> None:

@@ -66,7 +66,7 @@ def test_the_front_door_has_the_same_study(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["ladder", "bounce"], "choices"),
+        (["ladder", "bounce"], "Choose from"),
         (["model", "parted", "--settings", "dt"], "study model takes points, seed; got settings"),
         (["fidelity", "bounce", "--fidelity", "draft"], "got draft, leave it out"),
         (["model", "branin"], "branin names no parts of its model"),

@@ -297,7 +297,7 @@ def test_a_record_is_read_as_it_was_written(tmp_path: Path) -> None:
         ({"pairs": ("dt",)}, "--pairs takes two settings as dt:box"),
         ({"precisions": ["half"]}, "--precisions takes float32, float64; got half"),
         ({"width": 0.0}, "--width takes a share between 0 and 1"),
-        ({"against": "exact"}, "has fidelities standard, reference to be judged by; got 'exact'"),
+        ({"reference": "exact"}, "has fidelities standard, reference to be judged by; got 'exact'"),
     ],
 )
 def test_what_cannot_be_is_refused(how: dict[str, Any], said: str, tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""`landscape study fidelity`, `--tolerance` and `landscape pairs`: what they leave, say, go on from and refuse."""
+"""`landscape study fidelity` and `--tolerance`: what they leave, say, go on from and refuse."""
 
 import json
 import weakref
@@ -338,24 +338,6 @@ def test_a_slice_at_a_measured_fidelity_can_be_cut_anew(run: Command, tmp_path: 
     assert json.loads((tmp_path / "cut/summary.json").read_text())["fidelity"] == "standard-dt-x0.5"
     anew = run("overlay", "cut", "searched", "--through", "best", "--device", "cpu", "--out", "over", cwd=tmp_path)
     assert anew.returncode == 0, anew.stderr
-
-
-def test_pairs_prints_the_command_that_slices_the_first(run: Command, tmp_path: Path) -> None:
-    how = ["pairs", "rastrigin", "--set", "dim=3", "--samples", "8", "--top", "2"]
-    done = run(*how, "--json", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    report = json.loads(done.stdout)
-    assert len(report["pairs"]) == 2
-    assert report["episodes"] == 8 * (1 + 5 * 3 + 3)
-    first = " ".join(map(str, report["pairs"][0]["dims"]))
-    assert f"landscape slice rastrigin --dims {first} --fidelity exact --set dim=3" in done.stderr
-    shown = run(*how, cwd=tmp_path)
-    assert "152 episodes" in shown.stdout
-    assert len(json.loads((tmp_path / report["folder"] / "pairs.json").read_text())["pairs"]) == 3
-
-
-def test_pairs_needs_two_parameters(run: Command, tmp_path: Path) -> None:
-    assert "a pair takes two" in run("pairs", "rastrigin", "--set", "dim=1", cwd=tmp_path).stderr
 
 
 def test_a_tolerance_is_a_share() -> None:
