@@ -34,7 +34,7 @@ def compute(
 
     The data folder then holds a folder per figure: slice.zarr at the fidelity of the figure, companions.json (the same
     slice through other points), episode-*.mp4 at some of its points, sweep.mp4 at draft fidelity, report.json and
-    measures.json. runs/ holds searches at the fidelity of the figures, tradeoff/ the accuracy and time of each
+    measures.json. runs/ holds searches at the fidelity of the figures, studies/ the accuracy and time of each
     environment, league/ races of nine methods. Stop at any time: the same command continues from there. A figure that
     fails does not stop the others; the exit code is then 1.
 
@@ -46,7 +46,7 @@ def compute(
         A figure's id or an environment. It may be repeated; the default is all figures.
     part
         Part to compute: slices, companions (the same slice through other points), sweeps, episodes, searches, reports,
-        tradeoffs, league or league-slices. It may be repeated; the default is all but the league, which takes longest.
+        fidelities, league or league-slices. It may be repeated; the default is all but the league, which takes longest.
     fidelity
         Accuracy of the simulation: draft, standard or reference. The default is that of each figure.
     resolution

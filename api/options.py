@@ -94,19 +94,12 @@ Data = Annotated[
 ]
 
 
-class SceneKeywords(TypedDict, total=False):
-    """The keywords of every function that simulates a scene: those of `SceneSpec`, with its defaults."""
+class MadeKeywords(TypedDict, total=False):
+    """The keywords by which a scene is made, with the defaults of `SceneSpec`."""
 
     fidelity: Annotated[
         FidelityName | None,
         Parameter(help="Accuracy of the simulation: draft, standard or reference. The default is the cheapest."),
-    ]
-    tolerance: Annotated[
-        str | None,
-        Parameter(
-            help="Pick the fastest fidelity whose measured loss error is below this: 5% of the spread of losses, or "
-            "a number in their unit. `landscape study fidelity` measures the errors."
-        ),
     ]
     device: Device
     engine: Annotated[
@@ -116,8 +109,20 @@ class SceneKeywords(TypedDict, total=False):
             "taichi, as an independent reference."
         ),
     ]
-    deterministic: Annotated[bool, Parameter(help="Fail if the engine is not reproducible on a GPU.")]
     options: Annotated[
         Settings,
         Parameter(name="--set", help="An option of the environment, as name=value. It may be repeated."),
     ]
+
+
+class SceneKeywords(MadeKeywords, total=False):
+    """The keywords of every function that simulates a scene: those of `SceneSpec`, with its defaults."""
+
+    tolerance: Annotated[
+        Share | None,
+        Parameter(
+            help="Pick the fastest fidelity whose measured loss error is below this share of the spread of losses, "
+            "such as 5%. `landscape study fidelity` measures the errors."
+        ),
+    ]
+    deterministic: Annotated[bool, Parameter(help="Fail if the engine is not reproducible on a GPU.")]

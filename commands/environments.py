@@ -35,9 +35,9 @@ def show_entries(found: list[Entry], console: Console) -> None:
 def show_environment(env: Environment, console: Console) -> None:
     """Print all there is to know about one environment."""
     from ..gallery.paper import read_paper
-    from ..jobs.margins import say_margins
     from ..landscapes.options import in_full
     from ..landscapes.space import LOG10
+    from ..studies.kept import describe_margins
 
     console = Console(soft_wrap=True, highlight=False)
     about = env.about() or "It says nothing of itself: its class has no docstring."
@@ -53,7 +53,7 @@ def show_environment(env: Environment, console: Console) -> None:
     for fidelity in env.fidelities.values():
         console.print(f"fidelity {fidelity.record()}")
     console.print(f"engines: {', '.join(env.engines)}")
-    for said in say_margins(env) if any(one.dt for one in env.fidelities.values()) else ():
+    for said in describe_margins(env) if any(one.dt for one in env.fidelities.values()) else ():
         console.print(said)
     console.print(in_full(env.Options))
     console.print(f"examples: {', '.join(env.examples) or 'none'}")

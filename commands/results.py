@@ -28,6 +28,7 @@ SHOWN = {
     "Report": "report:show",
     "Reports": "report:show_several",
     "SliceComparison": "compare:show",
+    "StudyRecord": "study:show",
     "type[Optimizer]": "environments:show_method",
 }
 

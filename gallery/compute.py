@@ -22,7 +22,7 @@ from .episodes import EpisodePart
 from .figures import Figure
 from .league import LeaguePart
 from .league_slices import LeagueSlicePart
-from .measures import ReportPart, TradeoffPart
+from .measures import FidelityPart, ReportPart
 from .parts import FigurePart, SearchPart, SlicePart, SweepPart
 
 T = TypeVar("T")
@@ -33,7 +33,7 @@ PARTS: dict[str, type[FigurePart]] = {
     "episodes": EpisodePart,
     "searches": SearchPart,
     "reports": ReportPart,
-    "tradeoffs": TradeoffPart,
+    "fidelities": FidelityPart,
     "league": LeaguePart,
     "league-slices": LeagueSlicePart,
 }

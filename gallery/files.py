@@ -2,8 +2,8 @@
 
 Of the data, a figure's folder holds `slice.zarr` and what else was made of it: `sweep.mp4` with `sweep.json`,
 `episodes.json` with a film and a picture of each episode, `companions.json` and `companions.png` of the same cut
-through other points, and the files of `landscape report`. Searches lie in `runs/ENVIRONMENT-OPTIONS/`, trade-offs in
-`tradeoff/`, censuses in `census/`, the races of the league in `league/`: figures share them. The report card of
+through other points, and the files of `landscape report`. Searches lie in `runs/ENVIRONMENT-OPTIONS/`, studies in
+`studies/`, censuses in `census/`, the races of the league in `league/`: figures share them. The report card of
 gradients is in `card/`.
 """
 
@@ -17,12 +17,11 @@ from ..jobs.folder import CARD as CARD_FILES
 from ..jobs.folder import LEAGUE as LEAGUE_FILES
 from ..jobs.folder import REPORT as REPORT_FILES
 from ..jobs.folder import SLICE as SLICE_FILES
-from ..jobs.folder import TRADEOFF as TRADEOFF_FILES
-from ..jobs.tolerance import CONVERGED
+from ..studies.kept import FOLDER, file_name
 
 HERE = Path(__file__).parent
 FIGURES, PAPER = HERE / "figures.toml", HERE / "paper.toml"
-DATA = HERE / "data"  # of a checkout; what is installed from a wheel has trade-offs there and no figures
+DATA = HERE / "data"  # of a checkout; what is installed from a wheel has studies there and no figures
 ELSEWHERE = Path("out") / "gallery-data"
 
 STORE, PICTURE = SLICE_FILES.store, SLICE_FILES.picture
@@ -33,7 +32,7 @@ REPORT, MEASURES, QUALITY, QUALITY_ARRAYS = REPORT_FILES.files
 COMPANIONS, COMPANION_PICTURE = "companions.json", "companions.png"
 SURFACES = ("surface.png", "surface.html", "surface.gltf", "surface.glb")
 RUNS, RUN_SUFFIX = "runs", ".zarr.zip"
-TRADEOFFS = "tradeoff"
+STUDIES = FOLDER  # the folder of studies
 CARD = "card"  # the folder of the report card of gradients
 CARD_RECORD, CARD_PICTURE = CARD_FILES.files
 LEAGUE = "league"  # the folder of the league
@@ -43,8 +42,7 @@ WALL_PICTURE, WALL_TABLE = "wall.png", "wall.csv"  # of a slice of every environ
 THUMBNAIL = "thumbnail.png"  # of a slice, in a site
 COMPANION_TABLE, QUALITY_TABLE = "companions.csv", "gradient-quality.csv"  # of those pictures, in a site
 CSV, ZARR = "slice.csv", "slice.zarr.zip"  # a slice's data in a site
-TRADEOFF_PICTURE = TRADEOFF_FILES.picture  # in the folder of `landscape tradeoff`
-DEVICES = ("cuda", "cpu")  # that trade-offs are shown of
+DEVICES = ("cuda", "cpu")  # that studies are shown of
 REMAKE = "delete it, and `landscape gallery compute --part {}` makes it anew"
 
 _EPISODE = re.compile(r"episode-\d+-\d+\.(?:mp4|webp)")
@@ -73,37 +71,22 @@ def is_of_episode(file: Path) -> bool:
 
 
 @dataclass(frozen=True)
-class TradeoffFiles:
-    """Name the files of a trade-off: the record and the picture."""
+class StudyFiles:
+    """Name the files of a study: the record, the picture, and what the record holds as a table, in the site alone."""
 
     record: Path
     picture: Path
+    table: Path
 
     @classmethod
-    def of(cls, root: Path, env: str, device: str) -> TradeoffFiles:
-        """Return where the trade-off of an environment on a device is, in the gallery's data or in its site."""
-        record = root / TRADEOFFS / f"{env}-{device}.json"
-        return cls(record, record.with_suffix(".png"))
-
-    @classmethod
-    def of_model(cls, root: Path, env: str, device: str) -> TradeoffFiles:
-        """Return where the study of the parts of an environment's model is, beside its trade-off."""
-        return cls.of(root, env, f"{device}.model")
+    def of(cls, root: Path, env: str, device: str, kind: str) -> StudyFiles:
+        """Return where a kind of study of an environment on a device is, in the gallery's data or in its site."""
+        record = root / STUDIES / file_name(env, device, kind)
+        return cls(record, record.with_suffix(".png"), record.with_suffix(".csv"))
 
     def there(self) -> bool:
-        """Say whether both are there."""
+        """Say whether record and picture are there."""
         return self.record.exists() and self.picture.exists()
-
-    @property
-    def table(self) -> Path:
-        """What the record holds as a table, in the site alone."""
-        return self.record.with_suffix(".csv")
-
-    @property
-    def convergence(self) -> TradeoffFiles:
-        """The files of the study of convergence of the same scene, which may be missing."""
-        record = self.record.with_suffix(CONVERGED)
-        return TradeoffFiles(record, record.with_suffix(".png"))
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""What the gallery measures: the report of a figure's slice, the trade-off of its environment."""
+"""What the gallery measures: the report of a figure's slice, the study of its environment's fidelities."""
 
 from __future__ import annotations
 
@@ -8,19 +8,20 @@ from typing import TYPE_CHECKING
 
 from ..envs.registry import environment_class
 from ..jobs.scene import SceneSpec
-from ..jobs.variants import SETTINGS
 from ..jobs.watch import Watch
+from ..landscapes.convert import to_json
 from ..landscapes.storage.records import read_json
-from .files import DEVICES, MEASURES, QUALITY, QUALITY_ARRAYS, REPORT, STORE, TRADEOFF_PICTURE, TradeoffFiles
+from ..studies.fidelity import SETTINGS
+from .files import DEVICES, MEASURES, QUALITY, QUALITY_ARRAYS, REPORT, STORE, StudyFiles
 from .parts import FigurePart
 from .records import read_if_sound
 
 if TYPE_CHECKING:
-    from ..jobs.tradeoff import TradeoffJob
+    from ..jobs.study import StudyJob
 
 SEED = 0
-REPORT_POINTS, TRADEOFF_POINTS = 6, 64  # those of `landscape report` and `landscape tradeoff`
-TURNED = [one for one in SETTINGS if one not in ("engine", "device")]  # those take hours on another device
+REPORT_POINTS, STUDY_POINTS = 6, 64  # those of `landscape report` and `landscape study fidelity`
+CHANGED = tuple(one for one in SETTINGS if one not in ("engine", "device"))  # those take hours on another device
 
 
 class ReportPart(FigurePart):
@@ -68,7 +69,7 @@ class ReportPart(FigurePart):
         return ", ".join(report.words)
 
 
-class TradeoffPart(FigurePart):
+class FidelityPart(FigurePart):
     """Accuracy against time of the figure's environment, which its other figures share."""
 
     @property
@@ -78,18 +79,17 @@ class TradeoffPart(FigurePart):
 
     def label(self) -> str:
         """Return the command that measures it elsewhere."""
-        turned = ",".join(TURNED)
-        return f"landscape tradeoff {self.figure.env} --device {self.device} --variants {turned}"
+        return f"landscape study fidelity {self.figure.env} --device {self.device} --settings {','.join(CHANGED)}"
 
     def count_left(self) -> int:
-        """Return 1 where there is none, of an environment that has fidelities to trade."""
+        """Return 1 where there is none, of an environment that has fidelities to compare."""
         some = len(environment_class(self.figure.env).fidelities) > 1
         devices = DEVICES if self.device == "auto" else (self.device,)
         return int(some and not any(map(self._sound, devices)))
 
     def seconds_each(self) -> float:
         """Estimate all variants by the work of their episodes."""
-        return sum(self._open().estimate().values())
+        return sum(self._open().seconds().values())
 
     def make(self, watch: Watch) -> str:
         """Measure every variant; those that are measured stay in a folder of their own under out/ until the last is."""
@@ -99,20 +99,22 @@ class TradeoffPart(FigurePart):
 
         job = self._open()
         found = job.run(watch)
-        files = TradeoffFiles.of(self.root, self.figure.env, job.env.device)
+        files = StudyFiles.of(self.root, self.figure.env, found.device, found.kind)
         make_folder(files.record.parent)
-        shutil.copyfile(job.folder / TRADEOFF_PICTURE, files.picture)
+        shutil.copyfile(job.folder / job.results.picture, files.picture)
         lighten(files.picture)
-        write_record(files.record, found.record())
-        return f"{len(found.variants)} variants at {found.points} points"
+        write_record(files.record, to_json(found))
+        return f"{len(found.table())} variants at {found.points} points"
 
     def _sound(self, device: str) -> bool:
         """Whether there is one of a device."""
-        files = TradeoffFiles.of(self.root, self.figure.env, device)
+        files = StudyFiles.of(self.root, self.figure.env, device, "fidelity")
         return bool(read_if_sound(read_json, files.record)) and files.picture.is_file()
 
-    def _open(self) -> TradeoffJob:
-        from ..jobs.tradeoff import TradeoffJob
+    def _open(self) -> StudyJob:
+        from ..jobs.study import StudyJob
+        from ..studies.variants import StudyOptions
 
         scene = SceneSpec(self.figure.env, device=self.device)
-        return TradeoffJob.open(scene, points=TRADEOFF_POINTS, seed=SEED, settings=TURNED, command=self.label())
+        options = StudyOptions(points=STUDY_POINTS, seed=SEED, settings=CHANGED)
+        return StudyJob.open("fidelity", scene, options, command=self.label())

@@ -13,6 +13,7 @@ from ..landscapes.storage.files import other_files, visible_files
 from ..landscapes.storage.ownership import refuse_others
 from ..landscapes.storage.paths import slice_exists
 from ..optim import runs
+from ..studies import KINDS
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -61,11 +62,7 @@ REPORT = Results(
     "gradient-quality.png",
 )
 REPORTS = Results("set of reports", ("report.json", "report.md"))
-TRADEOFF = Results("trade-off", ("tradeoff.json", "tradeoff.png"), "tradeoff.png")
-MODEL = Results("model study", ("model.json", "model.png"), "model.png")
-MIXED = Results("search of mixed variants", ("mixed.json", "mixed.png"), "mixed.png")
-CONVERGENCE = Results("study of convergence", ("convergence.json", "convergence.png"), "convergence.png")
-EXTREMES = Results("study of extremes", ("extremes.json", "extremes.png"), "extremes.png")
+STUDIES = {kind: Results(f"{kind} study", (f"{kind}.json", f"{kind}.png"), f"{kind}.png") for kind in KINDS}
 CARD = Results("report card", ("card.json", "card.png"), "card.png")
 PAIRS = Results("study of pairs", ("pairs.json",))
 CENSUS = Results("census", ("census.json", "census.npz", "census.png"), "census.png")

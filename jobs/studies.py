@@ -30,11 +30,17 @@ def going_on(
     Raises StoreMismatchError where it gives other numbers than when the study began, and as `resumable` does.
     """
     with resumable(kept), holding(pieces.folder, watch.note):
-        if (env := make()) is not None:
-            with watch.busy(PREPARING):
-                pieces.verify(env)
-                free_memory()  # which the environment has taken, if nobody else has it
+        _verify(pieces, make, watch)
         yield
+
+
+def _verify(pieces: Checkpoint, make: Callable[[], Environment | None], watch: Watch) -> None:
+    """Verify the environment that `make` returns, which is gone afterwards with the memory it has taken."""
+    if (env := make()) is not None:
+        with watch.busy(PREPARING):
+            pieces.verify(env)
+            del env
+            free_memory()
 
 
 @contextmanager

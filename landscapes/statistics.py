@@ -97,3 +97,34 @@ def mean(values: Values, *, least: float = -np.inf, most: float = np.inf) -> Est
         return Estimate(value, math.nan, math.nan)
     reach = float(known.std(ddof=1)) / math.sqrt(len(known)) * float(student(len(known) - 1))
     return Estimate(value, max(least, value - reach), min(most, value + reach))
+
+
+def gradient_error(grad: Values, reference: Values) -> tuple[Values, Values]:
+    """Return cosine and relative error of each gradient, shapes (point,); two that are exactly zero agree."""
+    sizes = np.linalg.norm(grad, axis=-1), np.linalg.norm(reference, axis=-1)
+    both = (sizes[0] == 0) & (sizes[1] == 0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        units = [np.nan_to_num(g / size[:, None]) for g, size in zip((grad, reference), sizes, strict=True)]
+        off = np.linalg.norm(grad - reference, axis=-1) / sizes[1]
+    return np.where(both, 1.0, (units[0] * units[1]).sum(axis=-1)), np.where(both, 0.0, off)
+
+
+def spearman(a: Values, b: Values) -> Values:
+    """Return Spearman's rank correlation along the last axis, NaN where one side has a single value."""
+    from scipy.stats import rankdata
+
+    ranks = [rankdata(side, axis=-1) for side in (a, b)]
+    ranks = [rank - rank.mean(axis=-1, keepdims=True) for rank in ranks]
+    with np.errstate(invalid="ignore"):
+        found: Values = (ranks[0] * ranks[1]).sum(-1) / np.sqrt((ranks[0] ** 2).sum(-1) * (ranks[1] ** 2).sum(-1))
+    return found
+
+
+def median_of(values: Values) -> Values:
+    """Return the median along the last axis."""
+    return np.asarray(np.median(values, axis=-1))
+
+
+def p95_of(values: Values) -> Values:
+    """Return the 95th percentile along the last axis: the next larger of the values, not interpolated."""
+    return np.asarray(np.quantile(values, 0.95, axis=-1, method="higher"))

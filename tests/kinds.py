@@ -32,7 +32,8 @@ CUT = "slice ackley --set dim=3 --dims 0 1 --resolution 6 --out"
 SEARCH = "optimize ackley --set dim=3 --method cma-es --budget 30 --seed 1 --out"
 BOUNCE = "bounce --fidelity draft --device cpu"
 TURN = (
-    "extremes bounce --fidelity draft --set horizon=0.05 --points 4 --knobs dt --precisions float64 --device cpu --out"
+    "study extremes bounce --fidelity draft --set horizon=0.05 --points 4 --settings dt --precisions float64 "
+    "--device cpu --out"
 )
 EXPORT = f"export {MADE} --out {READ}/table.csv"
 GALLERY = f"gallery compute --resolution 6 --fidelity draft --device cpu --data {MADE}"
@@ -82,9 +83,9 @@ KINDS = {
     "pairs": Kind(f"pairs ackley --set dim=3 --samples 2 --out {MADE} --json"),
     "census": Kind(f"census ackley --set dim=3 --slices 4 --resolution 6 --out {MADE} --json"),
     "card": Kind(f"card --scene control --resolution 3 --out {MADE} --json"),
-    "tradeoff": Kind(f"tradeoff bounce --device cpu --points 2 --variants precision --out {MADE} --json"),
-    "kept tradeoff": Kind(
-        f"tradeoff bounce --device cpu --set horizon=0.5 --points 2 --variants precision --out {MADE}",
+    "fidelity": Kind(f"study fidelity bounce --device cpu --points 2 --settings precision --out {MADE} --json"),
+    "kept fidelity": Kind(
+        f"study fidelity bounce --device cpu --set horizon=0.5 --points 2 --settings precision --out {MADE}",
         (f"slice bounce --device cpu --tolerance 20% --set horizon=0.5 --dims 0 1 --resolution 3 --out {READ}",),
         where="home/gradscape",
     ),
@@ -108,8 +109,8 @@ KINDS = {
         (f"gallery list --json --data {MADE}", f"gallery build --data {MADE} --out {READ}",
          f"report --all --points 2 --data {MADE} --out {READ} --json"),
     ),
-    "gallery tradeoff": Kind(
-        f"{GALLERY} --only bounce-y --part slices --part tradeoffs",
+    "gallery study": Kind(
+        f"{GALLERY} --only bounce-y --part slices --part fidelities",
         (f"gallery build --data {MADE} --out {READ}",),
     ),
 }  # fmt: skip

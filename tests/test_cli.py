@@ -137,7 +137,7 @@ def test_bad_input_gets_one_line_and_exit_code_2(
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("verb", [("slice",), ("tradeoff", "--ladder", "convergence"), ("check",)])
+@pytest.mark.parametrize("verb", [("slice",), ("study", "convergence"), ("check",)])
 def test_a_device_without_memory_for_a_point_is_one_line_and_exit_code_1(
     run: Callable[..., Said], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, verb: tuple[str, ...]
 ) -> None:

@@ -53,8 +53,7 @@ VALUES = {"--resolution": "2", "--budget": "3", "--seeds": "1", "--frames": "2",
 ADDED = {
     "race": ["--seeds", "1", "--budget", "3", "--device", "cpu"],
     "league": ["--seeds", "1", "--budget", "3", "--device", "cpu"],
-    "tradeoff": ["--points", "2", "--variants", "precision"],
-    "extremes": ["--points", "4", "--knobs", "dt", "--device", "cpu", "--set", "horizon=0.05"],
+    "study": ["--points", "4", "--device", "cpu"],
     "replay": ["--no-film"],
     "bounce": ["--resolution", "3"],
     "slice": ["--resolution", "2"],
@@ -67,7 +66,7 @@ ADDED = {
     "gallery build": ["--data", "few", "--out", "site"],
     "gallery serve": ["--out", "served", "--port", "0"],
 }
-SCENES = {verb: {"fluid": "bounce", "flip": "bounce"} for verb in ("race", "optimize", "tradeoff", "extremes")}
+SCENES = {verb: {"fluid": "bounce", "flip": "bounce"} for verb in ("race", "optimize", "study")}
 SCENES["league"] = {"fluid@standard": "branin"}
 SCENES["--tolerance"] = {"fluid": "bounce", "6": "0", "8": "1"}
 SHORT = {
@@ -78,7 +77,7 @@ SHORT = {
     "plan": {"fluid"},
     "race": {"bounce"},
     "optimize": {"bounce"},
-    "tradeoff": {"bounce", "cartpole"},
+    "study": {"bounce", "cartpole"},
     "census": {"bounce"},
     "--tolerance": {"bounce"},
 }
@@ -115,10 +114,9 @@ def small(command: str) -> list[str]:
         found[at + 1] = VALUES.get(word, found[at + 1])
     added = ADDED.get(verb, []) + (TAICHI if "taichi" in found else [])
     pairs = [added[at : at + 2] for at in range(0, len(added), 2)] if verb != "replay" else [added]
-    pairs = [pair for pair in pairs if not (pair[0] == "--variants" and "--ladder" in found)]  # which go not together
-    if "mixed" in found:  # whose budget is in seconds
-        found += [] if "--budget" in found else ["--budget", ""]
-        found[found.index("--budget") + 1] = "0.01"
+    if "mixed" in found:
+        found += [] if "--time-limit" in found else ["--time-limit", ""]
+        found[found.index("--time-limit") + 1] = "0.01"
     short = TENTH if SHORT.get(kind, set()) & {*found} else []
     return [*found, *(word for pair in pairs if pair[0] not in found for word in pair), *short]
 
@@ -200,7 +198,7 @@ def test_every_command_runs(
     monkeypatch.setattr("http.server.ThreadingHTTPServer.serve_forever", stop)
     monkeypatch.setattr(view, "show_recording", lambda path, *, serve: opened.append(path))
     for name, value in (("REPETITION", 0.01), ("LARGEST", 0.01), ("RESAMPLES", 9)):
-        monkeypatch.setattr(f"gradscape.landscapes.measures.fidelity.{name}", value)
+        monkeypatch.setattr(f"gradscape.studies.samples.{name}", value)
     if "taichi" in command.split() and find_spec("taichi") is None:
         pytest.skip("Taichi has no wheels past Python 3.12")
     words = [request.getfixturevalue("address") if word == "ADDRESS" else word for word in small(command)]

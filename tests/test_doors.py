@@ -9,9 +9,10 @@ from typing import Any
 import pytest
 
 import gradscape as gs
+from gradscape.cli import verbs
 from gradscape.envs.registry import as_environment, entries
 
-from .command import Said, leave_blank, verbs
+from .command import Said, leave_blank
 
 SIMULATORS = """
 import jax.numpy as jnp
@@ -62,8 +63,7 @@ own = Own()
 NAMES = ("of_torch", "of_jax", "of_numpy", "of_warp", "Bowl", "bowl", "own")
 LACKING = {  # what some verbs need of a simulator
     "replay": "has no episode to draw; a class with a method `episode` has",
-    "tradeoff": "has one fidelity, default, so there is nothing",
-    "extremes": "nothing to turn",
+    "study": "has one fidelity, default, so there is nothing",
 }
 
 
@@ -105,8 +105,7 @@ def functions(f: Any, name: str) -> dict[str, Callable[[], Any]]:
         "compare": lambda: gs.compare(f"{name}/slice", f, out=f"{name}/compare"),
         "pairs": lambda: gs.pairs(f, samples=2, out=f"{name}/pairs"),
         "census": lambda: gs.census(f, slices=2, resolution=6, out=f"{name}/census"),
-        "tradeoff": lambda: gs.tradeoff(f, points=4, out=f"{name}/tradeoff"),
-        "extremes": lambda: gs.extremes(f, points=4, out=f"{name}/extremes"),
+        "study": lambda: gs.study("fidelity", f, points=4, out=f"{name}/study"),
     }
 
 
@@ -129,8 +128,7 @@ def commands(f: str, name: str) -> dict[str, str]:
         "pairs": f"pairs {f} --samples 2 --out {name}/p",
         "census": f"census {f} --slices 2 --resolution 6 --out {name}/n",
         "replay": f"replay {f}",
-        "tradeoff": f"tradeoff {f} --points 4 --out {name}/t",
-        "extremes": f"extremes {f} --points 4 --out {name}/x",
+        "study": f"study fidelity {f} --points 4 --out {name}/t",
     }
 
 
@@ -190,22 +188,24 @@ pendulum = gs.from_jax(
 def test_a_pendulum_with_fidelities_and_a_horizon_is_studied_like_a_scene(
     here: Path, run: Callable[..., Said], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("gradscape.landscapes.measures.fidelity.REPETITION", 0.0)
+    monkeypatch.setattr("gradscape.studies.samples.REPETITION", 0.0)
     Path("pendulum.py").write_text(PENDULUM)
     f = "pendulum.py:pendulum"
     for words in (
         f"check {f} --points 2",
         f"slice {f} --resolution 6 --fidelity reference --set damping=0.2 --out p/slice",
-        f"tradeoff {f} --points 4 --variants dt --out p/tradeoff",
-        f"tradeoff {f} --ladder convergence --points 4 --variants dt --out p/convergence",
+        f"study fidelity {f} --points 4 --settings dt --out p/fidelity",
+        f"study convergence {f} --points 4 --settings dt --out p/convergence",
         f"sweep {f} --dims 0 1 --over horizon --frames 2 --resolution 4 --out p/sweep",
         f"census {f} --slices 2 --resolution 6 --out p/census",
         f"race {f} --methods random,l-bfgs-b --budget 12 --seeds 2 --out p/race",
-        f"extremes {f} --points 4 --knobs damping --pairs none --precisions float64 --out p/extremes",
+        f"study extremes {f} --points 4 --settings damping --pairs none --precisions float64 --out p/extremes",
     ):
         said = run(*words.split(), cwd=here)
         assert said.returncode == 0, (words, said)
-    errors = gs.tradeoff(vars(_module(here, "pendulum.py"))["pendulum"], points=4, variants=("dt",), out="p/tradeoff")
+    errors = gs.study(
+        "fidelity", vars(_module(here, "pendulum.py"))["pendulum"], points=4, settings=("dt",), out="p/fidelity"
+    )
     median = errors.table()["median"]
     assert median["draft-dt-x0.5"] < median["draft"] < median["draft-dt-x2"]  # of the same time, by whole steps
     assert median["reference"] == 0

@@ -18,10 +18,6 @@ import gradscape as gs
 from gradscape import Environment, Evaluation, Fidelity, ParameterSpace, Plane
 from gradscape.envs.functions import Branin
 from gradscape.envs.records import ModelPart
-from gradscape.jobs.convergence import ConvergenceJob
-from gradscape.jobs.mixed import MixedJob
-from gradscape.jobs.model import ModelJob
-from gradscape.jobs.scene import SceneSpec
 from gradscape.jobs.slice import SliceJob
 from gradscape.jobs.watch import Stopped, Watch
 from gradscape.landscapes.identity import StoreMismatchError
@@ -231,20 +227,20 @@ STUDIES: dict[str, Callable[[Path], Any]] = {
     "race": lambda out: gs.race(Throw, ["random", "descents"], budget=6, seeds=2, out=out),
     "pairs": lambda out: gs.pairs(Throw, samples=2, out=out),
     "census": lambda out: gs.census(Throw, slices=1, resolution=6, out=out),
-    "tradeoff": lambda out: gs.tradeoff(Throw, points=2, variants=["precision"], out=out),
-    "convergence": lambda out: ConvergenceJob.open(SceneSpec(Throw), points=2, out=out).run(),
-    "model": lambda out: ModelJob.open(SceneSpec(Throw), points=2, out=out).run(),
-    "mixed": lambda out: MixedJob.open(SceneSpec(Throw), points=2, budget=0.01, out=out).run(),
-    "extremes": lambda out: gs.extremes(Throw, points=2, knobs=["dt"], precisions=["float64"], out=out),
+    "fidelity": lambda out: gs.study("fidelity", Throw, points=2, settings=["precision"], out=out),
+    "convergence": lambda out: gs.study("convergence", Throw, points=2, out=out),
+    "model": lambda out: gs.study("model", Throw, points=2, out=out),
+    "mixed": lambda out: gs.study("mixed", Throw, points=2, time_limit=0.01, out=out),
+    "extremes": lambda out: gs.study("extremes", Throw, points=2, settings=["dt"], precisions=["float64"], out=out),
 }
 
 
 @pytest.mark.parametrize("study", STUDIES)
 def test_the_same_call_after_an_edit_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, study: str) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("gradscape.jobs.margins.user_data_path", lambda name: tmp_path / "user" / name)
-    for name in ("fidelity.REPETITION", "fidelity.LARGEST", "turns.LASTING", "turns.ENOUGH"):
-        monkeypatch.setattr(f"gradscape.landscapes.measures.{name}", 0.002)
+    monkeypatch.setattr("gradscape.studies.kept.user_data_path", lambda name: tmp_path / "user" / name)
+    for name in ("REPETITION", "LARGEST", "MIN_SECONDS", "BATCH_SECONDS"):
+        monkeypatch.setattr(f"gradscape.studies.samples.{name}", 0.002)
     out = tmp_path / "made"
     STUDIES[study](out)
     STUDIES[study](out)

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from gradscape.cli import verbs
-from gradscape.landscapes.measures import fidelity as tradeoff
+from gradscape.studies import samples
 
 from .command import Said
 
@@ -32,13 +32,9 @@ WRITING = {  # the command, the file for which there is no room any more, what i
         "league branin --methods random --seeds 1 --budget 4 --out made", "league.json",
         "4 of 4 episodes are kept in made",
     ),
-    "tradeoff": (
-        "tradeoff bounce --set horizon=0.05 --points 2 --variants precision --device cpu --out made", "tradeoff.json",
-        "variants are kept in made",
-    ),
-    "extremes": (
-        "extremes bounce --set horizon=0.05 --points 4 --knobs dt --precisions float64 --device cpu --out made",
-        "extremes.json", "settings are kept in made",
+    "study": (
+        "study fidelity bounce --set horizon=0.05 --points 2 --settings precision --device cpu --out made",
+        "fidelity.json", "variants are kept in made",
     ),
     "pairs": ("pairs branin --samples 2 --out made", "pairs.json", "2 batches are kept in made"),
     "census": ("census branin --slices 1 --resolution 6 --out made", "census.json", "1 of 1 slices are kept in made"),
@@ -68,11 +64,10 @@ def test_every_verb_that_writes_is_tried() -> None:
 def test_a_full_disk_says_what_is_kept_and_the_same_command_goes_on(
     run: Command, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, verb: str
 ) -> None:
-    for module in ("tolerance", "margins"):
-        monkeypatch.setattr(f"gradscape.jobs.{module}.user_data_path", lambda name: tmp_path / "data" / name)
+    monkeypatch.setattr("gradscape.studies.kept.user_data_path", lambda name: tmp_path / "data" / name)
     for name in ("REPETITION", "LARGEST"):
-        monkeypatch.setattr(tradeoff, name, 0.002)
-    monkeypatch.setattr(tradeoff, "RESAMPLES", 9)
+        monkeypatch.setattr(samples, name, 0.002)
+    monkeypatch.setattr(samples, "RESAMPLES", 9)
     command, last, kept = WRITING[verb]
     for needed, made in (("cut", SLICE), ("run", SEARCH)):
         if needed in command.split():

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parent.parent
-FOLDERS = ("api", "commands", "envs", "gallery", "jobs", "landscapes", "optim")
+FOLDERS = ("api", "commands", "envs", "gallery", "jobs", "landscapes", "optim", "studies")
 SOURCES = sorted([ROOT / "cli.py", *(file for folder in FOLDERS for file in (ROOT / folder).rglob("*.py"))])
 LONGEST = 40  # lines of a function, but for its signature, its docstring and functions within it
 Function = ast.FunctionDef | ast.AsyncFunctionDef

@@ -58,7 +58,7 @@ def test_four_kills_change_no_bit(job: str, tmp_path: Path) -> None:
         (["sweep", *BOUNCE, "--over", "2", "--frames", "2"], "frames/.0.zarr"),
         (["optimize", "bounce", "--method", "random", *SEARCH], ".run.zarr"),
         (["race", "bounce", "--methods", "random", "--seeds", "2", *SEARCH], "random-0/.run.zarr"),
-        (["tradeoff", "bounce", "--points", "2", "--variants", "engine"], ".settings.json"),
+        (["study", "fidelity", "bounce", "--points", "2", "--settings", "engine"], ".settings.json"),
         (["pairs", "bounce", "--samples", "2"], ".pairs.json"),
         (["replay", "bounce", "--no-film"], ".episode.mp4"),
     ],
@@ -71,9 +71,9 @@ def test_what_a_kill_left_in_a_folder_is_no_other_file_and_goes(
     place.mkdir(parents=True)
     (place / "zarr.json").write_text("{}")
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("gradscape.jobs.tolerance.user_data_path", lambda name: tmp_path / "data" / name)
+    monkeypatch.setattr("gradscape.studies.kept.user_data_path", lambda name: tmp_path / "data" / name)
     for name in ("REPETITION", "LARGEST"):
-        monkeypatch.setattr(f"gradscape.landscapes.measures.fidelity.{name}", 0.002)
+        monkeypatch.setattr(f"gradscape.studies.samples.{name}", 0.002)
     with pytest.raises(SystemExit) as ended:
         main([*command, "--device", "cpu", "--out", "made"])
     assert not ended.value.code

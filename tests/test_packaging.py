@@ -15,9 +15,8 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 
 def test_every_linked_folder_is_the_one_at_the_root() -> None:
     links = {link.name: link.resolve() for link in (ROOT / "src/gradscape").iterdir() if link.is_symlink()}
-    assert links == {
-        name: ROOT / name for name in ("landscapes", "envs", "optim", "gallery", "jobs", "api", "commands", "cli.py")
-    }
+    folders = ("landscapes", "envs", "optim", "studies", "gallery", "jobs", "api", "commands", "cli.py")
+    assert links == {name: ROOT / name for name in folders}
 
 
 def test_constraints_are_plain_and_cover_every_dependency() -> None:

@@ -9,13 +9,13 @@ from typing import Any, get_args
 
 import pytest
 
+from gradscape.cli import verbs
 from gradscape.envs.registry import make
 from gradscape.jobs import plan
 from gradscape.landscapes.capacity import TooLargeError
 from gradscape.optim.memory import SearchSize, require_method
 from gradscape.optim.registry import methods, optimizer_class
 
-from .command import verbs
 from .processes import Ended, alone, landscape
 
 HUGE = 10**15
@@ -58,7 +58,7 @@ def _said(parameter: Any, path: tuple[str, ...]) -> list[str]:
     if name.startswith("-"):
         return [name, *NEEDED[name].split()] if name in NEEDED else []
     subject = SUBJECTS.get(parameter.metavar, "")
-    return ["bounce" if path == ("tradeoff",) else subject] if subject else []
+    return ["bounce" if path == ("study",) else subject] if subject else []
 
 
 def limited(*arguments: str) -> None:

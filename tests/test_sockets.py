@@ -13,11 +13,11 @@ from typing import Any
 
 import pytest
 
-from gradscape.cli import main
+from gradscape.cli import main, verbs
 from gradscape.jobs import workers as cluster
 from gradscape.landscapes.draw.recordings import viewer
 
-from .command import leave_blank, verbs
+from .command import leave_blank
 from .processes import FORK
 from .sockets import beyond_loopback, listening
 
@@ -40,9 +40,9 @@ bounce --axis y --resolution 3 --fidelity draft --device cpu
 plan bounce --resolution 2 --fidelity draft --device cpu
 bench bounce --batch 2 --seconds 0 --fidelity draft --device cpu
 check branin --points 2
-tradeoff cartpole --set horizon=0.02 --points 2 --variants precision --device cpu
-tradeoff cartpole --set horizon=0.02 --points 2 --ladder mixed --chaotic --budget 0.01 --device cpu
-extremes bounce --set horizon=0.05 --points 4 --knobs dt --precisions float64 --fidelity draft --device cpu
+study fidelity cartpole --set horizon=0.02 --points 2 --settings precision --device cpu
+study mixed cartpole --set horizon=0.02 --points 2 --chaotic --time-limit 0.01 --device cpu
+study extremes bounce --set horizon=0.05 --points 4 --settings dt --precisions float64 --fidelity draft --device cpu
 pairs bounce --samples 2 --fidelity draft --device cpu
 report cut --points 2 --device cpu
 census branin --slices 1 --resolution 6
@@ -122,7 +122,7 @@ def walk(folder: Path) -> None:
     patch = pytest.MonkeyPatch()
     leave_blank(patch.setattr)
     for name, value in (("REPETITION", 0.002), ("LARGEST", 0.002), ("RESAMPLES", 9)):
-        patch.setattr(f"gradscape.landscapes.measures.fidelity.{name}", value)
+        patch.setattr(f"gradscape.studies.samples.{name}", value)
     patch.setattr(viewer, "_rerun", windowless)
     sys.addaudithook(watch)
     found = {}

@@ -15,8 +15,9 @@ import pytest
 import scipy
 
 from gradscape import __main__ as command
+from gradscape.cli import verbs
 
-from .command import modules, verbs
+from .command import modules
 
 PROJECT = tomllib.loads((Path(__file__).parent.parent / "pyproject.toml").read_text())["project"]
 TOLD = {"cyclopts", "rich"}  # a command's words, and its tables
@@ -56,7 +57,13 @@ def packages(loaded: set[str]) -> set[str]:
 
 
 REFUSED = (
-    *("slice nosuch --dims 0 1", "check own.py:Bowls", "check missing.py:Bowl", "replay nosuch", "tradeoff nosuch"),
+    *(
+        "slice nosuch --dims 0 1",
+        "check own.py:Bowls",
+        "check missing.py:Bowl",
+        "replay nosuch",
+        "study fidelity nosuch",
+    ),
     *("slice branin --dims 7 8", "slice fluid --dims 0 --along gradient", "slice fluid --along nowhere"),
     *("slice fluid --dims 0 --resolution x", "slice fluid --dims 0 --window x", "slice fluid --dims 0 --refine x"),
     *("slice fluid --dims 0 --tolerance x", "slice fluid --dims 0 --tolerance 5% --fidelity draft"),
@@ -65,7 +72,7 @@ REFUSED = (
     *("sweep fluid --dims 0 1 --over 12", "plan fluid --dims 12 0", "plan nosuch.toml", "plan fluid --methods nosuch"),
     *("race fluid --methods nosuch", "race fluid --methods random --option bo.a=1", "optimize bounce --method nosuch"),
     *("league nosuch", "league fluid@nosuch", "league fluid --methods nosuch", "methods nosuch", "envs nosuch"),
-    *("report nosuch", "report fluid --fidelity nosuch", "bench fluid --against nosuch", "tradeoff fluid --ladder no"),
+    *("report nosuch", "report fluid --fidelity nosuch", "bench fluid --against nosuch", "study no fluid"),
     *("compare nosuch fluid", "overlay nosuch run", "surface nosuch", "export nosuch", "view nosuch", "nosuch"),
 )
 

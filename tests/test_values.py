@@ -41,6 +41,7 @@ view cut
 bounce --axis y --resolution 3
 bench branin --batch 2 --seconds 0
 check branin --points 2
+study fidelity bounce --points 2 --settings dt
 pairs ackley --samples 2 --top 3
 census ackley --slices 1 --resolution 6
 card --scene control --resolution 3
@@ -52,7 +53,7 @@ gallery serve
 """.strip().splitlines()
 
 
-VERBS = {tuple(words.split()): verb for words, verb in verbs().items() if words not in ("info", "plan", "study")}
+VERBS = {tuple(words.split()): verb for words, verb in verbs().items() if words not in ("info", "plan")}
 WORDS = {verb: next(words for line in BASE if (words := line.split())[: len(verb)] == [*verb]) for verb in VERBS}
 PATHS = [  # of what a verb says that it is a file or a folder
     pytest.param(verb, option, id=f"{' '.join(verb)} {option.names[0]}")

@@ -71,7 +71,7 @@ def tree(folder: Path, *, data: bool = False) -> Path:
 
     def ignored(place: str, names: list[str]) -> set[str]:
         lost = shutil.ignore_patterns(*NOT_SENT, *LOST)(place, names)
-        figures = set(names) - {"tradeoff", "extremes"} if place.endswith("gallery/data") and not data else set()
+        figures = set(names) - {"studies"} if place.endswith("gallery/data") and not data else set()
         return lost | figures
 
     shutil.copytree(ROOT, folder, symlinks=True, ignore=ignored)
@@ -173,7 +173,7 @@ def test_every_file_of_the_package_is_sent(built: dict[str, Path], kind: str) ->
         for place, _, names in os.walk(package, followlinks=True)
         for name in names
     }
-    measured = ("gallery/data/tradeoff/", "gallery/data/extremes/")
+    measured = ("gallery/data/studies/",)
     pictures = {name for name in wanted if name.startswith(measured) and name.endswith(".png")}
     assert names_of(built[kind]) == wanted - pictures
     assert "cli.py" in wanted

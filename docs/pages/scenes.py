@@ -8,8 +8,8 @@ from pathlib import Path
 
 from gradscape.envs.base import Environment
 from gradscape.envs.registry import BUILTIN, EXTRAS, Entry, installs, make
-from gradscape.jobs.margins import say_margins
 from gradscape.landscapes.options import in_full
+from gradscape.studies.kept import describe_margins
 
 from .kept import NOT_MEASURED, Kept, KeptFigure
 from .pictures import draw_function, draw_slice, shown
@@ -96,7 +96,7 @@ def _settings(env: Environment) -> Iterator[str]:
     yield "Options: none." if not options else "Options:\n\n" + "\n".join(f"- `{one}`" for one in options)
     yield prose(explained)
     if any(one.dt for one in env.fidelities.values()):
-        yield "\n".join(f"- {prose(line)}" for line in say_margins(env))
+        yield "\n".join(f"- {prose(line)}" for line in describe_margins(env))
 
 
 def _measured(entry: Entry, kept: Kept) -> Iterator[str]:

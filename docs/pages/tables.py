@@ -11,17 +11,22 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from gradscape.envs.registry import entries, environment_class
 from gradscape.gallery.figures import read_figures
 from gradscape.gallery.files import DATA, DEVICES
 from gradscape.gallery.paper import read_paper
 from gradscape.jobs.report import Report, environments_markdown
-from gradscape.landscapes.measures.choice import CLAIMS, Claim, Shortfall
-from gradscape.landscapes.measures.fidelity import Comparison
 from gradscape.landscapes.storage.records import read_json
+from gradscape.studies.claims import CLAIMS, Claim, Shortfall
+from gradscape.studies.extremes import ExtremesRecord, Limit
+from gradscape.studies.fidelity import FidelityRecord
+from gradscape.studies.kept import file_name, read_study
+from gradscape.studies.model import MeasuredPart, ModelRecord
+from gradscape.studies.variants import StudyRecord
 
 from .text import table
 
@@ -56,6 +61,13 @@ def kept(pattern: str, scene: str, data: Path = DATA) -> list[Record] | str:
     files = (data / pattern.format(scene, device) for device in DEVICES)
     records = [read_json(file) for file in files if file.exists()]
     return [one for one in records if present(one)] or (UNMEASURED if records else MISSING)
+
+
+def studies(kind: str, scene: str, data: Path = DATA) -> list[StudyRecord] | str:
+    """Return a scene's studies of a kind, of its present model, or why there are none."""
+    files = (data / "studies" / file_name(scene, device, kind) for device in DEVICES)
+    found = [read_study(file, kind) for file in files if file.exists()]
+    return [one for one in found if present({"identity": one.identity})] or (UNMEASURED if found else MISSING)
 
 
 def censuses() -> str:
@@ -112,24 +124,28 @@ def margins() -> str:
     """How near standard's step is to the longest that is stable, by precision."""
     rows = []
     for scene in scenes():
-        found = kept("extremes/{}-{}.json", scene)
+        found = studies("extremes", scene)
         if isinstance(found, str):
             rows.append([f"`{scene}`", *[""] * 4, found, "", ""])
             continue
-        limits = [(one, limit) for one in found for limit in one["limits"] if limit["knob"] == "dt"]
-        rows += [[f"`{scene}`", one["identity"]["device"], *_margin(limit)] for one, limit in limits]
+        limits = [
+            (one, limit)
+            for one in found if isinstance(one, ExtremesRecord)
+            for limit in one.limits if limit.setting == "dt"
+        ]  # fmt: skip
+        rows += [[f"`{scene}`", one.device, *_margin(limit)] for one, limit in limits]
     step = ("standard's step [s]", "longest stable [s]", "margin", "beyond", "95 % error")
     return table(("scene", "device", "precision", *step), rows)
 
 
-def _margin(limit: Record) -> list[str]:
-    base, stable = limit["base"], "" if limit["stable"] is None else f"{limit['stable']:.3g}"
-    (own,) = (rung for rung in limit["rungs"] if rung["values"] == [base])
-    error = "" if own["error"] is None else f"{100 * own['error']:.2g} %"
-    if limit["failed"] is None:
-        return [limit["precision"], f"{base:.3g}", f"at least {stable}", "", "", error]
-    margin = "" if limit["margin"] is None else f"{limit['margin']:.2f}"
-    return [limit["precision"], f"{base:.3g}", stable, margin, limit["beyond"], error]
+def _margin(limit: Limit) -> list[str]:
+    base, stable = limit.base, "" if limit.stable is None else f"{limit.stable:.3g}"
+    (own,) = (cell for cell in limit.scanned if cell.values == (base,))
+    error = "" if own.error is None else f"{100 * own.error:.2g} %"
+    if limit.failed is None:
+        return [limit.precision, f"{base:.3g}", f"at least {stable}", "", "", error]
+    margin = "" if limit.margin is None else f"{limit.margin:.2f}"
+    return [limit.precision, f"{base:.3g}", stable, margin, limit.beyond, error]
 
 
 def fidelities() -> str:
@@ -140,20 +156,20 @@ def fidelities() -> str:
 
 def _fidelity(scene: str, claim: Claim) -> list[str]:
     """Return the cells of a fidelity, of the variant that has its settings now."""
-    found = kept("tradeoff/{}-{}.json", scene)
-    now = environment_class(scene).fidelities[claim.name].record()
+    found = studies("fidelity", scene)
+    now = environment_class(scene).fidelities[claim.name]
     for record in found if not isinstance(found, str) else ():
-        known = {key: record["identity"][key] for key in ("device", "engine", "options")}
-        for one in record["rungs"]:
-            if {**one["fidelity"], "name": claim.name} == now and all(
-                one[key] == value for key, value in known.items()
-            ):
-                measured = Comparison.of_record(one)
+        assert isinstance(record, FidelityRecord)
+        known = {key: record.identity[key] for key in ("device", "engine", "options")}
+        for one in record.variants:
+            same = all(getattr(one, key) == value for key, value in known.items())
+            if same and replace(one.fidelity, name=claim.name) == now:
+                measured = one.comparison
                 lack, error = Shortfall.of(measured, claim), measured.loss_error.p95_relative.value
                 return [
-                    one["device"], _number(measured.spearman.value, 3), _number(measured.gradient.cosine.value, 3),
+                    one.device, _number(measured.spearman.value, 3), _number(measured.gradient.cosine.value, 3),
                     "none" if error is None else f"{100 * error:.0f} %" if error >= 0.1 else f"{100 * error:.2g} %",
-                    f"{1e3 * measured.seconds.with_gradient:.3g}", "kept" if lack.kept else f"short in {lack.by}",
+                    f"{1e3 * one.seconds:.3g}", "kept" if lack.kept else f"short in {lack.by}",
                 ]  # fmt: skip
     return [*[""] * 5, found if isinstance(found, str) else UNMEASURED]
 
@@ -172,23 +188,23 @@ def parts() -> str:
     """What each part of a scene's model is for: how far losses move without it, what it costs, and the verdict."""
     rows = []
     for scene in sorted(entries()):
-        found = kept("tradeoff/{}-{}.model.json", scene)
-        measured = {} if isinstance(found, str) else {one["name"]: one for one in found[0]["parts"]}
+        found = studies("model", scene)
+        measured = {} if isinstance(found, str) else {one.name: one for one in cast(ModelRecord, found[0]).parts}
         for part in environment_class(scene).model_parts:
             one = measured.get(part.name)
-            cells = [*[""] * 4, UNMEASURED] if one is None or one["options"] != dict(part.options) else _part(one)
+            cells = [*[""] * 4, UNMEASURED] if one is None or one.options != dict(part.options) else _part(one)
             rows.append([f"`{scene}`", part.name, f"{part.change}{' (missing now)' if part.missing else ''}", *cells])
     return table(("scene", "part", "changed to", "95 % of losses move by", "rank", "cosine", "time", "verdict"), rows)
 
 
-def _part(one: Record) -> list[str]:
-    found, cost = one["comparison"], one["cost"]["value"]
-    moved = found["loss_error"]["p95_relative"]["value"]
+def _part(one: MeasuredPart) -> list[str]:
+    found, cost = one.comparison, one.cost.value
+    moved = found.loss_error.p95_relative.value
     return [
         "none" if moved is None else f"{100 * moved:.2g} %",
-        *(_number(value["value"], 2) for value in (found["spearman"], found["gradient"]["cosine"])),
+        *(_number(value.value, 2) for value in (found.spearman, found.gradient.cosine)),
         "none" if cost is None else f"{100 * (cost - 1):+.0f} %",
-        f"{one['effect']}; {one['price']}",
+        one.verdict,
     ]
 
 

@@ -54,8 +54,8 @@ from .card import place_card
 from .downloads import save_slice, save_table
 from .front import Front
 from .league import LeaguePage, place_league
-from .manifest import SCHEMA, FigureEntry, Manifest, ModelEntry, TradeoffEntry, as_json
-from .measured import place_tradeoffs, quality_rows, read_report
+from .manifest import SCHEMA, FidelityEntry, FigureEntry, Manifest, ModelEntry, as_json
+from .measured import place_fidelities, quality_rows, read_report
 from .models import place_models
 from .page_data import count_numbers, read_episodes, read_measures, read_off_nodes, read_sweep
 from .studio import Studio, draws
@@ -156,7 +156,7 @@ class _Site:
     folder: Path
     pages: Environment
     tables: Sequence[xr.Dataset]
-    tradeoffs: Mapping[str, Sequence[TradeoffEntry]]
+    fidelities: Mapping[str, Sequence[FidelityEntry]]
     models: Mapping[str, Sequence[ModelEntry]]
     studio: Studio
 
@@ -165,7 +165,7 @@ class _Site:
         cls, folder: Path, data: Path, envs: Sequence[str], tables: Sequence[xr.Dataset], studio: Studio
     ) -> _Site:
         """Place what the pages of these environments share."""
-        studies = place_tradeoffs(data, folder, envs, studio), place_models(data, folder, envs, studio)
+        studies = place_fidelities(data, folder, envs, studio), place_models(data, folder, envs, studio)
         return cls(folder, _templates(), tables, *studies, studio)
 
     def write_page(self, figure: Figure, source: Path) -> FigureEntry:
@@ -191,7 +191,7 @@ class _Site:
             ],
             episodes=episodes,
             runs=[run.search() for run in runs],
-            tradeoffs=self.tradeoffs.get(figure.env, []),
+            fidelities=self.fidelities.get(figure.env, []),
             models=self.models.get(figure.env, []),
         )
         about = {"entry": entry, "held": list(_held_parameters(dataset)), "scene": entries().get(figure.env)}
@@ -274,7 +274,7 @@ def _entry(figure: Figure, dataset: xr.Dataset, source: Path) -> FigureEntry:
         runs=[],
         measures=read_measures(source),
         report=read_report(source),
-        tradeoffs=[],
+        fidelities=[],
         models=[],
     )
 

@@ -195,7 +195,7 @@ class SecondsEntry:
 
 
 @dataclass(frozen=True)
-class Rung:
+class VariantRow:
     """A way to simulate: how near it is to the reference, and what it takes; `front` where nothing beats it in both."""
 
     name: str
@@ -210,7 +210,7 @@ class Rung:
 
 @dataclass(frozen=True)
 class ConvergenceEntry:
-    """What `landscape tradeoff --ladder convergence` found, in sentences; `alt` says what its picture shows."""
+    """What `landscape study convergence` found, in sentences; `alt` says what its picture shows."""
 
     says: Sequence[str]
     converged: bool | None
@@ -221,8 +221,8 @@ class ConvergenceEntry:
 
 
 @dataclass(frozen=True)
-class TradeoffEntry:
-    """What `landscape tradeoff` found of an environment on a device; `alt` says what its picture shows."""
+class FidelityEntry:
+    """What `landscape study fidelity` found of an environment on a device; `alt` says what its picture shows."""
 
     env: str
     reference: str
@@ -236,7 +236,7 @@ class TradeoffEntry:
     picture: str
     file: str
     alt: str
-    rungs: Sequence[Rung]
+    variants: Sequence[VariantRow]
     convergence: ConvergenceEntry | None
 
 
@@ -305,7 +305,7 @@ class FigureEntry:
     runs: Sequence[Search]
     measures: Mapping[str, str | float]
     report: ReportEntry | None
-    tradeoffs: Sequence[TradeoffEntry]
+    fidelities: Sequence[FidelityEntry]
     models: Sequence[ModelEntry]
 
 

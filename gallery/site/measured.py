@@ -7,25 +7,28 @@ import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 from ...jobs.report import Report
 from ...landscapes.convert import from_json, to_json
-from ...landscapes.identity import MODEL_VERSION, current_identity
+from ...landscapes.identity import MODEL_VERSION
 from ...landscapes.measures.classify import WORDS
-from ...landscapes.measures.convergence_record import Convergence
-from ...landscapes.measures.fidelity import cheapest, p95, pareto_front
 from ...landscapes.measures.gradient_quality import ScaleRow
 from ...landscapes.measures.profile import Profile
-from ...landscapes.plain import number, optional, text
+from ...landscapes.plain import number
 from ...landscapes.storage.records import read_json, reading
-from ..files import DEVICES, REMAKE, REPORT, TRADEOFFS, TradeoffFiles
+from ...studies.kept import read_study
+from ..files import DEVICES, REMAKE, REPORT, STUDIES, StudyFiles
 from .downloads import save_table
-from .manifest import ConvergenceEntry, Interval, ReportEntry, Rung, SecondsEntry, TradeoffEntry, Word
+from .manifest import ConvergenceEntry, FidelityEntry, Interval, ReportEntry, SecondsEntry, VariantRow, Word, as_json
 from .studio import Studio
 
+if TYPE_CHECKING:
+    from ...studies.convergence import ConvergenceRecord
+    from ...studies.fidelity import FidelityRecord, MeasuredVariant
+
 Record = Mapping[str, Any]
-TOLERANCE = 0.05  # of the loss error that a picture's description names the quickest rung for
+TOLERANCE = 0.05  # of the loss error that a picture's description names the quickest variant for
 
 
 def read_report(folder: Path) -> ReportEntry | None:
@@ -88,112 +91,102 @@ def _format_signed(value: float) -> str:
     return f"{value:z.2f}".replace("-", "\N{MINUS SIGN}")
 
 
-def place_tradeoffs(data: Path, out: Path, envs: Sequence[str], studio: Studio) -> dict[str, list[TradeoffEntry]]:
+def place_fidelities(data: Path, out: Path, envs: Sequence[str], studio: Studio) -> dict[str, list[FidelityEntry]]:
     """Copy what was measured of these environments' accuracy into the site, and return it by environment."""
-    placed: dict[str, list[TradeoffEntry]] = {}
+    placed: dict[str, list[FidelityEntry]] = {}
     for env, device in ((env, device) for env in dict.fromkeys(envs) for device in DEVICES):
-        source, target = (TradeoffFiles.of(root, env, device) for root in (data, out))
+        source, target = (StudyFiles.of(root, env, device, "fidelity") for root in (data, out))
         if not source.there():
             continue
-        target.record.parent.mkdir(exist_ok=True)
-        with reading(source.record, REMAKE.format("tradeoffs")):
-            record = read_json(source.record)
-            study = _read_convergence(source.convergence, record, target.convergence.table)
-            placed.setdefault(env, []).append(_tradeoff(record, target, study))
-        for one, there in ((source, target), (source.convergence, target.convergence)):
-            if one.there():
-                shutil.copyfile(one.record, there.record)
-                shutil.copyfile(one.picture, there.picture)
-                studio.develop(one.picture, there.picture)
-        save_table(record["rungs"], target.table)
+        record = cast("FidelityRecord", read_study(source.record, "fidelity"))
+        place_study(source, target, studio)
+        placed.setdefault(env, []).append(_fidelity(record, target, _place_convergence(data, out, record, studio)))
+        save_table(as_json(record.variants), target.table)
     return placed
 
 
-def _read_convergence(files: TradeoffFiles, record: Record, table: Path) -> ConvergenceEntry | None:
-    """Return what a study of convergence says, None where there is none of the model that the trade-off is of."""
-    if not files.there():
+def place_study(source: StudyFiles, target: StudyFiles, studio: Studio) -> None:
+    """Copy a study and its picture into the site."""
+    target.record.parent.mkdir(exist_ok=True)
+    shutil.copyfile(source.record, target.record)
+    shutil.copyfile(source.picture, target.picture)
+    studio.develop(source.picture, target.picture)
+
+
+def _place_convergence(data: Path, out: Path, of: FidelityRecord, studio: Studio) -> ConvergenceEntry | None:
+    """Copy a study of convergence, and return what it says; None where there is none of the same model."""
+    source, target = (StudyFiles.of(root, of.env, of.device, "convergence") for root in (data, out))
+    if not source.there():
         return None
-    todo = f"delete it, and `landscape tradeoff {record['env']} --ladder convergence` measures it anew"
-    with reading(files.record, todo):
-        found = Convergence.of_record(read_json(files.record))
-    moves = [{"knob": one.knob, **asdict(move)} for one in found.knobs for move in one.moves]
-    save_table([*moves, *({"left of": one.name, **asdict(one)} for one in found.remainders)], table)
-    if found.identity[MODEL_VERSION] != current_identity(record["identity"]).get(MODEL_VERSION):
+    found = cast("ConvergenceRecord", read_study(source.record, "convergence"))
+    place_study(source, target, studio)
+    moves = [{"setting": one.setting, **asdict(move)} for one in found.settings for move in one.moves]
+    save_table([*moves, *({"left of": one.name, **asdict(one)} for one in found.remainders)], target.table)
+    if found.identity[MODEL_VERSION] != of.identity[MODEL_VERSION]:
         return None
-    knobs = ", ".join(knob.knob for knob in found.knobs)
+    settings = ", ".join(one.setting for one in found.settings)
     return ConvergenceEntry(
         says=found.sentences(),
         converged=found.rule.met,
         command=found.command,
-        picture=f"{TRADEOFFS}/{files.picture.name}",
-        file=f"{TRADEOFFS}/{files.record.name}",
-        alt=f"How far losses of {found.env} move as {knobs} are refined: {found.rule.say()}",
+        picture=f"{STUDIES}/{target.picture.name}",
+        file=f"{STUDIES}/{target.record.name}",
+        alt=f"How far losses of {found.env} move as {settings} are refined: {found.rule.sentence()}",
     )
 
 
-def _tradeoff(record: Record, files: TradeoffFiles, study: ConvergenceEntry | None) -> TradeoffEntry:
-    rows = sorted(record["rungs"], key=_time)
-    reference = next(row for row in rows if row["name"] == record["reference"])
-    quicker = [row for row in rows if _time(row) < _time(reference)]
-    errors = [math.inf if (off := _error(row, record)) is None else off for row in quicker]
-    best = {quicker[place]["name"] for place in pareto_front([_time(row) for row in quicker], errors)}
-    return TradeoffEntry(
-        **{name: text(record[name]) for name in ("env", "reference", "loss_unit", "command")},
-        points=number(record["points"]),
-        spread=optional(number, record["spread"]),
-        refused=record["refused"],
-        options=dict(record["identity"]["options"]),
-        device=text(record["identity"]["device"]),
-        picture=f"{TRADEOFFS}/{files.picture.name}",
-        file=f"{TRADEOFFS}/{files.record.name}",
-        alt=_describe_accuracy(record, reference),
-        rungs=[_rung(row, record, best) for row in rows],
+def _fidelity(record: FidelityRecord, files: StudyFiles, study: ConvergenceEntry | None) -> FidelityEntry:
+    front = set(record.front)
+    return FidelityEntry(
+        env=record.env,
+        reference=record.reference,
+        loss_unit=record.loss_unit,
+        command=record.command,
+        points=record.points,
+        spread=record.spread,
+        refused=[asdict(one) for one in record.refused],
+        options=dict(record.identity["options"]),
+        device=record.device,
+        picture=f"{STUDIES}/{files.picture.name}",
+        file=f"{STUDIES}/{files.record.name}",
+        alt=_describe_accuracy(record),
+        variants=[_row(one, record, one.name in front) for one in record.by_time],
         convergence=study,
     )
 
 
-def _rung(row: Record, record: Record, best: set[str]) -> Rung:
-    error = row["loss_error"]["p95_relative" if record["spread"] else "p95"]
-    return Rung(
-        name=text(row["name"]),
-        front=row["name"] in best,
-        error=Interval(**{end: optional(number, error[end]) for end in ("value", "low", "high")}),
-        spearman=optional(number, row["spearman"]["value"]),
-        cosine=optional(number, row["gradient"]["cosine"]["value"]),
-        diverged=optional(number, row["diverged"]),
-        seconds=SecondsEntry(**{way: number(row["seconds"][way]) for way in ("forward", "with_gradient")}),
-        memory=number(row["memory"]),
+def _row(one: MeasuredVariant, record: FidelityRecord, front: bool) -> VariantRow:
+    found = one.comparison
+    error = found.loss_error.p95_relative if record.spread else found.loss_error.p95
+    return VariantRow(
+        name=one.name,
+        front=front,
+        error=Interval(**asdict(error)),
+        spearman=found.spearman.value,
+        cosine=found.gradient.cosine.value,
+        diverged=found.diverged,
+        seconds=SecondsEntry(**asdict(found.seconds)),
+        memory=number(one.memory),
     )
 
 
-def _describe_accuracy(record: Record, reference: Record) -> str:
+def _describe_accuracy(record: FidelityRecord) -> str:
     """Say what the picture of accuracy against time shows."""
-    named = [row for row in record["rungs"] if row["ladder"] == "named" and row is not reference]
-    parts = [
-        f"{row['name']} takes {_milliseconds(row)} and is off by {_share(_error(row, record), record)}" for row in named
-    ]
-    others = [row for row in record["rungs"] if row is not reference]
-    if quickest := cheapest(others, TOLERANCE, relative=True):
-        parts.append(f"the quickest within {TOLERANCE:.0%} is {quickest['name']} with {_milliseconds(quickest)}")
-    count = len(record["rungs"])
-    return f"Loss error of {count} ways to simulate {record['env']} over the time of an episode: " + "; ".join(
-        [*parts, f"the reference takes {_milliseconds(reference)}"]
-    )
+    named = [one for one in record.by_time if one.changed == "named" and one.name != record.reference]
+    parts = [f"{one.name} takes {_milliseconds(one)} and is off by {_share(one, record)}" for one in named]
+    if quickest := record.cheapest(TOLERANCE):
+        parts.append(f"the quickest within {TOLERANCE:.0%} is {quickest.name} with {_milliseconds(quickest)}")
+    parts.append(f"the reference takes {_milliseconds(record.variant(record.reference))}")
+    count = len(record.variants)
+    return f"Loss error of {count} ways to simulate {record.env} over the time of an episode: {'; '.join(parts)}"
 
 
-def _time(row: Record) -> float:
-    return number(row["seconds"]["with_gradient"])
+def _milliseconds(one: MeasuredVariant) -> str:
+    return f"{1e3 * one.seconds:.3g} ms"
 
 
-def _error(row: Record, record: Record) -> float | None:
-    return p95(row, relative=record["spread"] is not None)
-
-
-def _milliseconds(row: Record) -> str:
-    return f"{1e3 * _time(row):.3g} ms"
-
-
-def _share(error: float | None, record: Record) -> str:
+def _share(one: MeasuredVariant, record: FidelityRecord) -> str:
+    error = one.p95(relative=record.spread is not None)
     if error is None:
         return "more than a number can say (it failed too often)"
-    return f"{error:.2g} {record['loss_unit']}".rstrip() if record["spread"] is None else f"{100 * error:.2g} %"
+    return f"{error:.2g} {record.loss_unit}".rstrip() if record.spread is None else f"{100 * error:.2g} %"

@@ -2,39 +2,35 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
+from typing import cast
 
-from ...landscapes.measures.model import Effect, MeasuredPart, ModelStudy
-from ...landscapes.storage.records import read_json, reading
-from ..files import DEVICES, TRADEOFFS, TradeoffFiles
+from ...studies.kept import read_study
+from ...studies.model import Effect, MeasuredPart, ModelRecord
+from ..files import DEVICES, STUDIES, StudyFiles
 from .downloads import save_table
 from .manifest import Interval, ModelEntry, PartRow, as_json
+from .measured import place_study
 from .studio import Studio
-
-REMAKE = "delete it, and `landscape tradeoff {} --ladder model` measures it anew"
 
 
 def place_models(data: Path, out: Path, envs: Sequence[str], studio: Studio) -> dict[str, list[ModelEntry]]:
     """Copy what was measured of the parts of these environments' models into the site; return it by environment."""
     placed: dict[str, list[ModelEntry]] = {}
     for env, device in ((env, device) for env in dict.fromkeys(envs) for device in DEVICES):
-        source, target = (TradeoffFiles.of_model(root, env, device) for root in (data, out))
+        source, target = (StudyFiles.of(root, env, device, "model") for root in (data, out))
         if not source.there():
             continue
-        with reading(source.record, REMAKE.format(env)):
-            placed.setdefault(env, []).append(_entry(ModelStudy.of_record(read_json(source.record)), device, target))
-        target.record.parent.mkdir(exist_ok=True)
-        shutil.copyfile(source.record, target.record)
-        shutil.copyfile(source.picture, target.picture)
-        studio.develop(source.picture, target.picture)
+        study = cast("ModelRecord", read_study(source.record, "model"))
+        placed.setdefault(env, []).append(_entry(study, device, target))
+        place_study(source, target, studio)
         save_table(as_json(placed[env][-1].parts), target.table)
     return placed
 
 
-def _entry(study: ModelStudy, device: str, files: TradeoffFiles) -> ModelEntry:
+def _entry(study: ModelRecord, device: str, files: StudyFiles) -> ModelEntry:
     own = study.noise.comparison.loss_error
     return ModelEntry(
         env=study.env,
@@ -46,14 +42,14 @@ def _entry(study: ModelStudy, device: str, files: TradeoffFiles) -> ModelEntry:
         device=device,
         noise=(own.p95_relative if study.spread else own.p95).value,
         refused=[asdict(one) for one in study.refused],
-        picture=f"{TRADEOFFS}/{files.picture.name}",
-        file=f"{TRADEOFFS}/{files.record.name}",
+        picture=f"{STUDIES}/{files.picture.name}",
+        file=f"{STUDIES}/{files.record.name}",
         alt=_describe(study),
         parts=[_row(part, study) for part in (*study.present, *study.missing)],
     )
 
 
-def _row(part: MeasuredPart, study: ModelStudy) -> PartRow:
+def _row(part: MeasuredPart, study: ModelRecord) -> PartRow:
     found = part.comparison
     error = found.loss_error.p95_relative if study.spread else found.loss_error.p95
     return PartRow(
@@ -69,7 +65,7 @@ def _row(part: MeasuredPart, study: ModelStudy) -> PartRow:
     )
 
 
-def _describe(study: ModelStudy) -> str:
+def _describe(study: ModelRecord) -> str:
     """Say what the picture of a model's parts shows."""
     said = [
         f"{', '.join(names)}: {effect}"

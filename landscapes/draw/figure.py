@@ -19,10 +19,12 @@ if TYPE_CHECKING:
 FIGURES = {
     "Card": "landscapes.draw.figures.card:card_figure",
     "Census": "landscapes.draw.figures.census:census_figure",
-    "Convergence": "landscapes.draw.figures.convergence:convergence_figure",
+    "ConvergenceRecord": "landscapes.draw.figures.convergence:convergence_figure",
     "Episode": "landscapes.draw.figures.contact:episode_figure",
-    "Extremes": "landscapes.draw.figures.extremes:extremes_figure",
-    "ModelStudy": "landscapes.draw.figures.model:model_figure",
+    "ExtremesRecord": "landscapes.draw.figures.extremes:extremes_figure",
+    "FidelityRecord": "landscapes.draw.figures.fidelity:fidelity_figure",
+    "MixedRecord": "landscapes.draw.figures.fidelity:mixed_figure",
+    "ModelRecord": "landscapes.draw.figures.model:model_figure",
     "SliceComparison": "landscapes.draw.figures.comparison:comparison_figure",
 }
 _PACKAGE = __name__.partition(".landscapes.")[0]

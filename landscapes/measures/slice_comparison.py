@@ -27,8 +27,7 @@ from ..large import refuse_large
 from ..lattice import sampled_lattice
 from ..objective import Status
 from ..space import scaled_labels
-from ..statistics import Estimate, jackknife
-from .fidelity import gradient_error, median_of, p95_of, spearman
+from ..statistics import Estimate, gradient_error, jackknife, median_of, p95_of, spearman
 from .ruggedness import box_slopes, span
 
 if TYPE_CHECKING:

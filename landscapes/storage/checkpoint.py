@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -118,6 +118,13 @@ class Checkpoint:
         """Write the arrays of a part, whole or not at all."""
         with replacing(self._path(name)) as partial, partial.open("wb") as file:
             np.savez(file, **{NAME_KEY: np.array(name), STUDY_KEY: np.array(self.study), **arrays})
+
+    def load_or_compute(self, name: str, compute: Callable[[], Mapping[str, Any]]) -> dict[str, NDArray[Any]]:
+        """Return the arrays of a part, which are computed and saved where it is missing or damaged."""
+        if (found := self.load(name)) is None:
+            found = {key: np.asarray(value) for key, value in compute().items()}
+            self.save(name, **found)
+        return found
 
     def names(self) -> list[str]:
         """Return the names of the parts, in order, but for what the study is verified by."""

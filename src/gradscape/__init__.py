@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from .api.report import report
     from .api.search import league, open_run, optimize, race
     from .api.slice import bounce, open_slice, sample, slice
+    from .api.study import study
     from .api.surface import surface
     from .api.sweep import sweep
     from .envs.adapters import from_jax, from_numpy, from_step, from_torch, from_warp
@@ -42,6 +43,7 @@ _HOMES = {
     "api.report": ("report",),
     "api.search": ("league", "open_run", "optimize", "race"),
     "api.slice": ("bounce", "open_slice", "sample", "slice"),
+    "api.study": ("study",),
     "api.surface": ("surface",),
     "api.sweep": ("sweep",),
     "envs.adapters": ("from_jax", "from_numpy", "from_step", "from_torch", "from_warp"),
@@ -56,11 +58,14 @@ _HOMES = {
     "optim.race": ("Race",),
     "optim.runs.run": ("Run",),
 }
+_FORMER = {"tradeoff": "study('fidelity', ...)", "extremes": "study('extremes', ...)"}
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 __all__ = sorted([*_HOME_OF, "__version__"])
 
 
 def __getattr__(name: str) -> Any:
+    if name in _FORMER:
+        raise AttributeError(f"gradscape.{name} is gradscape.{_FORMER[name]} today")
     if name not in _HOME_OF:
         raise AttributeError(f"module 'gradscape' has no attribute {name!r}; it has {', '.join(__all__)}")
     return getattr(import_module(f".{_HOME_OF[name]}", __name__), name)

@@ -1,4 +1,4 @@
-"""`gs.report`, `gs.check`, `gs.tradeoff`, `gs.pairs`: what each promises."""
+"""`gs.report`, `gs.check`, `gs.study`, `gs.pairs`: what each promises."""
 
 from pathlib import Path
 
@@ -8,16 +8,16 @@ import torch
 import gradscape as gs
 from gradscape.landscapes import cost
 from gradscape.landscapes.convert import to_json
-from gradscape.landscapes.measures import fidelity
 from gradscape.landscapes.storage.records import read_json
+from gradscape.studies import samples
 
 
 @pytest.fixture(autouse=True)
 def own_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Leave results and what is kept for a tolerance in the test's own folder, and time little."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("gradscape.jobs.tolerance.user_data_path", lambda name: tmp_path / "data" / name)
-    for module, names in ((cost, ("MOMENT", "ENOUGH", "WARM_UP")), (fidelity, ("REPETITION", "LARGEST"))):
+    monkeypatch.setattr("gradscape.studies.kept.user_data_path", lambda name: tmp_path / "data" / name)
+    for module, names in ((cost, ("MOMENT", "ENOUGH", "WARM_UP")), (samples, ("REPETITION", "LARGEST"))):
         for name in names:
             monkeypatch.setattr(module, name, 0.0)
 
@@ -83,18 +83,18 @@ def test_a_class_is_checked_and_its_findings_are_a_table() -> None:
 
 
 @pytest.mark.drawn
-def test_a_tradeoff_has_a_front_a_table_and_a_picture(tmp_path: Path) -> None:
-    how = {"points": 2, "variants": ("precision",), "device": "cpu", "options": {"horizon": 0.05}}
-    found = gs.tradeoff("bounce", **how, out=tmp_path / "trade")  # type: ignore[arg-type]
+def test_a_study_has_a_front_a_table_and_a_picture(tmp_path: Path) -> None:
+    how = {"points": 2, "settings": ("precision",), "device": "cpu", "options": {"horizon": 0.05}}
+    found = gs.study("fidelity", "bounce", **how, out=tmp_path / "trade")  # type: ignore[arg-type]
     table = found.table()
     assert table.index[table["front"]].tolist() == found.front
     assert table["with_gradient"].is_monotonic_increasing
     assert {"draft", "standard", "reference", "draft-float64"} <= set(table.index)
-    assert found.record() == read_json(tmp_path / "trade/tradeoff.json")
-    assert gs.tradeoff("bounce", **how, out=tmp_path / "trade") == found  # type: ignore[arg-type]
+    assert to_json(found) == read_json(tmp_path / "trade/fidelity.json")
+    assert gs.study("fidelity", "bounce", **how, out=tmp_path / "trade") == found  # type: ignore[arg-type]
     assert found.plot()._repr_png_().startswith(b"\x89PNG")
-    with pytest.raises(ValueError, match="there is nothing to hold against"):
-        gs.tradeoff("branin")
+    with pytest.raises(ValueError, match="there is nothing to compare"):
+        gs.study("fidelity", "branin")
 
 
 def test_pairs_are_ranked_and_need_two_parameters(tmp_path: Path) -> None:

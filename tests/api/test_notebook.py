@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from gradscape.landscapes import cost
-from gradscape.landscapes.measures import fidelity
+from gradscape.studies import samples
 
 CELLS = (
     "import gradscape as gs",
@@ -23,7 +23,7 @@ CELLS = (
     'gs.race("bounce", ["random", "bo-leap"], budget=12, seeds=2).plot()',
     'env = gs.make("bounce")\nenv.episode(run.best.x).show()',
     "gs.check(env, points=2)",
-    'gs.tradeoff(env, points=4, variants=["dt"])',
+    'gs.study("fidelity", env, points=4, settings=["dt"])',
     "gs.list_envs()",
     "gs.open_slice(s.folder)",
     "gs.open_run(run.folder)",
@@ -40,7 +40,7 @@ def shown(tmp_path_factory: pytest.TempPathFactory) -> list[Any]:
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         patch.setenv("XDG_DATA_HOME", str(folder / "data"))
-        for module, names in ((cost, ("MOMENT", "ENOUGH", "WARM_UP")), (fidelity, ("REPETITION", "LARGEST"))):
+        for module, names in ((cost, ("MOMENT", "ENOUGH", "WARM_UP")), (samples, ("REPETITION", "LARGEST"))):
             for name in names:
                 patch.setattr(module, name, 0.0)
         return [_run(cell, space) for cell in CELLS]

@@ -1,4 +1,4 @@
-"""`landscape extremes` and what `landscape envs NAME` says of it: what they leave, say and refuse."""
+"""`landscape study extremes` and what `landscape envs NAME` says of it: what they leave, say and refuse."""
 
 import json
 from collections.abc import Callable
@@ -11,15 +11,16 @@ from torch import Tensor
 
 from gradscape.envs import registry
 from gradscape.envs.base import Environment, Fidelity, Work
-from gradscape.landscapes.measures.extremes import Extremes
+from gradscape.landscapes.convert import from_json
 from gradscape.landscapes.objective import Evaluation
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.landscapes.storage.records import read_json, write_record
+from gradscape.studies.extremes import ExtremesRecord
 
 from ..command import Said, modules
 
 Command = Callable[..., Said]
-TURN = ["extremes", "stepping", "--points", "4", "--device", "cpu", "--out", "turned"]
+TURN = ["study", "extremes", "stepping", "--points", "4", "--device", "cpu", "--out", "turned"]
 
 
 class Stepping(Environment):
@@ -46,7 +47,7 @@ class Stepping(Environment):
 
 @pytest.fixture(autouse=True)
 def own_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setattr("gradscape.jobs.margins.user_data_path", lambda name: tmp_path / "data" / name)
+    monkeypatch.setattr("gradscape.studies.kept.user_data_path", lambda name: tmp_path / "data" / name)
     monkeypatch.setitem(registry.entries(), "stepping", registry.Entry("stepping", f"{__name__}:Stepping"))
     return tmp_path / "data"
 
@@ -54,7 +55,7 @@ def own_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.mark.drawn
 def test_a_study_leaves_a_record_a_picture_and_the_margin(run: Command, tmp_path: Path) -> None:
     assert (
-        "stability: not measured; `landscape extremes stepping` measures it"
+        "stability: not measured; `landscape study extremes stepping` measures it"
         in run("envs", "stepping", cwd=tmp_path).stdout
     )
     done = run(*TURN, "--grid", "3", "--json", "--figure-width-mm", "85", cwd=tmp_path)
@@ -64,15 +65,14 @@ def test_a_study_leaves_a_record_a_picture_and_the_margin(run: Command, tmp_path
     assert (tmp_path / "turned/extremes.png").read_bytes().startswith(b"\x89PNG")
     assert (tmp_path / "turned/extremes-85mm.pdf").read_bytes().startswith(b"%PDF")
     assert report["provenance"]["command"] == report["command"]
-    limits = {(one["knob"], one["precision"]): one for one in report["limits"]}
-    for (knob, precision), truth in {
+    limits = {(one["setting"], one["precision"]): one for one in report["limits"]}
+    for (setting, precision), truth in {
         ("dt", "float32"): 0.25, ("dt", "float64"): 0.35, ("box", "float32"): 3.0, ("box", "float64"): 3.0,
     }.items():  # fmt: skip
-        limit = limits[knob, precision]
+        limit = limits[setting, precision]
         assert limit["stable"] <= truth <= limit["failed"]
         assert limit["beyond"] == "NONFINITE"
-    assert "some " in done.stderr
-    assert "at 4 points, judged by reference" in done.stderr
+    assert "settings to measure at 4 points" in done.stderr
     said = run("envs", "stepping", cwd=tmp_path).stdout
     share = 0.1 / limits["dt", "float32"]["stable"]
     assert f"standard's step is {share:.2g} of the largest stable one" in said
@@ -82,7 +82,7 @@ def test_a_study_leaves_a_record_a_picture_and_the_margin(run: Command, tmp_path
 def test_envs_says_where_a_margin_is_of_another_model_and_of_other_options_nothing(
     run: Command, tmp_path: Path, own_data: Path
 ) -> None:
-    assert run(*TURN, "--knobs", "dt", "--precisions", "float32", cwd=tmp_path).returncode == 0
+    assert run(*TURN, "--settings", "dt", "--precisions", "float32", cwd=tmp_path).returncode == 0
     (path,) = own_data.rglob("*.json")
     record = read_json(path)
     write_record(path, {**record, "identity": {**record["identity"], "model_version": 0}})
@@ -98,17 +98,17 @@ def test_envs_says_where_a_margin_is_of_another_model_and_of_other_options_nothi
 def test_shipped_extremes_are_found_where_nothing_of_the_users_own_is(
     run: Command, tmp_path: Path, own_data: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    run(*TURN, "--knobs", "dt", "--precisions", "float32", cwd=tmp_path)
+    run(*TURN, "--settings", "dt", "--precisions", "float32", cwd=tmp_path)
     (path,) = own_data.rglob("*.json")
-    shipped = tmp_path / "package" / "data" / "extremes" / "stepping-cpu.json"
+    shipped = tmp_path / "package" / "data" / "studies" / "stepping-cpu.extremes.json"
     shipped.parent.mkdir(parents=True)
     path.rename(shipped)
-    monkeypatch.setattr("gradscape.jobs.margins.resources.files", lambda package: tmp_path / "package")
+    monkeypatch.setattr("gradscape.studies.kept.resources.files", lambda package: tmp_path / "package")
     assert "of the largest stable one" in run("envs", "stepping", cwd=tmp_path).stdout
 
 
 def test_the_table_says_what_is_beyond(run: Command, tmp_path: Path) -> None:
-    said = run(*TURN, "--knobs", "dt,box", cwd=tmp_path, width=200).stdout
+    said = run(*TURN, "--settings", "dt,box", cwd=tmp_path, width=200).stdout
     assert "stepping: standard on cpu, 4 points, judged by reference (accurate: 10% of the spread)" in said
     assert "then NONFINITE" in " ".join(said.split())
 
@@ -116,10 +116,10 @@ def test_the_table_says_what_is_beyond(run: Command, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--knobs", "speed"], "stepping has knobs dt, box; got speed"),
-        (["--pairs", "dt"], "--pairs takes two knobs as dt:box, or none; got 'dt'"),
-        (["--accuracy", "-1"], "--accuracy takes a share"),
-        (["--against", "exact"], "to be judged by; got 'exact'"),
+        (["--settings", "speed"], "stepping has settings dt, box; got speed"),
+        (["--pairs", "dt"], "--pairs takes two settings as dt:box, or none; got 'dt'"),
+        (["--tolerance", "-1"], "--tolerance takes a share"),
+        (["--reference", "exact"], "to be judged by; got 'exact'"),
     ],
 )
 def test_what_cannot_be_is_refused(arguments: list[str], said: str, run: Command, tmp_path: Path) -> None:
@@ -130,9 +130,9 @@ def test_what_cannot_be_is_refused(arguments: list[str], said: str, run: Command
 
 
 def test_another_study_is_not_overwritten(run: Command, tmp_path: Path) -> None:
-    run(*TURN, "--knobs", "dt", cwd=tmp_path)
+    run(*TURN, "--settings", "dt", cwd=tmp_path)
     before = (tmp_path / "turned/extremes.json").read_bytes()
-    other = run(*TURN, "--knobs", "dt", "--seed", "1", cwd=tmp_path)
+    other = run(*TURN, "--settings", "dt", "--seed", "1", cwd=tmp_path)
     assert other.returncode == 2
     assert "seed: wanted 1, found 0" in other.stderr
     assert (tmp_path / "turned/extremes.json").read_bytes() == before
@@ -141,7 +141,7 @@ def test_another_study_is_not_overwritten(run: Command, tmp_path: Path) -> None:
 @pytest.mark.drawn
 def test_a_map_shows_each_outcome_the_boundary_and_the_base(run: Command, tmp_path: Path) -> None:
     run(*TURN, "--grid", "4", cwd=tmp_path)
-    found = Extremes.of_record(read_json(tmp_path / "turned/extremes.json"))
+    found = from_json(ExtremesRecord, read_json(tmp_path / "turned/extremes.json"))
     picture = found.plot()
     maps = [ax for ax in picture.axes if ax.get_title().endswith("dt against box")]
     assert len(maps) == len(found.maps) == 2
@@ -156,4 +156,4 @@ def test_a_map_shows_each_outcome_the_boundary_and_the_base(run: Command, tmp_pa
 
 def test_envs_loads_nothing_that_measures_or_draws() -> None:
     loaded = modules(["envs", "bounce"])
-    assert not loaded & {"matplotlib", "gradscape.landscapes.measures.extremes", "gradscape.jobs.extremes"}
+    assert not loaded & {"matplotlib", "gradscape.jobs.study"}

@@ -266,7 +266,7 @@ def test_without_a_checkout_s_data_results_go_to_the_folder_where_one_stands(
     listed: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     installed = tmp_path / "site-packages" / "data"
-    (installed / "tradeoff").mkdir(parents=True)
+    (installed / "studies").mkdir(parents=True)
     monkeypatch.setattr("gradscape.gallery.files.DATA", installed)
     monkeypatch.chdir(tmp_path)
     how = ["--part", "slices", "--device", "cpu", "--only", "branin", "--resolution", "4"]
@@ -274,7 +274,7 @@ def test_without_a_checkout_s_data_results_go_to_the_folder_where_one_stands(
     assert (tmp_path / "out/gallery-data/branin/slice.zarr").exists()
     assert gallery("build") == 0
     assert (tmp_path / "out/gallery/branin/index.html").exists()
-    assert sorted(path.name for path in installed.rglob("*")) == ["tradeoff"]
+    assert sorted(path.name for path in installed.rglob("*")) == ["studies"]
 
 
 def test_view_opens_the_site(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

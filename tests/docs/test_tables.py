@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-import copy
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from docs.pages import tables
-from docs.pages.tables import COLUMNS, MISSING, UNMEASURED, faint_share, kept, scenes, settle
+from docs.pages.tables import COLUMNS, MISSING, UNMEASURED, faint_share, kept, scenes, settle, studies
 
 from gradscape.envs.registry import entries, environment_class
 from gradscape.gallery.files import DATA
-from gradscape.landscapes.measures.choice import CLAIMS
 from gradscape.landscapes.storage.records import read_json, write_record
+from gradscape.studies.claims import CLAIMS
+from gradscape.studies.fidelity import FidelityRecord
+from gradscape.studies.model import ModelRecord
+from gradscape.studies.samples import Bootstrap
+from gradscape.studies.variants import StudyRecord
 
 
 def lines(table: str) -> list[list[str]]:
@@ -43,39 +47,50 @@ def test_every_scene_has_a_row_and_every_part_has_one() -> None:
 def test_a_scene_that_changed_or_was_never_measured_is_said_to_be_so(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for name in ("census/bounce-cpu.json", "extremes/bounce-cpu.json", "tradeoff/bounce-cpu.json"):
+    for name in ("census/bounce-cpu.json", "studies/bounce-cpu.extremes.json", "studies/bounce-cpu.fidelity.json"):
         record = read_json(DATA / name)
         record["identity"]["model_version"] = 0
-        (tmp_path / name).parent.mkdir()
+        (tmp_path / name).parent.mkdir(exist_ok=True)
         write_record(tmp_path / name, record)
     assert kept("census/{}-{}.json", "bounce", tmp_path) == UNMEASURED
     assert kept("census/{}-{}.json", "cartpole", tmp_path) == MISSING
     monkeypatch.setattr(tables, "kept", lambda pattern, scene: kept(pattern, scene, tmp_path))
+    monkeypatch.setattr(tables, "studies", lambda kind, scene: studies(kind, scene, tmp_path))
     for table in (tables.censuses, tables.margins, tables.fidelities, tables.short_censuses):
         assert all((UNMEASURED if "bounce" in row[0] else MISSING) in row for row in lines(table()))
     assert all(row[-1] == UNMEASURED for row in lines(tables.parts()))
 
 
 def test_a_fidelity_or_a_part_whose_settings_changed_is_not_measured(monkeypatch: pytest.MonkeyPatch) -> None:
-    def edited(pattern: str, scene: str) -> list[tables.Record] | str:
-        found = copy.deepcopy(kept(pattern, scene))
-        for one in (*found[0].get("rungs", ()), *found[0].get("parts", ())) if not isinstance(found, str) else ():
-            one["options"] = {"horizon": 7.0}
-        return found
+    def edited(kind: str, scene: str) -> list[StudyRecord] | str:
+        found = studies(kind, scene)
+        if isinstance(found, str):
+            return found
+        other = {"horizon": 7.0}
+        return [
+            replace(one, variants=tuple(replace(row, options=other) for row in one.variants))
+            if isinstance(one, FidelityRecord)
+            else replace(one, parts=tuple(replace(part, options=other) for part in one.parts))
+            for one in found if isinstance(one, FidelityRecord | ModelRecord)
+        ]  # fmt: skip
 
-    monkeypatch.setattr(tables, "kept", edited)
+    monkeypatch.setattr(tables, "studies", edited)
     for table in (tables.fidelities, tables.parts):
         assert {row[-1] for row in lines(table())} == {UNMEASURED}
 
 
 def test_a_claim_that_breaks_is_named_with_what_it_lacks(monkeypatch: pytest.MonkeyPatch) -> None:
-    (record,) = kept("tradeoff/{}-{}.json", "torus")
-    worse = copy.deepcopy(record)
-    for one in worse["rungs"]:
-        one["gradient"]["cosine"]["value"] = 0.5
+    (record,) = studies("fidelity", "torus")
+    assert isinstance(record, FidelityRecord)
+    low = Bootstrap(0.5, 0.5, 0.5)
+    rows = [
+        replace(row, comparison=replace(row.comparison, gradient=replace(row.comparison.gradient, cosine=low)))
+        for row in record.variants
+    ]
+    worse = replace(record, variants=tuple(rows))
     for found, said in ((record, "kept"), (worse, "short in cosine")):
         monkeypatch.setattr(
-            tables, "kept", lambda pattern, scene, found=found: [found] if scene == "torus" else MISSING
+            tables, "studies", lambda kind, scene, found=found: [found] if scene == "torus" else MISSING
         )
         assert {row[-1] for row in lines(tables.fidelities()) if row[0] == "`torus`"} == {said}
 

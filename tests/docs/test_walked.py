@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 from markdown_it import MarkdownIt
 
 import gradscape
+from gradscape.cli import verbs
 from gradscape.envs.registry import BUILTIN, environment_class
 from gradscape.gallery.figures import read_figures
 from gradscape.gallery.files import DATA
@@ -26,7 +27,6 @@ from gradscape.landscapes.storage.records import read_json, write_record
 from gradscape.optim.claims import ClaimVerdict
 from gradscape.optim.league import League
 
-from ..command import verbs
 from ..gallery.site.conftest import scene_standings
 
 ROOT = Path(__file__).parents[2]

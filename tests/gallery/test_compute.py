@@ -40,7 +40,7 @@ def small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     for name, value in (("METHODS", ("random", "descents")), ("BUDGET", 12), ("SEEDS", 3)):
         monkeypatch.setattr(gallery_league, name, value)
     for name in ("REPETITION", "LARGEST"):
-        monkeypatch.setattr(f"gradscape.landscapes.measures.fidelity.{name}", 0.01)
+        monkeypatch.setattr(f"gradscape.studies.samples.{name}", 0.01)
     longer = {name: replace(one, dt=4 * one.dt) for name, one in Bounce.fidelities.items()}
     monkeypatch.setattr(Bounce, "fidelities", longer)
     monkeypatch.chdir(tmp_path)
@@ -81,9 +81,12 @@ def test_everything_is_made_once(small: Path, capsys: pytest.CaptureFixture[str]
         report = json.loads((small / figure / "report.json").read_text())
         assert report["name"] == figure
         assert (small / figure / "gradient-quality.png").read_bytes().startswith(b"\x89PNG")
-    assert sorted(file.name for file in (small / "tradeoff").iterdir()) == ["bounce-cpu.json", "bounce-cpu.png"]
-    rungs = {row["name"] for row in json.loads((small / "tradeoff/bounce-cpu.json").read_text())["rungs"]}
-    assert rungs > {"draft", "standard", "reference", "draft-float64"}
+    assert sorted(file.name for file in (small / "studies").iterdir()) == [
+        "bounce-cpu.fidelity.json",
+        "bounce-cpu.fidelity.png",
+    ]
+    names = {row["name"] for row in json.loads((small / "studies/bounce-cpu.fidelity.json").read_text())["variants"]}
+    assert names > {"draft", "standard", "reference", "draft-float64"}
     before = {file: file.stat().st_mtime_ns for file in small.rglob("*") if file.is_file()}
     capsys.readouterr()
     assert compute(small) == 0

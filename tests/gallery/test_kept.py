@@ -11,7 +11,7 @@ import pytest
 from gradscape.landscapes.storage.records import read_json
 
 DATA = Path(__file__).parents[2] / "gallery" / "data"
-RECORDS = [path for folder in ("tradeoff", "extremes", "census") for path in sorted((DATA / folder).glob("*.json"))]
+RECORDS = [path for folder in ("studies", "census") for path in sorted((DATA / folder).glob("*.json"))]
 
 
 @pytest.mark.parametrize("path", RECORDS, ids=lambda path: f"{path.parent.name}/{path.name}")
@@ -38,9 +38,5 @@ def test_no_text_of_what_is_kept_names_a_folder_of_a_machine(path: Path) -> None
 
 
 def test_every_picture_has_its_record() -> None:
-    pictures = {
-        path.with_suffix(".json")
-        for folder in ("tradeoff", "extremes", "census")
-        for path in (DATA / folder).glob("*.png")
-    }
+    pictures = {path.with_suffix(".json") for folder in ("studies", "census") for path in (DATA / folder).glob("*.png")}
     assert pictures == set(RECORDS)

@@ -6,12 +6,12 @@ import torch
 
 from gradscape import Evaluation, ParameterSpace, Plane, Status, from_numpy, sample
 from gradscape.landscapes.conformance.suite import check
-from gradscape.landscapes.measures.fidelity import measure
 from gradscape.landscapes.measures.gradient_quality import compare_differences, subgrid
 from gradscape.landscapes.measures.profile import OutsideBounds, measure_profile
 from gradscape.landscapes.measures.sensitivity import Design, explore
 from gradscape.landscapes.objective import BoxedObjective, Objective, evaluate, failed, has_loss
 from gradscape.landscapes.storage.checkpoint import Checkpoint
+from gradscape.studies.samples import measure
 
 BOUNDS = torch.tensor([[-1.0, 0.1, -3.0], [2.0, 0.7, 3.0]], dtype=torch.float64)
 SPACE = ParameterSpace(("a", "b", "c"), *BOUNDS, ("", "m", "s"))

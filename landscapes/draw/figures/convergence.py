@@ -15,14 +15,14 @@ from .. import style
 from . import page, panel
 
 if TYPE_CHECKING:
-    from ...measures.convergence_record import Convergence, KnobConvergence, Move
-    from ...measures.fidelity import Bootstrap
+    from ....studies.convergence import ConvergenceRecord, Move, SettingConvergence
+    from ....studies.samples import Bootstrap
 
 PITCH, SHAPE = 5.2, 0.8  # room of a panel on a screen [inch]; its height, against its width
 COLUMN, FLAT = 3, 0.34  # panels of that shape that a column of a page has room for, and the shape of more
 ROW = 0.07  # of a flat panel's width: what a name beside it takes
-ROOM = 1.8  # what the axes reach beyond the marks, as a ratio
-LEAST = 1e-16  # of the spread: what is drawn on the lower edge of rounding
+REACH = 1.8  # what the axes reach beyond the marks, as a ratio
+MIN_MOVE = 1e-16  # of the spread: what is drawn on the lower edge of rounding
 WIDTHS = {
     "dt": "time step [s]",
     "resolution": "width of a cell, against the reference's",
@@ -31,8 +31,8 @@ WIDTHS = {
 }
 
 
-def convergence_figure(found: Convergence, *, width: float | None = None) -> page.Picture:
-    """Draw a panel for each knob, and one for distributions where there are any.
+def convergence_figure(found: ConvergenceRecord, *, width: float | None = None) -> page.Picture:
+    """Draw a panel for each setting, and one for distributions where there are any.
 
     Marks are the median over the points of how far losses move from a level to the next finer one, and paler the 95th
     percentile, both with intervals. Dashed is the slope of the designed order, shaded those that the interval of the
@@ -41,8 +41,8 @@ def convergence_figure(found: Convergence, *, width: float | None = None) -> pag
 
     Raises ValueError where the page is too narrow or too wide.
     """
-    knobs = [knob for knob in found.knobs if knob.knob in WIDTHS and knob.moves]
-    count = len(knobs) + bool(found.distributions)
+    drawn = [one for one in found.settings if one.setting in WIDTHS and one.moves]
+    count = len(drawn) + bool(found.distributions)
     sheet = style.Sheet.of(width, pitch=PITCH, columns=min(2, max(1, count)), panels=max(1, count))
     picture = page.Picture(sheet, sheet.width)
     axes = panel.grid(picture, max(1, count))
@@ -50,8 +50,8 @@ def convergence_figure(found: Convergence, *, width: float | None = None) -> pag
     for ax in axes:
         ax.set_box_aspect(FLAT if flat else SHAPE)
     entries: dict[str, Artist] = {}
-    for ax, knob in zip(axes, knobs, strict=False):
-        _draw_knob(ax, knob, found, entries)
+    for ax, one in zip(axes, drawn, strict=False):
+        _draw_setting(ax, one, found, entries)
     if found.distributions:
         _draw_distributions(axes[-1], found, entries)
         axes[-1].set_box_aspect(max(FLAT, ROW * len(found.distributions.compared)) if flat else SHAPE)
@@ -60,21 +60,21 @@ def convergence_figure(found: Convergence, *, width: float | None = None) -> pag
     return picture
 
 
-def _draw_knob(ax: Axes, knob: KnobConvergence, found: Convergence, entries: dict[str, Artist]) -> None:
+def _draw_setting(ax: Axes, one: SettingConvergence, found: ConvergenceRecord, entries: dict[str, Artist]) -> None:
     panel.dress(ax)
-    sheet, look = page.sheet_of(ax), style.VARIANTS[knob.knob]
+    sheet, look = page.sheet_of(ax), style.VARIANTS[one.setting]
     for kind, alpha in (("p95", 0.45), ("median", 1.0)):
         name = "95th percentile" if kind == "p95" else "median over the points"
-        _draw_moves(ax, knob.moves, kind, look | {"alpha": alpha})
+        _draw_moves(ax, one.moves, kind, look | {"alpha": alpha})
         mark = {"color": style.QUIET, "marker": look["marker"], "linestyle": "solid", "alpha": alpha, "linewidth": 1.0}
         entries.setdefault(kind, Line2D([], [], **sheet.look(mark), label=name))
-    _limit(ax, knob)
-    _draw_design(ax, knob, entries)
-    _draw_levels(ax, knob, found, entries)
+    _limit(ax, one)
+    _draw_design(ax, one, entries)
+    _draw_levels(ax, one, found, entries)
     for axis in (ax.xaxis, ax.yaxis):  # whose ends are known now
         panel.log_axis(axis)
-    panel.name_axes(ax, WIDTHS[knob.knob], "loss moves [share of the spread]" if found.spread else "loss moves")
-    panel.caption(ax, _title(knob))
+    panel.name_axes(ax, WIDTHS[one.setting], "loss moves [share of the spread]" if found.spread else "loss moves")
+    panel.caption(ax, _title(one))
 
 
 def _draw_moves(ax: Axes, moves: Sequence[Move], kind: str, look: dict[str, object]) -> None:
@@ -83,8 +83,10 @@ def _draw_moves(ax: Axes, moves: Sequence[Move], kind: str, look: dict[str, obje
     drawn = [(width, one) for width, one in known if one.value is not None]
     for width, one in drawn:
         low, high = (end or one.value or 0.0 for end in (one.low, one.high))
-        ax.plot([width, width], [max(low, LEAST), max(high, LEAST)], **sheet.look(style.INTERVAL_LINE), gid="interval")
-    values = [max(one.value or 0.0, LEAST) for _, one in drawn]
+        ax.plot(
+            [width, width], [max(low, MIN_MOVE), max(high, MIN_MOVE)], **sheet.look(style.INTERVAL_LINE), gid="interval"
+        )
+    values = [max(one.value or 0.0, MIN_MOVE) for _, one in drawn]
     ax.plot(
         [width for width, _ in drawn],
         values,
@@ -93,42 +95,42 @@ def _draw_moves(ax: Axes, moves: Sequence[Move], kind: str, look: dict[str, obje
     )
 
 
-def _limit(ax: Axes, knob: KnobConvergence) -> None:
+def _limit(ax: Axes, one: SettingConvergence) -> None:
     """Span the marks, on logarithmic axes."""
-    ends = [end for move in knob.moves for one in (move.median, move.p95) for end in (one.value, one.low, one.high)]
-    values = [max(end, LEAST) for end in ends if end is not None] or [LEAST, 1.0]
-    widths = [move.width for move in knob.moves]
-    ax.set_xlim(min(widths) / ROOM**0.5, max(widths) * ROOM**0.5)
-    ax.set_ylim(min(values) / ROOM, max(values) * ROOM)
+    ends = [end for move in one.moves for one in (move.median, move.p95) for end in (one.value, one.low, one.high)]
+    values = [max(end, MIN_MOVE) for end in ends if end is not None] or [MIN_MOVE, 1.0]
+    widths = [move.width for move in one.moves]
+    ax.set_xlim(min(widths) / REACH**0.5, max(widths) * REACH**0.5)
+    ax.set_ylim(min(values) / REACH, max(values) * REACH)
     for axis in (ax.xaxis, ax.yaxis):
         style.log_axis(axis)
 
 
-def _draw_design(ax: Axes, knob: KnobConvergence, entries: dict[str, Artist]) -> None:
+def _draw_design(ax: Axes, one: SettingConvergence, entries: dict[str, Artist]) -> None:
     """Draw the slope of the designed order, and those within the interval of the observed one, through the medians."""
-    known = [(move.width, move.median.value) for move in knob.moves if move.median.value]
+    known = [(move.width, move.median.value) for move in one.moves if move.median.value]
     if not known:
         return
     widths, values = np.array(known).T
     middle, height = np.exp(np.log(widths).mean()), np.exp(np.log(values).mean())
     span = np.geomspace(*ax.get_xlim(), 32)
-    if knob.order.low is not None and knob.order.high is not None and knob.verdict == "converges":
-        edges = [height * (span / middle) ** order for order in (knob.order.low, knob.order.high)]
+    if one.order.low is not None and one.order.high is not None and one.verdict == "converges":
+        edges = [height * (span / middle) ** order for order in (one.order.low, one.order.high)]
         ax.fill_between(span, *edges, color=style.BAND[0], linewidth=0.0, zorder=0, gid="observed")
         entries.setdefault("observed", Patch(color=style.BAND[0], label="observed order, 95 %"))
-    if knob.designed is not None:
+    if one.designed is not None:
         look = page.sheet_of(ax).look({"color": style.INK, "linewidth": 0.9, "linestyle": (0, (5, 2)), "zorder": 1})
-        ax.plot(span, height * (span / middle) ** knob.designed, **look, gid="design", scaley=False, scalex=False)
+        ax.plot(span, height * (span / middle) ** one.designed, **look, gid="design", scaley=False, scalex=False)
         entries.setdefault("design", Line2D([], [], **look, label="designed order"))
 
 
-def _draw_levels(ax: Axes, knob: KnobConvergence, found: Convergence, entries: dict[str, Artist]) -> None:
+def _draw_levels(ax: Axes, one: SettingConvergence, found: ConvergenceRecord, entries: dict[str, Artist]) -> None:
     """Draw the floor, what the rule allows, and what Richardson's limit leaves at the reference."""
     sheet, off = page.sheet_of(ax), found.rule.off.value
     left = next((one.median.value for one in found.remainders if one.name == found.reference), None)
     lines = {
         "rule": (0.1 * off if off else None, "solid", "a tenth of standard's error"),
-        "floor": (knob.floor, (0, (1, 1.5)), "floor"),
+        "floor": (one.floor, (0, (1, 1.5)), "floor"),
         "limit": (left, (0, (6, 1.5, 1, 1.5)), "left at the reference by Richardson, median"),
     }
     for gid, (value, dashes, said) in lines.items():
@@ -136,19 +138,19 @@ def _draw_levels(ax: Axes, knob: KnobConvergence, found: Convergence, entries: d
         if value and low / 30 < value < 30 * high:
             look = sheet.look({"color": style.QUIET, "linewidth": 1.0, "linestyle": dashes, "zorder": 0.5})
             ax.axhline(value, **look, gid=gid)
-            ax.set_ylim(min(low, value / ROOM), max(high, value * ROOM))
+            ax.set_ylim(min(low, value / REACH), max(high, value * REACH))
             entries.setdefault(gid, Line2D([], [], **look, label=said))
 
 
-def _title(knob: KnobConvergence) -> str:
-    order = knob.order
+def _title(one: SettingConvergence) -> str:
+    order = one.order
     if order.value is None:
-        return f"{knob.knob}: {knob.verdict}"
+        return f"{one.setting}: {one.verdict}"
     ends = " to ".join("?" if end is None else style.number(end, ".2g") for end in (order.low, order.high))
-    return f"{knob.knob}: {knob.verdict}, order {style.number(order.value, '.2g')} ({ends})"
+    return f"{one.setting}: {one.verdict}, order {style.number(order.value, '.2g')} ({ends})"
 
 
-def _draw_distributions(ax: Axes, found: Convergence, entries: dict[str, Artist]) -> None:
+def _draw_distributions(ax: Axes, found: ConvergenceRecord, entries: dict[str, Artist]) -> None:
     """Draw Wasserstein's distance of each fidelity's losses over neighbourhoods from the reference's, and the noise."""
     apart = found.distributions
     assert apart is not None
@@ -172,7 +174,7 @@ def _draw_distributions(ax: Axes, found: Convergence, entries: dict[str, Artist]
     panel.caption(ax, f"losses over {apart.neighbourhoods} neighbourhoods")
 
 
-def _provenance(found: Convergence) -> str:
+def _provenance(found: ConvergenceRecord) -> str:
     """Say who measured it, and how."""
     known = {**found.provenance, **found.identity}
     return " · ".join(f"{known[key]}" for key in ("device", "created", "command") if known.get(key))

@@ -1,4 +1,4 @@
-"""The extremes of a scene: loss errors over how far knobs are turned, and maps of pairs of them (matplotlib)."""
+"""The extremes of a scene: loss errors over how far settings are changed, and maps of pairs of them (matplotlib)."""
 
 from __future__ import annotations
 
@@ -15,25 +15,30 @@ from matplotlib.path import Path
 from matplotlib.ticker import FixedLocator
 from numpy.typing import NDArray
 
-from ...measures.stability import ACCURATE, INACCURATE, REFUSED, UNJUDGED, Cell
 from ...objective import Status
 from .. import style
 from . import page, panel
 
 if TYPE_CHECKING:
-    from ...measures.extremes import Extremes, Limit, StabilityMap
+    from ....studies.extremes import ExtremesRecord, Limit, StabilityMap
+    from ....studies.stability import Cell
 
-PITCH, LEAST = 4.0, 40.0  # room of a panel: on a screen [inch], and at least in print [mm]
+PITCH, MIN_PANEL = 4.0, 40.0  # room of a panel: on a screen [inch], and at least in print [mm]
 LOWEST, HIGHEST = 1e-4, 1e4  # of the error axis [% of the spread]; what is beyond stands on the edge
-NAMES = {ACCURATE: "accurate", INACCURATE: "finite, but wrong", UNJUDGED: "finite, not judged", REFUSED: "refused"}
+NAMES = {
+    "accurate": "accurate",
+    "inaccurate": "finite, but wrong",
+    "not judged": "finite, not judged",
+    "refused": "refused",
+}  # of the outcomes of `studies.stability`
 NAMES |= {kind.name: name for kind, name in style.FAILURES.items()} | {Status.NO_GRADIENT.name: style.NO_GRADIENT}
-ROOM = 1.35  # what the axis of factors reaches beyond the outermost marks, as a ratio
+REACH = 1.35  # what the axis of factors reaches beyond the outermost marks, as a ratio
 
 Grid = NDArray[np.float64]
 
 
-def extremes_figure(found: Extremes, *, width: float | None = None) -> page.Picture:
-    """Draw for each precision loss errors over the knobs, and a map of each pair with its bisected boundary.
+def extremes_figure(found: ExtremesRecord, *, width: float | None = None) -> page.Picture:
+    """Draw for each precision loss errors over the settings, and a map of each pair with its bisected boundary.
 
     A cell of a map is one setting, coloured by how it ended; nothing is interpolated. A curve breaks where the scene
     fails, and a cross says where it first does; errors too large or too small for the axis are on its edges.
@@ -42,13 +47,13 @@ def extremes_figure(found: Extremes, *, width: float | None = None) -> page.Pict
     """
     rows = [[one for one in found.maps if one.precision == precision] for precision in found.precisions]
     columns = 1 + max(map(len, rows))
-    sheet = style.Sheet.of(width, pitch=PITCH, columns=columns, least=LEAST)
+    sheet = style.Sheet.of(width, pitch=PITCH, columns=columns, least=MIN_PANEL)
     picture = page.Picture(sheet, len(rows) * math.ceil(columns / sheet.columns) * sheet.pitch)
     axes = iter(panel.grid(picture, sum(1 + len(maps) for maps in rows)))
     entries: dict[str, Artist] = {}
     for precision, maps in zip(found.precisions, rows, strict=True):
         limits = [one for one in found.limits if one.precision == precision]
-        entries |= _draw_errors(next(axes), limits, found.accuracy, precision)
+        entries |= _draw_errors(next(axes), limits, found.tolerance, precision)
         for one in maps:
             entries |= _draw_map(next(axes), one)
     page.entitle(picture, f"{found.env} · {found.fidelity} · extremes · {found.points} points")
@@ -56,50 +61,50 @@ def extremes_figure(found: Extremes, *, width: float | None = None) -> page.Pict
     return picture
 
 
-def _provenance(found: Extremes) -> str:
+def _provenance(found: ExtremesRecord) -> str:
     known = {**found.provenance, **found.identity}
     said = [f"judged by {found.reference}", *(str(known[key]) for key in ("device", "engine", "created") if known[key])]
     return " · ".join([*said, found.command])
 
 
-def _draw_errors(ax: Axes, limits: Sequence[Limit], accuracy: float, precision: str) -> dict[str, Artist]:
-    """Draw the error of each knob's stable rungs over the factor it is turned by; return the legend's entries."""
+def _draw_errors(ax: Axes, limits: Sequence[Limit], tolerance: float, precision: str) -> dict[str, Artist]:
+    """Draw the error of each setting's stable values over the factor it is changed by; return the legend's entries."""
     sheet, entries = page.sheet_of(ax), dict[str, Artist]()
     panel.dress(ax)
     drawn = [limit for limit in limits if _has_factor(limit)]
-    looks = _looks(list(dict.fromkeys(limit.knob for limit in drawn)))
+    looks = _looks(list(dict.fromkeys(limit.setting for limit in drawn)))
     for limit in drawn:
-        look = sheet.look({"linewidth": 1.1, **style.VARIANT_MARK, "markersize": 5.0, **looks[limit.knob]})
-        factors = [cell.values[0] / limit.base for cell in limit.rungs]
-        errors = [_error(cell) for cell in limit.rungs]
-        ax.plot(factors, errors, **look | {"linestyle": "solid"}, gid=limit.knob, clip_on=False)
-        entries[limit.knob] = Line2D([], [], **look | {"linestyle": "solid"}, label=limit.knob)
+        look = sheet.look({"linewidth": 1.1, **style.VARIANT_MARK, "markersize": 5.0, **looks[limit.setting]})
+        factors = [cell.values[0] / limit.base for cell in limit.scanned]
+        errors = [_error(cell) for cell in limit.scanned]
+        ax.plot(factors, errors, **look | {"linestyle": "solid"}, gid=limit.setting, clip_on=False)
+        entries[limit.setting] = Line2D([], [], **look | {"linestyle": "solid"}, label=limit.setting)
         if limit.failed is not None:
             cross = sheet.look({"marker": "x", "markersize": 6.0, "markeredgewidth": 1.4, "linestyle": "none"})
             at, top = [limit.failed / limit.base], [HIGHEST]
             ax.plot(at, top, color=look["color"], **cross, gid="failed", clip_on=False, zorder=5)
             entries["failed"] = Line2D([], [], color=style.INK, **cross, label="first failure, on the edge")
     if drawn:
-        reach = [cell.values[0] / limit.base for limit in drawn for cell in limit.rungs]
-        ax.set_xlim(min(reach) / ROOM, max(reach) * ROOM)
+        reach = [cell.values[0] / limit.base for limit in drawn for cell in limit.scanned]
+        ax.set_xlim(min(reach) / REACH, max(reach) * REACH)
     ax.set_ylim(LOWEST, HIGHEST)
     for axis in (ax.xaxis, ax.yaxis):
         panel.log_axis(axis)
     ax.yaxis.set_major_locator(FixedLocator([10.0**power for power in range(-4, 5, 2)]))
-    _dress_errors(ax, accuracy, precision)
+    _dress_errors(ax, tolerance, precision)
     line = sheet.look(style.REFERENCE_LINE)
-    return entries | {"accuracy": Line2D([], [], **line, label=f"accurate below {100 * accuracy:g} %")}
+    return entries | {"tolerance": Line2D([], [], **line, label=f"accurate below {100 * tolerance:g} %")}
 
 
 def _error(cell: Cell) -> float:
-    """Return a stable rung's error within the axis [% of the spread], NaN where there is none: the curve breaks."""
+    """Return a stable value's error within the axis [% of the spread], NaN where there is none: the curve breaks."""
     if not cell.stable or cell.error is None:
         return math.nan
     return float(np.clip(100 * cell.error, LOWEST, HIGHEST))
 
 
-def _dress_errors(ax: Axes, accuracy: float, precision: str) -> None:
-    ax.axhline(100 * accuracy, **page.sheet_of(ax).look(style.REFERENCE_LINE))
+def _dress_errors(ax: Axes, tolerance: float, precision: str) -> None:
+    ax.axhline(100 * tolerance, **page.sheet_of(ax).look(style.REFERENCE_LINE))
     ax.axvline(1.0, color=style.FAINT, linewidth=0.8 * page.sheet_of(ax).weight, zorder=0)
     ax.set_box_aspect(1)
     panel.name_axes(ax, "times what the scene has", "loss error, 95 % of the points [% of the spread]")
@@ -107,16 +112,16 @@ def _dress_errors(ax: Axes, accuracy: float, precision: str) -> None:
 
 
 def _has_factor(limit: Limit) -> bool:
-    """Say whether a knob is turned by factors: one that may be zero is not."""
-    return limit.base > 0 and all(cell.values[0] > 0 for cell in limit.rungs)
+    """Say whether a setting is changed by factors: one that may be zero is not."""
+    return limit.base > 0 and all(cell.values[0] > 0 for cell in limit.scanned)
 
 
-def _looks(knobs: Sequence[str]) -> dict[str, dict[str, object]]:
-    """Return a colour and a marker for each knob: those of the trade-off where it has them."""
+def _looks(settings: Sequence[str]) -> dict[str, dict[str, object]]:
+    """Return a colour and a marker for each setting: those of the trade-off where it has them."""
     own = [style.VARIANTS[name] for name in ("stiffness", "engine", "particles", "precision", "device")]
     known = {"dt": style.VARIANTS["dt"], "resolution": style.VARIANTS["resolution"]}
-    others = iter(own * len(knobs))
-    return {knob: known[knob] if knob in known else next(others) for knob in knobs}
+    others = iter(own * len(settings))
+    return {name: known[name] if name in known else next(others) for name in settings}
 
 
 def _draw_map(ax: Axes, found: StabilityMap) -> dict[str, Artist]:

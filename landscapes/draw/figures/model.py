@@ -15,16 +15,16 @@ from .. import style
 from . import labels, page, panel
 
 if TYPE_CHECKING:
-    from ...measures.fidelity import Bootstrap
-    from ...measures.model import MeasuredPart, ModelStudy
+    from ....studies.model import MeasuredPart, ModelRecord
+    from ....studies.samples import Bootstrap
 
 PITCH, SHAPE, NARROW = 7.2, 0.58, 0.9  # room on a screen [inch]; the panel's height against its width, there and narrow
 GAPS = (7.0, 12.0, 18.0, 25.0, 34.0, 44.0)  # of a name from its mark, on a screen [pt]
-ROOM, BESIDE = 2.0, 0.12  # what the axes reach beyond the outermost marks: as a ratio, and as a share of the width
-LEAST = 4.0  # per cent of an episode that the axis of times spans at least, to either side
+REACH, MARGIN = 2.0, 0.12  # what the axes reach beyond the outermost marks: as a ratio, and as a share of the width
+MIN_SPAN = 4.0  # per cent of an episode that the axis of times spans at least, to either side
 
 
-def model_figure(study: ModelStudy, *, width: float | None = None) -> page.Picture:
+def model_figure(study: ModelRecord, *, width: float | None = None) -> page.Picture:
     """Draw how far changing each part moves losses, the 95th percentile, over the time of an episode that it saves.
 
     Both have their intervals. A part that the full model has is a filled mark; one that is missing, which its options
@@ -42,7 +42,7 @@ def model_figure(study: ModelStudy, *, width: float | None = None) -> page.Pictu
         keyed += [name for name in left if name not in keyed]
 
 
-def _draw(study: ModelStudy, sheet: style.Sheet, keyed: Sequence[str]) -> tuple[page.Picture, list[str]]:
+def _draw(study: ModelRecord, sheet: style.Sheet, keyed: Sequence[str]) -> tuple[page.Picture, list[str]]:
     """Draw the picture, with the `keyed` parts named by number; return it and the names that found no room."""
     picture = page.Picture(sheet, sheet.width)
     ax = picture.subplots()
@@ -74,7 +74,7 @@ def _error(found: Any, relative: bool) -> Bootstrap:
     return error
 
 
-def _floor(study: ModelStudy) -> float | None:
+def _floor(study: ModelRecord) -> float | None:
     """Return the noise of the full model as the errors are measured, None where it fails too often to have one."""
     relative = study.spread is not None
     value = _error(study.noise.comparison, relative).value
@@ -82,24 +82,24 @@ def _floor(study: ModelStudy) -> float | None:
     return None if value is None else max(value, digit)
 
 
-def _limits(ax: Axes, study: ModelStudy) -> dict[str, tuple[float, float]]:
+def _limits(ax: Axes, study: ModelRecord) -> dict[str, tuple[float, float]]:
     """Span what is drawn, with no time saved in sight; return where each part's mark is."""
     relative = study.spread is not None
     found = {part.name: _error(part.comparison, relative) for part in study.parts}
     sizes = [_floor(study), *(end for one in found.values() for end in (one.value, one.low, one.high))]
     known = [size for size in sizes if size] or [1.0]
-    low, high = min(known) / ROOM, max(known) * ROOM
+    low, high = min(known) / REACH, max(known) * REACH
     saved = np.array([_saved(part) for part in study.parts]).reshape(-1, 3)
-    ends = np.append(saved[np.isfinite(saved)], (-LEAST, LEAST))
-    beside = BESIDE * np.ptp(ends)
-    ax.set_xlim(float(ends.min() - beside), float(ends.max() + beside))
+    ends = np.append(saved[np.isfinite(saved)], (-MIN_SPAN, MIN_SPAN))
+    margin = MARGIN * np.ptp(ends)
+    ax.set_xlim(float(ends.min() - margin), float(ends.max() + margin))
     ax.set_ylim(low, high)
     style.log_axis(ax.yaxis)
     heights = {name: high if one.value is None else max(one.value, low) for name, one in found.items()}
     return {part.name: (float(_saved(part)[0]), heights[part.name]) for part in study.parts}
 
 
-def _draw_parts(ax: Axes, study: ModelStudy, places: dict[str, tuple[float, float]]) -> list[Artist]:
+def _draw_parts(ax: Axes, study: ModelRecord, places: dict[str, tuple[float, float]]) -> list[Artist]:
     """Draw a mark for each part with its intervals; return the entries of the legend."""
     sheet = page.sheet_of(ax)
     how, (bottom, top) = sheet.look(style.INTERVAL_LINE), ax.get_ylim()
@@ -127,7 +127,7 @@ def _look(sheet: style.Sheet, part: MeasuredPart) -> dict[str, Any]:
     return sheet.look(look)
 
 
-def _draw_lines(ax: Axes, study: ModelStudy) -> list[Artist]:
+def _draw_lines(ax: Axes, study: ModelRecord) -> list[Artist]:
     """Draw where no time is saved, and how far noise alone moves the losses."""
     sheet, floor = page.sheet_of(ax), _floor(study)
     entries: list[Artist] = [ax.axvline(0.0, **sheet.look(style.REFERENCE_LINE), label="the full model's time")]
@@ -138,13 +138,13 @@ def _draw_lines(ax: Axes, study: ModelStudy) -> list[Artist]:
     return entries
 
 
-def _number_entries(sheet: style.Sheet, study: ModelStudy, numbers: dict[str, str]) -> list[Artist]:
+def _number_entries(sheet: style.Sheet, study: ModelRecord, numbers: dict[str, str]) -> list[Artist]:
     """Return the legend entries of the parts that are named by number."""
     parts = {part.name: part for part in study.parts}
     return [Line2D([], [], **_look(sheet, parts[name]), label=f"{number}: {name}") for name, number in numbers.items()]
 
 
-def _name(ax: Axes, study: ModelStudy, numbers: dict[str, str], places: dict[str, tuple[float, float]]) -> list[str]:
+def _name(ax: Axes, study: ModelRecord, numbers: dict[str, str], places: dict[str, tuple[float, float]]) -> list[str]:
     """Name the parts where the name covers no mark and if possible no line; return those without room.
 
     Parts whose number is in the legend come first.
@@ -167,7 +167,7 @@ def _along(ax: Axes, line: Line2D) -> NDArray[np.float64]:
     return found
 
 
-def _write_head(picture: page.Picture, ax: Axes, study: ModelStudy) -> None:
+def _write_head(picture: page.Picture, ax: Axes, study: ModelRecord) -> None:
     page.entitle(picture, f"{study.env} · what each part of the model is for · {study.fidelity}, {study.points} points")
     known = {**study.provenance, **study.identity}
     said = [f"{known[key]}" for key in ("device", "created", "command") if known.get(key)]

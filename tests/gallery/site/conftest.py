@@ -5,12 +5,12 @@ import subprocess
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import imageio_ffmpeg
 import pytest
 import torch
 
+from gradscape.envs.records import Fidelity
 from gradscape.gallery.figures import Figure
 from gradscape.gallery.files import DATA, RUN_SUFFIX, RUNS, LeagueFiles, LeagueSliceFiles
 from gradscape.gallery.paper import PaperCaption
@@ -32,9 +32,13 @@ from gradscape.optim.race import Race
 from gradscape.optim.runs.run import Run
 from gradscape.optim.runs.store import RunStore
 from gradscape.optim.search import search
+from gradscape.studies.convergence import ConvergenceRecord, ConvergenceRule, Remainder
+from gradscape.studies.fidelity import FidelityRecord, MeasuredVariant
+from gradscape.studies.kept import file_name
+from gradscape.studies.samples import Bootstrap, Comparison, GradientError, LossError, Seconds
 
 from ...command import PATIENCE
-from ...studies import study
+from ...made_studies import NONE, fidelities, study
 from .browsing import DRAWN
 from .ledges import build_ledges, keep_ledges
 
@@ -78,36 +82,35 @@ def kept_report() -> Report:
     return replace(known, profile=profile, paper=paper)
 
 
-def rung(name: str, ladder: str, milliseconds: float, error: float | None) -> dict[str, Any]:
-    """Return what a trade-off says of a rung, its error in percent of the spread of 2 J."""
-    found = None if error is None else {"value": error / 100, "low": error / 200, "high": error / 50}
-    none = {"value": None, "low": None, "high": None}
-    return {
-        "name": name, "ladder": ladder, "loss_error": {"p95_relative": found or none, "p95": none},
-        "spearman": {"value": 0.987}, "gradient": {"cosine": {"value": 0.654}}, "diverged": 0.25,
-        "seconds": {"forward": milliseconds / 2e3, "with_gradient": milliseconds / 1e3}, "memory": 2_500_000,
-    }  # fmt: skip
+def measured(name: str, changed: str, milliseconds: float, error: float | None) -> MeasuredVariant:
+    """Return what a study says of a variant, its error in percent of the spread of 2 J."""
+    found = NONE if error is None else Bootstrap(error / 100, error / 200, error / 50)
+    compared = Comparison(
+        LossError(NONE, NONE if error is None else found, NONE, found), Bootstrap(0.987, None, None),
+        GradientError(Bootstrap(0.654, None, None), NONE), 0.25, 64, Seconds(milliseconds / 2e3, milliseconds / 1e3), 8,
+    )  # fmt: skip
+    return MeasuredVariant(name, changed, Fidelity(name, dt=0.1), "warp", "cuda", {}, 2_500_000, compared)
 
 
-TRADEOFF = {
-    "env": "fluid", "reference": "reference", "points": 64, "spread": 2.0, "loss_unit": "J", "refused": [],
-    "command": "landscape tradeoff fluid",
-    "identity": {"options": {"goal": "high"}, "device": "cuda", "model_version": 1},
-    "rungs": [
-        rung("reference", "named", 400, 0), rung("draft", "named", 4, 9), rung("coarse", "dt", 2, None),
-        rung("standard", "named", 40, 3), rung("slow", "dt", 50, 4),
-    ],
-}  # fmt: skip
+def studied(device: str) -> FidelityRecord:
+    """Return a study of fidelities on a device."""
+    rows = (
+        measured("reference", "named", 400, 0), measured("draft", "named", 4, 9), measured("coarse", "dt", 2, None),
+        measured("standard", "named", 40, 3), measured("slow", "dt", 50, 4),
+    )  # fmt: skip
+    identity = {"options": {"goal": "high"}, "device": device, "engine": "warp", "model_version": 1}
+    found = replace(fidelities(rows, "fluid"), loss_unit="J", identity=identity)
+    return replace(found, command="landscape study fidelity fluid")
 
 
-KNOWN = {"value": 0.04, "low": 0.03, "high": 0.05}
-CONVERGENCE = {
-    "env": "fluid", "reference": "reference", "points": 16, "seed": 0, "loss_unit": "J", "spread": 2.0, "knobs": [],
-    "rule": {"off": {**KNOWN, "value": 0.1}, "moved": KNOWN, "knob": "dt", "met": False, "failing": ["dt"]},
-    "remainders": [{"name": "standard", "median": KNOWN, "p95": KNOWN}], "divergence": None, "distributions": None,
-    "refused": [], "identity": {"model_version": 1, "engine": "warp", "device": "cuda"}, "provenance": {},
-    "command": "landscape tradeoff fluid --ladder convergence",
-}  # fmt: skip
+KNOWN = Bootstrap(0.04, 0.03, 0.05)
+CONVERGENCE = ConvergenceRecord(
+    env="fluid", reference="reference", points=16, seed=0, loss_unit="J", spread=2.0, settings=(),
+    rule=ConvergenceRule(replace(KNOWN, value=0.1), KNOWN, "dt", False, ("dt",)),
+    remainders=(Remainder("standard", KNOWN, KNOWN),), divergence=None, distributions=None, refused=(),
+    identity={"model_version": 1, "engine": "warp", "device": "cuda", "options": {}}, provenance={},
+    command="landscape study convergence fluid",
+)  # fmt: skip
 
 
 GRADE = {
@@ -238,15 +241,12 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     picture(full / "gradient-quality.png")
     (full / "companions.json").write_text(json.dumps({"slices": COMPANIONS}))
     picture(full / "companions.png")
-    (folder / "tradeoff").mkdir()
-    for device in ("cuda", "cpu"):
-        identity = {**TRADEOFF["identity"], "device": device}
-        (folder / f"tradeoff/fluid-{device}.json").write_text(json.dumps({**TRADEOFF, "identity": identity}))
-        picture(folder / f"tradeoff/fluid-{device}.png")
-    (folder / "tradeoff/fluid-cuda.model.json").write_text(json.dumps(study({"drag": 1.0, "wall": 0.2}).record()))
-    picture(folder / "tradeoff/fluid-cuda.model.png")
-    (folder / "tradeoff/fluid-cuda.convergence.json").write_text(json.dumps(CONVERGENCE))
-    picture(folder / "tradeoff/fluid-cuda.convergence.png")
+    (folder / "studies").mkdir()
+    parts = replace(study({"drag": 1.0, "wall": 0.2}), identity=CONVERGENCE.identity)
+    for found in (studied("cuda"), studied("cpu"), parts, CONVERGENCE):
+        path = folder / "studies" / file_name("fluid", found.device, found.kind)
+        path.write_text(json.dumps(to_json(found)))
+        picture(path.with_suffix(".png"))
     (folder / "card").mkdir()
     (folder / "card/card.json").write_text(json.dumps(CARD))
     picture(folder / "card/card.png")

@@ -67,7 +67,7 @@ def maker(file: Path) -> str:
     if file.parent.name == "census":
         return f"census {file.stem.removesuffix('-cuda')} --device cuda` measures it anew"
     scene, _, study = file.stem.partition("-cuda.")
-    return f"tradeoff {scene} --ladder {study}` measures it anew" if study else "gallery compute --part "
+    return f"study {study} {scene}` measures it again" if study else "gallery compute --part "
 
 
 def test_a_site_is_built_or_refused_by_the_damaged_files_name(undrawn: None, data: Path, tmp_path: Path) -> None:

@@ -94,7 +94,7 @@ def test_a_page_shows_what_each_part_of_the_model_is_for(site: Path) -> None:
     bare, full = json.loads((site / "manifest.json").read_text())["figures"][1:]
     assert bare["models"] == []
     (study,) = full["models"]
-    assert (study["device"], study["fidelity"], study["file"]) == ("cuda", "draft", "tradeoff/fluid-cuda.model.json")
+    assert (study["device"], study["fidelity"], study["file"]) == ("cuda", "draft", "studies/fluid-cuda.model.json")
     assert [(row["name"], row["missing"]) for row in study["parts"]] == [("drag", False), ("wall", True)]
     drag = study["parts"][0]
     assert drag["error"]["value"] == pytest.approx(1 / study["spread"])
@@ -169,7 +169,7 @@ def test_without_races_there_is_no_league(data: Path, tmp_path: Path) -> None:
 
 def test_words_are_beside_the_papers_and_a_trade_off_is_ranked(site: Path) -> None:
     bare, full = json.loads((site / "manifest.json").read_text())["figures"][1:]
-    assert (bare["report"], bare["tradeoffs"]) == (None, [])
+    assert (bare["report"], bare["fidelities"]) == (None, [])
     agreed = {one["word"]: (one["measured"], one["agree"]) for one in full["report"]["words"]}
     assert agreed == {
         "rugged": (True, True), "gradients good": (False, False), "gradients noisy": (True, None)
@@ -179,16 +179,16 @@ def test_words_are_beside_the_papers_and_a_trade_off_is_ranked(site: Path) -> No
         "mean cosine of gradient and difference −0.50 over 0.04 of the box; "
         "smoothed over 1% of it, first order is biased at 9 of 36"
     )
-    trade, another = full["tradeoffs"]
+    trade, another = full["fidelities"]
     assert (trade["device"], another["device"]) == ("cuda", "cpu")
-    files = {path.name for path in (site / "tradeoff").iterdir()}
-    studies = ("fluid-cuda", "fluid-cpu", "fluid-cuda.model", "fluid-cuda.convergence")
+    files = {path.name for path in (site / "studies").iterdir()}
+    studies = ("fluid-cuda.fidelity", "fluid-cpu.fidelity", "fluid-cuda.model", "fluid-cuda.convergence")
     assert files == {f"{study}{kind}" for study in studies for kind in (".json", ".csv", ".png", "-dark.png")}
     said = "the reference is not converged: refining its dt moves it by 4 % where standard is off by 10 %"
     assert trade["convergence"]["says"][0].startswith(said)
     assert said in " ".join((site / "full/index.html").read_text().split())
     assert another["convergence"] is None
-    assert [(row["name"], row["front"]) for row in trade["rungs"]] == [
+    assert [(row["name"], row["front"]) for row in trade["variants"]] == [
         ("coarse", False), ("draft", True), ("standard", True), ("slow", False), ("reference", False)
     ]  # fmt: skip
     assert trade["alt"] == (
@@ -235,7 +235,7 @@ def test_words_of_a_figure_are_escaped(site: Path) -> None:
 
 def test_a_page_says_what_it_has_and_nothing_of_what_it_has_not(site: Path) -> None:
     full, bare = ((site / name / "index.html").read_text() for name in ("full", "bare"))
-    sections = ("sweep-title", "episodes-title", "measures-title", "tradeoff-title", 'id="surface"')
+    sections = ("sweep-title", "episodes-title", "measures-title", "fidelity-title", 'id="surface"')
     assert [section in full for section in sections] == [True, True, True, True, True]
     assert [section in bare for section in sections] == [False, False, False, False, True]
     words = re.findall(r'<th scope="row">([\w ]+)</th>\s*<td>([^<]*)</td>\s*<td>([^<]*)</td></tr>', bare_cells(full))

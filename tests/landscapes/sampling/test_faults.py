@@ -13,7 +13,6 @@ from gradscape.envs.engines.sheets import springs
 from gradscape.envs.registry import make
 from gradscape.landscapes.cost import seconds_per_episode
 from gradscape.landscapes.identity import StoreError
-from gradscape.landscapes.measures.stability import ask
 from gradscape.landscapes.objective import Evaluation, Objective, Status
 from gradscape.landscapes.plane import Plane
 from gradscape.landscapes.sampling.fill import sample
@@ -22,6 +21,7 @@ from gradscape.landscapes.space import ParameterSpace
 from gradscape.landscapes.storage.paths import filling_path
 from gradscape.landscapes.storage.store import SliceStore
 from gradscape.landscapes.verification import POINTS
+from gradscape.studies.stability import ask
 
 from ...processes import FORK
 

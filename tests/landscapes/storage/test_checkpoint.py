@@ -32,16 +32,16 @@ def test_a_part_of_another_study_is_damaged_and_computed_again(tmp_path: Path) -
 
 
 def test_a_limit_is_not_moved_by_a_piece_of_another_seed(tmp_path: Path) -> None:
-    how = {"points": 2, "knobs": ["dt"], "precisions": ["float64"], "device": "cpu", "fidelity": "draft"}
-    found = [gs.extremes("bounce", **how, seed=seed, out=tmp_path / str(seed)) for seed in (0, 1)]
+    how = {"points": 2, "settings": ["dt"], "precisions": ["float64"], "device": "cpu", "fidelity": "draft"}
+    found = [gs.study("extremes", "bounce", **how, seed=seed, out=tmp_path / str(seed)) for seed in (0, 1)]
     for piece in (tmp_path / "1/pieces").glob("*.npz"):
         shutil.copy(piece, tmp_path / "0/pieces" / piece.name)
     (tmp_path / "1/pieces/probes.npz").replace(tmp_path / "0/pieces/probes.npz")
     with pytest.raises(DamagedError, match=r"probes\.npz is damaged \(it is not of this study"):
-        gs.extremes("bounce", **how, seed=0, out=tmp_path / "0")
+        gs.study("extremes", "bounce", **how, seed=0, out=tmp_path / "0")
     (tmp_path / "0/pieces/probes.npz").unlink()
     with pytest.warns(RuntimeWarning, match="not of this study"):
-        again = gs.extremes("bounce", **how, seed=0, out=tmp_path / "0")
+        again = gs.study("extremes", "bounce", **how, seed=0, out=tmp_path / "0")
     assert [one.stable for one in again.limits] == [one.stable for one in found[0].limits]
 
 

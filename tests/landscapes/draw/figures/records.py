@@ -1,33 +1,34 @@
-"""Records of studies that fill their figures: each knob there is, in each precision, with long names and many rows."""
+"""Records of studies that fill their figures: each setting there is, in each precision, long names, many rows."""
 
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 import xarray as xr
 
+from gradscape.envs.records import Fidelity
 from gradscape.jobs.league import simulated_scenes
 from gradscape.landscapes.draw import style
 from gradscape.landscapes.measures.card import Card, CardSlice, Grade
 from gradscape.landscapes.measures.census import MEASURES, Census, CensusDesign, SurveyedSlice, conclude
 from gradscape.landscapes.measures.classify import WORDS
-from gradscape.landscapes.measures.convergence import Shapes
-from gradscape.landscapes.measures.convergence_record import (
-    Convergence,
+from gradscape.landscapes.space import ParameterSpace
+from gradscape.optim.registry import methods
+from gradscape.studies.convergence import (
+    ConvergenceRecord,
     ConvergenceRule,
-    KnobConvergence,
     Level,
     Move,
     Remainder,
+    SettingConvergence,
 )
-from gradscape.landscapes.measures.distributions import ComparedDistribution, Distance, Distributions
-from gradscape.landscapes.measures.extremes import Extremes, Limit, StabilityMap
-from gradscape.landscapes.measures.fidelity import Bootstrap
-from gradscape.landscapes.measures.stability import STABLE, Cell
-from gradscape.landscapes.space import ParameterSpace
-from gradscape.optim.registry import methods
+from gradscape.studies.divergence import ComparedDistribution, Distance, Distributions
+from gradscape.studies.extremes import ExtremesRecord, Limit, StabilityMap
+from gradscape.studies.fidelity import FidelityRecord
+from gradscape.studies.order import Shapes
+from gradscape.studies.samples import Bootstrap
+from gradscape.studies.stability import STABLE, Cell
 
-from ...measures.test_fidelity import REPORT, rung
+from ....made_studies import VARIANTS, fidelities, variant
 
 MEASURED = {"device": "cuda", "engine": "warp", "created": "2026-11-21"}
 COMMAND = "landscape {} triple-move --fidelity reference --device cuda --points 64 --out studies/triple-move-reference"
@@ -50,49 +51,50 @@ def near(value: float) -> Bootstrap:
     return Bootstrap(value, 0.8 * value, 1.3 * value)
 
 
-def knob(name: str, widths: list[float]) -> KnobConvergence:
-    """Return a knob whose observed order is not the designed one, with a floor."""
-    levels = tuple(Level(f"reference-{name}-x{width:.3g}", width, {}, 1.0) for width in widths)
+def refined(name: str, widths: list[float]) -> SettingConvergence:
+    """Return a setting whose observed order is not the designed one, with a floor."""
+    levels = tuple(Level(f"reference-{name}-x{width:.3g}", width, Fidelity(name, width), 1.0) for width in widths)
     moves = tuple(
         Move(coarse.name, fine.name, fine.width, near(coarse.width), near(9 * coarse.width), near(0.9), near(0.1), 64)
         for coarse, fine in pairwise(levels)
     )
     shapes, verdict = Shapes(monotone=40, oscillating=12, growing=11, still=1), "converges"
     order = Bootstrap(1.21, -0.35, 2.42)
-    return KnobConvergence(
+    return SettingConvergence(
         name, levels, moves, verdict, order, (1.0,) * 64, shapes, 2.0, min(widths) / 3, near(0.02), False, None
     )  # fmt: skip
 
 
-def convergence() -> Convergence:
-    """Return a study of every knob that has a panel, of a scene that is chaotic."""
+def convergence() -> ConvergenceRecord:
+    """Return a study of every setting that has a panel, of a scene that is chaotic."""
     steps = [2e-5 / 2**level for level in range(5)]
-    knobs = (knob("dt", steps), *(knob(one, [1.5, 1.0, 2 / 3, 0.5]) for one in ("resolution", "particles", "joint")))
-    names = ("draft", "standard", *(one.levels[-1].name for one in knobs), "reference-float32")
+    others = [refined(one, [1.5, 1.0, 2 / 3, 0.5]) for one in ("resolution", "particles", "joint")]
+    settings = (refined("dt", steps), *others)
+    names = ("draft", "standard", *(one.levels[-1].name for one in settings), "reference-float32")
     far = Distance(near(0.4), near(0.3))
     apart = Distributions(
         16, 64, 0.01, far, {"kolmogorov": 0.2, "wasserstein": 0.1},
         tuple(ComparedDistribution(name, far, ("kolmogorov", "wasserstein")) for name in names),
     )  # fmt: skip
-    return Convergence(
-        env="triple-move", reference="reference", points=64, seed=0, loss_unit="J", spread=12.3, knobs=knobs,
+    return ConvergenceRecord(
+        env="triple-move", reference="reference", points=64, seed=0, loss_unit="J", spread=12.3, settings=settings,
         rule=ConvergenceRule(near(0.05), near(0.02), "resolution", False, ("dt", "resolution", "particles", "joint")),
         remainders=(Remainder("standard", near(0.1), near(0.4)), Remainder("reference", near(0.004), near(0.02))),
         divergence=None, distributions=apart, refused=(), identity={}, provenance=MEASURED,
-        command=COMMAND.format("tradeoff") + " --ladder convergence",
+        command=COMMAND.format("study convergence"),
     )  # fmt: skip
 
 
 def limit(name: str, precision: str, failed: float | None) -> Limit:
-    """Return a limit whose rungs span decades; `failed` is the factor from which they fail."""
+    """Return a limit whose values span decades; `failed` is the factor from which they fail."""
     factors = np.geomspace(1e-3, 1e3, 13)
-    rungs = [Cell((f,), "NONFINITE" if failed and f >= failed else "accurate", 1.0, error=f**2 / 50) for f in factors]
-    stable = max(cell.values[0] for cell in rungs if cell.stable)
-    return Limit(name, "s", precision, "largest", 1.0, stable, failed, "NONFINITE", 1.0, 2.0, (), tuple(rungs))
+    scanned = [Cell((f,), "NONFINITE" if failed and f >= failed else "accurate", 1.0, error=f**2 / 50) for f in factors]
+    stable = max(cell.values[0] for cell in scanned if cell.stable)
+    return Limit(name, "s", precision, "largest", 1.0, stable, failed, "NONFINITE", 1.0, 2.0, (), tuple(scanned))
 
 
 def stability_map(x: str, y: str, precision: str) -> StabilityMap:
-    """Return a map in which every outcome occurs, over decades of both knobs."""
+    """Return a map in which every outcome occurs, over decades of both settings."""
     values, outcomes = tuple(np.geomspace(1e-6, 1e3, 9).tolist()), list(style.OUTCOMES)
     cells = [
         Cell((a, b), outcomes[(row + column) % len(outcomes)], 1.0)
@@ -104,31 +106,31 @@ def stability_map(x: str, y: str, precision: str) -> StabilityMap:
     return StabilityMap(x, y, ("s", "1/m"), precision, (1.0, 1.0), values, values, tuple(cells), edge, accurate)
 
 
-def extremes() -> Extremes:
-    """Return a study of as many knobs as a scene has, and of two pairs of them, in both precisions."""
-    knobs = {"dt": 10.0, "resolution": None, "particles": None, "tool_friction": 100.0, "yield_stress": 1e3,
+def extremes() -> ExtremesRecord:
+    """Return a study of as many settings as a scene has, and of two pairs of them, in both precisions."""
+    settings = {"dt": 10.0, "resolution": None, "particles": None, "tool_friction": 100.0, "yield_stress": 1e3,
              "softness": 30.0, "gravity": 300.0}  # fmt: skip
     pairs = (("dt", "resolution"), ("yield_stress", "tool_friction"))
     both = ("float32", "float64")
-    return Extremes(
+    return ExtremesRecord(
         env="triple-move", fidelity="reference", reference="reference-dt-x0.5", points=64, seed=0, width=0.01,
-        accuracy=0.1, limits=tuple(limit(*one, failed) for *one, failed in
-                                   ((name, kind, failed) for kind in both for name, failed in knobs.items())),
+        loss_unit="J", tolerance=0.1, limits=tuple(limit(*one, failed) for *one, failed in
+                                   ((name, kind, failed) for kind in both for name, failed in settings.items())),
         maps=tuple(stability_map(*pair, kind) for kind in both for pair in pairs),
-        refused=(), identity={}, provenance=MEASURED, command=COMMAND.format("extremes"),
+        refused=(), identity={}, provenance=MEASURED, command=COMMAND.format("study extremes"),
     )  # fmt: skip
 
 
-def mixed() -> dict[str, Any]:
-    """Return the record of a search among dozens of mixed variants, half of which are on the front."""
+def mixed() -> FidelityRecord:
+    """Return a search among dozens of mixed variants, half of which are on the front."""
     settings = [
         f"dt-x{2 ** (k % 5)} resolution-{64 - k} particles-x{1 / (1 + k):.2g} float32 on warp" for k in range(24)
     ]
     rows = [
-        rung(f"standard {said}", 10 * 0.8**k, 0.001 * 1.3**k * (1 + k % 2), "mixed") for k, said in enumerate(settings)
+        variant(f"standard {said}", 10 * 0.8**k, 0.001 * 1.3**k * (1 + k % 2), "mixed")
+        for k, said in enumerate(settings)
     ]
-    named = [row for row in REPORT["rungs"] if row["ladder"] == "named"]
-    return {**REPORT, "env": "triple-move", "rungs": [*named, *rows]}
+    return fidelities([*(one for one in VARIANTS if one.changed == "named"), *rows], "triple-move")
 
 
 def card() -> Card:

@@ -25,6 +25,7 @@ from gradscape.landscapes.draw.figures.contour import landscape_figure
 from gradscape.landscapes.draw.figures.convergence import convergence_figure
 from gradscape.landscapes.draw.figures.curve import run_figure
 from gradscape.landscapes.draw.figures.extremes import extremes_figure
+from gradscape.landscapes.draw.figures.fidelity import fidelity_figure
 from gradscape.landscapes.draw.figures.league import league_figure
 from gradscape.landscapes.draw.figures.model import model_figure
 from gradscape.landscapes.draw.figures.overlay import overlay_figure
@@ -33,7 +34,6 @@ from gradscape.landscapes.draw.figures.quality import quality_figure
 from gradscape.landscapes.draw.figures.race import race_figure
 from gradscape.landscapes.draw.figures.sweep import Scales, frame_figure
 from gradscape.landscapes.draw.figures.thumbnail import thumbnail_figure
-from gradscape.landscapes.draw.figures.tradeoff import tradeoff_figure
 from gradscape.landscapes.draw.figures.wall import Landscape, wall_figure
 from gradscape.landscapes.draw.render.surface import surface_figure
 from gradscape.landscapes.episode import Episode, Part, View
@@ -44,8 +44,7 @@ from gradscape.landscapes.sampling.fill import sample
 from gradscape.landscapes.storage.files import print_width
 from gradscape.optim.registry import methods
 
-from ....studies import study
-from ...measures.test_fidelity import REPORT
+from ....made_studies import fidelities, study
 from ...test_overlay import LAID, SLICE
 from .records import card, census, convergence, extremes, league, mixed
 from .test_contour import BOUNCES, DATASET, LINE, Bowl, plane
@@ -102,7 +101,7 @@ HUNG = [
     Landscape("swing-velocity", "smooth with local minima 100 %, discontinuous 100 %, large flat regions 100 %", PLANE)
 ]
 MIXED = mixed()
-CHOSEN = {"draft": MIXED["rungs"][-1]["name"], "standard": MIXED["rungs"][10]["name"]}
+CHOSEN = {"draft": MIXED.variants[-1].name, "standard": MIXED.variants[10].name}
 FIGURES: dict[str, list[Callable[[float | None], page.Picture]]] = {
     "landscape_figure": [
         lambda width: landscape_figure(PLANE, width=width),
@@ -133,9 +132,9 @@ FIGURES: dict[str, list[Callable[[float | None], page.Picture]]] = {
         lambda width: surface_figure(dated(SLICE), LAID, width=width),
         lambda width: surface_figure(PLANE, width=width),
     ],
-    "tradeoff_figure": [
-        lambda width: tradeoff_figure(REPORT, width=width),
-        lambda width: tradeoff_figure(MIXED, width=width, chosen=CHOSEN),
+    "fidelity_figure": [
+        lambda width: fidelity_figure(fidelities(), width=width),
+        lambda width: fidelity_figure(MIXED, width=width, chosen=CHOSEN),
     ],
     "convergence_figure": [lambda width: convergence_figure(convergence(), width=width)],
     "model_figure": [lambda width: model_figure(study(PARTS, failing=True), width=width)],

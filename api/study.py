@@ -1,0 +1,125 @@
+"""`gs.study`: the same points in several variants of a scene, each compared with a reference."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated, Literal, Unpack, cast
+
+from .call import current, verb
+from .options import (
+    ARGUMENT,
+    FigureWidth,
+    Force,
+    MadeKeywords,
+    Names,
+    Out,
+    Scene,
+    SceneKeywords,
+    Seed,
+    Share,
+    at_least,
+)
+from .scene import spec_of
+from .values import as_names, as_path, as_share, as_widths
+
+if TYPE_CHECKING:
+    from ..studies.variants import StudyRecord
+
+
+@verb
+def study(
+    kind: Annotated[Literal["fidelity", "convergence", "model", "mixed", "extremes"], ARGUMENT],
+    scene: Scene,
+    *,
+    points: Annotated[int | None, at_least(2)] = None,
+    seed: Seed = 0,
+    settings: Names = (),
+    pairs: Names | None = None,
+    precisions: Names = (),
+    grid: Annotated[int | None, at_least(2, lte=64)] = None,
+    width: float | None = None,
+    tolerance: Share | None = None,
+    reference: str | None = None,
+    max_cost: float | None = None,
+    time_limit: float | None = None,
+    chaotic: bool = False,
+    figure_width_mm: FigureWidth = (),
+    out: Out = None,
+    force: Force = False,
+    **keywords: Unpack[MadeKeywords],
+) -> StudyRecord:
+    """Measure several variants of an environment at the same points and compare them with a reference.
+
+    fidelity: errors and times of cheaper and dearer variants. The reference is the last fidelity. What is measured is
+    also kept for --tolerance of other verbs.
+
+    convergence: is the reference converged? Each setting of it is refined. 16 points are enough.
+
+    model: what each part of the model is for. Each part is left out, or put in where it is missing. The reference is
+    the full model at --fidelity.
+
+    mixed: what draft and standard should be, by a search over all settings together.
+
+    extremes: how far time step, grid, stiffness, controls and horizon can be changed before a simulation fails. Each
+    setting is scanned and its first failure bisected; pairs of settings are mapped. The default fidelity is standard.
+    `landscape envs NAME` shows what was found about the time step.
+
+    The folder then holds KIND.json and KIND.png. Stop at any time: the same command continues with the next variant.
+
+    Raises ValueError for options that the kind does not take, and where there is nothing to compare; StoreMismatchError
+    where the folder holds another study; Stopped where it is interrupted.
+
+    Example: landscape study fidelity bounce --settings dt,precision
+
+    Parameters
+    ----------
+    kind
+        Study to run: fidelity, convergence, model, mixed or extremes.
+    scene
+        The environment: a name that `landscape envs` lists, or FILE.py:NAME for a simulator in a file of your own.
+    points
+        Number of points at which every variant is measured. The default is 64, and 16 for extremes.
+    seed
+        Random seed.
+    settings
+        Settings to change, a,b or repeated. Of fidelity: dt, resolution, particles, precision, stiffness, engine,
+        device. Of convergence: dt, resolution, particles, joint, precision. Of extremes: dt, resolution, box, horizon
+        and options that are positive numbers. The default is all that the environment has.
+    pairs
+        Of extremes: pairs of settings to map, as dt:ke, or none. The default is dt with each other setting.
+    precisions
+        Of extremes: precisions to test, float32, float64 or both. The default is all there are.
+    grid
+        Of extremes: number of values of each setting on a map. The default is 8.
+    width
+        Of extremes: relative width at which the bisection of a limit stops. The default is 0.05.
+    tolerance
+        Of extremes: loss error that counts as accurate, at the 95th percentile and as a share of the spread of losses.
+        The default is 10%.
+    reference
+        Of extremes: fidelity that finite losses are compared with. The default is the last.
+    max_cost
+        Of mixed: largest cost of a variant, as a multiple of the present one. The default is 4.
+    time_limit
+        Of mixed: time to spend on measurements [s]. The default is 600.
+    chaotic
+        Of mixed: ignore gradients, because the motion is chaotic.
+    """
+    spec = spec_of(scene, cast("SceneKeywords", keywords))
+    from ..jobs.study import StudyJob
+    from ..studies.kept import keep
+    from ..studies.variants import StudyOptions
+
+    asked = StudyOptions(
+        points=points, seed=seed, settings=tuple(as_names(settings)),
+        pairs=None if pairs is None else tuple(as_names(pairs)), precisions=tuple(as_names(precisions)), grid=grid,
+        width=width, tolerance=as_share(tolerance, "--tolerance"), reference=reference, max_cost=max_cost,
+        time_limit=time_limit, chaotic=chaotic,
+    )  # fmt: skip
+    call = current()
+    job = StudyJob.open(
+        kind, spec, asked, out=as_path(out), force=force, prints=as_widths(figure_width_mm), command=call.command
+    )
+    found = job.run(call.watch)
+    if path := keep(found):
+        call.watch.note(f"kept for other verbs: {path}")
+    return found

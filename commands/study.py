@@ -1,0 +1,233 @@
+"""A study: its tables, its verdicts, and what was refused."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from ..studies.convergence import ConvergenceRecord
+    from ..studies.divergence import Distributions
+    from ..studies.extremes import ExtremesRecord
+    from ..studies.fidelity import FidelityRecord, MeasuredVariant
+    from ..studies.mixed import MixedRecord
+    from ..studies.model import MeasuredPart, ModelRecord
+    from ..studies.samples import Bootstrap, Comparison
+    from ..studies.variants import StudyRecord
+    from .terminal import Console
+
+MEANING = (
+    "median, 95 %: how far losses are off, as a share of the spread, at half and at 95 % of points (95 % interval); "
+    "rank: Spearman's correlation of losses; cosine, slope: of gradients, median cosine and relative error"
+)
+
+
+def show(found: StudyRecord, console: Console) -> None:
+    """Print a study: what it is of, its tables, its verdicts, and what was refused."""
+    from .terminal import Console
+
+    console = Console(file=console.file, width=console.width, highlight=False)
+    for part in SHOWN[found.kind](found):
+        console.print(part, soft_wrap=found.kind == "mixed" and isinstance(part, str))  # lines of Python stay whole
+    for why in dict.fromkeys(refused.why for refused in found.refused):
+        names = [refused.name for refused in found.refused if refused.why == why]
+        console.print(f"refused: {'; '.join(names)}: {why}")
+
+
+def _show_fidelity(found: FidelityRecord) -> Iterable[str | Table]:
+    from ..studies.kept import find_convergence
+
+    failed = f"; {found.reference_failed} points left out, the reference fails there" if found.reference_failed else ""
+    yield f"{found.env}: {found.points} points against {found.reference}; {_scale(found)}{failed}"
+    accuracy = ("variant", "median", "95 % of points", "rank", "cosine", "slope", "failed")
+    rows, best = _table(*accuracy, "ms", "with grad", "memory"), set(found.front)
+    for variant in found.by_time:
+        mark = " *" if variant.name in best else ""
+        rows.add_row(variant.name + mark, *_variant_cells(variant, reference=variant.name == found.reference))
+    yield rows
+    yield f"{MEANING}; ms an episode; * none is quicker and nearer"
+    yield from _missing((one.name, one.comparison) for one in found.variants)
+    yield from found.sentences()
+    if converged := find_convergence(found):
+        yield from (converged.rule.sentence(), *converged.remainder_sentences())
+
+
+def _variant_cells(variant: MeasuredVariant, *, reference: bool) -> list[str]:
+    from ..landscapes.capacity import size
+
+    found = variant.comparison
+    costs = [f"{1e3 * seconds:.3g}" for seconds in (found.seconds.forward, found.seconds.with_gradient)]
+    costs.append("" if variant.memory is None else size(variant.memory))
+    return ["reference", *[""] * 5, *costs] if reference else [*_error_cells(found), _failed(found), *costs]
+
+
+def _show_convergence(found: ConvergenceRecord) -> Iterable[str | Table]:
+    yield f"{found.env}: {found.points} points about {found.reference}; {_scale(found)}"
+    rows = _table("setting", "from", "to", "median", "95 % of points", "cosine", "slope", "points")
+    for one in found.settings:
+        for place, move in enumerate(one.moves):
+            names = [name.removeprefix(f"{found.reference}-") for name in (move.coarse, move.fine)]
+            cells = [_percent(move.median), _share(move.p95), _number(move.cosine), _number(move.relative_error)]
+            rows.add_row(one.setting if place == 0 else "", *names, *cells, str(move.compared))
+    yield rows
+    yield MEANING
+    yield from found.sentences()
+    if found.distributions:
+        yield _distributions(found.distributions)
+
+
+def _distributions(found: Distributions) -> Table:
+    rows = _table("losses over neighbourhoods", "Kolmogorov", "Wasserstein / spread", "told apart by")
+    noise = found.noise
+    rows.add_row("noise: the reference twice", str(noise.kolmogorov), str(noise.wasserstein), "")
+    for one in found.compared:
+        cells = (str(one.distance.kolmogorov), str(one.distance.wasserstein))
+        rows.add_row(one.name, *cells, ", ".join(one.told) or "neither")
+    return rows
+
+
+def _show_model(found: ModelRecord) -> Iterable[str | Table]:
+    about = f"{found.env}: {found.points} points against the full model at {found.fidelity}"
+    if found.parts:  # with which it was timed
+        about += f", {1e3 * found.seconds.with_gradient:.3g} ms an episode with gradient"
+    failed = f"; {found.failed} points left out, the full model fails there" if found.failed else ""
+    yield f"{about}; {_scale(found)}{failed}"
+    own = found.noise.comparison
+    error = own.loss_error.p95_relative
+    moves = (
+        "more than a number says at" if own.loss_error.p95.value is None else f"{_percent(error) or '0%'} at most at"
+    )
+    rank, cosine = _number(own.spearman) or "none", _number(own.gradient.cosine) or "none"
+    yield f"noise, the full model again: losses move by {moves} 95 % of points, rank {rank}, cosine {cosine}"
+    titles = (
+        "parts of the model, and what changing each does",
+        "parts that are missing, and what putting each in does",
+    )
+    for parts, title in zip((found.present, found.missing), titles, strict=True):
+        if parts:
+            yield _parts(parts, title)
+    yield from found.sentences()
+    yield from _missing((one.name, one.comparison) for one in (*found.present, *found.missing))
+    yield (
+        f"{MEANING}; moved: points whose loss moves beyond the noise; time: of an episode with gradient, against the "
+        "full model's, in turn with it (95 % interval)"
+    )
+
+
+def _parts(parts: Sequence[MeasuredPart], title: str) -> Table:
+    failing = any(part.comparison.diverged for part in parts)
+    headings = ("part", "median", "95 %", "rank", "cosine", "slope", "moved", *(["failed"] if failing else []), "time")
+    rows = _table(*headings, title=title)
+    for part in parts:
+        failed = [_failed(part.comparison)] if failing else []
+        moved = "" if part.moved is None else f"{part.moved:.0%}"
+        rows.add_row(part.name, *_error_cells(part.comparison), moved, *failed, _change(part.cost))
+    return rows
+
+
+def _show_mixed(found: MixedRecord) -> Iterable[str | Table]:
+    measured = found.measured
+    yield (
+        f"{found.env}: {len(measured.variants)} variants at {found.points} points against {measured.reference}, "
+        f"{len(found.dismissed)} given up before, {len(measured.refused)} refused"
+    )
+    rows = _table("", "variant", "rank", "cosine", "95 % of points", "of allowed", "ms")
+    for one in found.choices:
+        today = (one.claim.name, one.today_shortfall, one.today_seconds)
+        for label, chosen in (
+            (f"{one.claim.name} today", today),
+            ("chosen", (one.variant, one.shortfall, one.seconds)),
+        ):
+            rows.add_row(label, *_choice_cells(found, *chosen))
+    yield rows
+    yield from found.sentences()
+
+
+def _choice_cells(found: MixedRecord, name: str | None, shortfall: float | None, seconds: float | None) -> list[str]:
+    if name is None or seconds is None:
+        return ["none", *[""] * 5]
+    one = found.variant(name).comparison
+    lack = "not finite" if shortfall is None else f"{shortfall:.2g}"
+    ranks = (_interval(one.spearman), _interval(one.gradient.cosine), _share(one.loss_error.p95_relative))
+    return [name, *ranks, lack, f"{1e3 * seconds:.3g}"]
+
+
+def _show_extremes(found: ExtremesRecord) -> Iterable[str | Table]:
+    about = f"{found.env}: {found.fidelity} on {found.device}, {found.points} points"
+    yield f"{about}, judged by {found.reference} (accurate: {found.tolerance:.0%} of the spread)"
+    rows = _table("setting", "it has", *found.precisions)
+    for first in (limit for limit in found.limits if limit.precision == found.precisions[0]):
+        same = [limit for limit in found.limits if (limit.setting, limit.end) == (first.setting, first.end)]
+        base = f"{first.base:.4g} {first.unit}".rstrip()
+        rows.add_row(f"{first.setting}, {first.end}", base, *(limit.sentence() for limit in same))
+    yield rows
+
+
+SHOWN: dict[str, Any] = {
+    "fidelity": _show_fidelity,
+    "convergence": _show_convergence,
+    "model": _show_model,
+    "mixed": _show_mixed,
+    "extremes": _show_extremes,
+}
+
+
+def _table(*headings: str, title: str | None = None) -> Table:
+    from rich.box import SIMPLE
+
+    from .terminal import table
+
+    return table(*headings, title=title, box=SIMPLE, padding=(0, 1), collapse_padding=True)
+
+
+def _scale(found: FidelityRecord | ConvergenceRecord | ModelRecord) -> str:
+    if not found.spread:
+        return "no spread"
+    return f"spread of the loss (5th to 95th percentile) {found.spread:.4g} {found.loss_unit}".rstrip()
+
+
+def _missing(rows: Iterable[tuple[str, Comparison]]) -> Iterable[str]:
+    """Say which variants lack gradients where the reference has them, and at what share; nothing where none does."""
+    lacking = [f"{name} at {found.missing:.0%}" for name, found in rows if found.missing]
+    return [f"no gradient, of the points that have a loss: {', '.join(lacking)}"] if lacking else []
+
+
+def _error_cells(found: Comparison) -> list[str]:
+    errors = (_percent(found.loss_error.median_relative), _share(found.loss_error.p95_relative))
+    return [*errors, *map(_number, (found.spearman, found.gradient.cosine, found.gradient.relative_error))]
+
+
+def _failed(found: Comparison) -> str:
+    return "" if found.diverged is None else f"{found.diverged:.0%}"
+
+
+def _percent(found: Bootstrap) -> str:
+    return "" if found.value is None else f"{100 * found.value:.2g}%"
+
+
+def _share(found: Bootstrap) -> str:
+    """Return a share in per cent, with its interval."""
+    if found.value is None:
+        return "not finite"
+    low, high = ("?" if end is None else f"{100 * end:.2g}" for end in (found.low, found.high))
+    return f"{_percent(found)} ({low}-{high})"
+
+
+def _number(found: Bootstrap) -> str:
+    return "" if found.value is None else f"{found.value:z.3f}"
+
+
+def _interval(found: Bootstrap) -> str:
+    if found.value is None or found.low is None or found.high is None:
+        return _number(found)
+    return f"{_number(found)} ({found.low:z.3f}-{found.high:z.3f})"
+
+
+def _change(cost: Bootstrap) -> str:
+    """Return a ratio of times as what it adds or takes away, with its interval."""
+    if cost.value is None or cost.low is None or cost.high is None:
+        return ""
+    value, low, high = (100 * (ratio - 1) for ratio in (cost.value, cost.low, cost.high))
+    return f"{value:+z.0f}% ({low:+z.0f}:{high:+z.0f})"

@@ -1,0 +1,100 @@
+"""A study of a scene in its folder: opened or continued, announced, measured, drawn and written."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ..landscapes.cost import duration, seconds_per_episode
+from ..studies import study_class
+from ..studies.variants import Study, StudyOptions, StudyRecord, expected_work
+from .folder import ROOT, STUDIES, Results, folder_named
+from .job import CheckpointedJob
+from .plan import Work
+from .scene import SceneSpec, provenance
+from .watch import PREPARING, Watch
+
+if TYPE_CHECKING:
+    from ..envs.base import Environment
+
+
+@dataclass(frozen=True, kw_only=True)
+class StudyJob(CheckpointedJob[StudyRecord]):
+    """A study of a scene; a part of the checkpoint for each variant."""
+
+    study: Study
+
+    @classmethod
+    def open(
+        cls,
+        kind: str,
+        scene: SceneSpec,
+        options: StudyOptions | None = None,
+        *,
+        out: Path | None = None,
+        root: Path = ROOT,
+        force: bool = False,
+        prints: Sequence[float] = (),
+        command: str = "",
+    ) -> StudyJob:
+        """Continue the study in its folder, by default one named after it under `root`, or begin it there.
+
+        Raises ValueError for a kind, options and a fidelity that are not to be had, and where the scene has nothing to
+        compare; TooLargeError for more points than there is memory for; StoreMismatchError where the folder holds
+        another study.
+        """
+        found = study_class(kind)
+        fidelity = found.choose_fidelity(scene.kind, scene.fidelity)
+        env = replace(scene, fidelity=fidelity, tolerance=None).make()
+        study = found(env, options or StudyOptions())
+        folder = out or folder_named(study.folder_parts(), study.identity(), root)
+        study.open(folder, force=force)
+        return cls(study=study, checkpoint=study.checkpoint, folder=folder, prints=prints, command=command)
+
+    @property
+    def results(self) -> Results:  # type: ignore[override] # of the kind of study
+        """What it leaves in its folder."""
+        return STUDIES[self.study.kind]
+
+    def work(self) -> Iterator[Work]:
+        """Yield the variants that are left."""
+        for one in self.study.expected():
+            yield Work(one.env, 0, round(one.episodes))
+
+    def compute(self, watch: Watch) -> StudyRecord:
+        """Measure what is missing, and return the record."""
+        self._announce(watch)
+        return self.study.run(watch, provenance(self.study.env, self.command), self.command)
+
+    def verified(self) -> Environment:
+        """Return the reference."""
+        return self.study.env.remake()
+
+    def kept(self) -> str:
+        """Say how much of it is on disk."""
+        return self.study.describe_kept()
+
+    def seconds(self) -> dict[str, float]:
+        """Estimate the seconds of each variant that is left, by the work of an episode."""
+        env = self.study.env
+        left = [(one, expected_work(one.env)) for one in self.study.expected()]
+        if not left:
+            return {}
+        base = env.remake(fidelity=next(iter(env.fidelities)))
+        base.prepare()
+        rate = seconds_per_episode(base, base.space.sobol(len(self.study.x), seed=0), grad=True) / expected_work(base)
+        return {one.name: one.seconds + rate * work * one.episodes for one, work in left}
+
+    def _announce(self, watch: Watch) -> None:
+        """Say what is left to measure and about how long that takes."""
+        study, env = self.study, self.study.env
+        watch.note(f"{env.name} · {env.fidelity.name} · {env.device} · {env.engine} · {self.folder}")
+        watch.note(f"{study.describe_left()} at {len(study.x)} points")
+        with watch.busy(f"{env.name}: {PREPARING}"):
+            seconds = self.seconds()
+        if seconds:
+            dearest = max(seconds, key=lambda name: seconds[name])
+            most = f"{duration(seconds[dearest])} of it {dearest}, " if len(seconds) > 1 else ""
+            watch.note(f"about {duration(sum(seconds.values()))}, {most}by the work of an episode; {study.advice}")

@@ -1,0 +1,264 @@
+"""The study `fidelity`: accuracy against speed of a scene's fidelities, and of what can be changed about them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+
+from ..envs.records import Fidelity
+from ..landscapes.statistics import fit_line
+from . import samples
+from .samples import Comparison, Sample, compare, pareto_front, spread
+from .variants import Expected, StudyRecord, Variant, VariantStudy, refuse_single, samples_of
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from ..envs.base import Environment
+    from ..jobs.watch import Watch
+    from .samples import Follow
+    from .variants import StudyOptions
+
+SETTINGS = ("dt", "resolution", "particles", "precision", "stiffness", "engine", "device")
+DT_FACTORS, CELL_FACTORS, PARTICLE_FACTORS = (0.5, 2.0, 4.0), (2 / 3, 1.5), (0.5, 2.0)
+STIFFNESS_FACTORS = (0.25, 0.5, 2.0, 4.0)
+MIN_ERRORS = 3  # that an order of convergence is fitted to
+
+
+@dataclass(frozen=True)
+class MeasuredVariant:
+    """Hold one way to simulate a scene and what was measured of it.
+
+    `changed` names the setting that differs from a named fidelity, "named" where none does; `memory` is what an episode
+    takes [bytes] as the scene estimates it.
+    """
+
+    name: str
+    changed: str
+    fidelity: Fidelity
+    engine: str
+    device: str
+    options: dict[str, Any]
+    memory: int | None
+    comparison: Comparison
+
+    @property
+    def seconds(self) -> float:
+        """What an episode with gradient takes [s]."""
+        return self.comparison.seconds.with_gradient
+
+    def p95(self, *, relative: bool) -> float | None:
+        """Return the 95th percentile of loss errors, as a share of the spread or in the loss's unit."""
+        error = self.comparison.loss_error
+        return (error.p95_relative if relative else error.p95).value
+
+    def differs_beyond_dt(self, other: MeasuredVariant) -> bool:
+        """Say whether they differ in more than time step and precision."""
+        return self._others() != other._others()
+
+    def _others(self) -> tuple[Any, ...]:
+        same = {**self.fidelity.record(), "name": "", "dt": 0, "precision": ""}
+        return same, self.engine, self.device, self.options
+
+
+@dataclass(frozen=True)
+class ConvergenceOrder:
+    """Hold p of error ~ dt^p, fitted to some variants, with its standard error."""
+
+    variants: tuple[str, ...]
+    order: float
+    standard_error: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class FidelityRecord(StudyRecord):
+    """Hold the variants of a scene at the same points, all compared with the first of them, the reference.
+
+    `spread` is the 5th to 95th percentile of the reference's losses [`loss_unit`], None where they are all equal;
+    `reference_failed` counts points that are left out, as the reference fails there.
+    """
+
+    kind: ClassVar[str] = "fidelity"
+
+    reference: str
+    spread: float | None
+    reference_failed: int
+    variants: tuple[MeasuredVariant, ...]
+    orders: tuple[ConvergenceOrder, ...]
+
+    @property
+    def by_time(self) -> list[MeasuredVariant]:
+        """The variants, the quickest first."""
+        return sorted(self.variants, key=lambda one: one.seconds)
+
+    @property
+    def front(self) -> list[str]:
+        """The Pareto front: the variants quicker than the reference that no other beats in both, quickest first."""
+        rows = self.by_time
+        others = rows[: [row.name for row in rows].index(self.reference)]  # a slower one is beaten by it
+        errors = [math.inf if (off := row.p95(relative=False)) is None else off for row in others]
+        return [others[number].name for number in pareto_front([row.seconds for row in others], errors)]
+
+    def variant(self, name: str) -> MeasuredVariant:
+        """Return a measured variant by its name."""
+        return next(one for one in self.variants if one.name == name)
+
+    def cheapest(self, tolerance: float) -> MeasuredVariant | None:
+        """Return the quickest of the variants but the reference that is within a share of the spread, None if none."""
+        others = [row for row in self.by_time if row.name != self.reference]
+        return next((row for row in others if (off := row.p95(relative=True)) is not None and off <= tolerance), None)
+
+    def table(self) -> pd.DataFrame:
+        """Return a row for each variant, the quickest first, indexed by `name`.
+
+        Columns: `changed`; `median` and `p95`, loss errors as shares of the spread, with the ends of the latter's 95 %
+        interval; `spearman`, `cosine`, `relative_error`, `diverged`; `forward` and `with_gradient` [s per episode];
+        `memory` [bytes per episode]; `front`, whether it is on the Pareto front.
+        """
+        import pandas as pd
+
+        front = set(self.front)
+        rows = [
+            {
+                **{"name": row.name, "changed": row.changed, **row.comparison.columns()},
+                **{**asdict(row.comparison.seconds), "memory": row.memory, "front": row.name in front},
+            }
+            for row in self.by_time
+        ]
+        return pd.DataFrame(rows).set_index("name")
+
+    def sentences(self) -> list[str]:
+        """Return the orders of convergence in dt."""
+        return [
+            f"error ~ dt^{fit.order:z.2f} ± {fit.standard_error:.2f}: {', '.join(fit.variants)}" for fit in self.orders
+        ]
+
+
+class FidelityStudy(VariantStudy):
+    """Time and loss errors of each named fidelity, and of each changed in one setting at a time.
+
+    The reference is the last named fidelity.
+    """
+
+    kind = "fidelity"
+    takes: ClassVar[tuple[str, ...]] = ("settings",)
+    advice = "compiling kernels comes on top, minutes for taichi; --points and --settings lower it"
+
+    def __init__(self, env: Environment, options: StudyOptions) -> None:
+        super().__init__(env, options)
+        self._variants = self._list_variants()
+
+    def _list_variants(self) -> list[Variant]:
+        refuse_single(self.env)
+        return list_variants(self.env, self.options.settings or SETTINGS)
+
+    @property
+    def variants(self) -> list[Variant]:
+        """The reference, the named fidelities, and what is changed of them."""
+        return self._variants
+
+    def measure(self, variant: Variant, follow: Follow) -> Mapping[str, Any]:
+        """Return the arrays of a variant's sample, with its times."""
+        return samples.measure(self._make(variant), self.x, follow=follow).arrays()
+
+    def _expect(self, variant: Variant, env: Environment) -> Expected:
+        repeated = 2 / 3 * min(len(self.x), env.preferred_batch)
+        return Expected(variant.name, env, len(self.x) + repeated, seconds=2 * samples.REPETITION)
+
+    def run(self, watch: Watch, provenance: Mapping[str, Any], command: str) -> FidelityRecord:
+        """Measure what is missing and return the record."""
+        return self.conclude(samples_of(self.measure_all(watch)), provenance, command)
+
+    def conclude(self, found: Mapping[str, Sample], provenance: Mapping[str, Any], command: str) -> FidelityRecord:
+        """Compare the samples with that of the reference, which is the first variant."""
+        reference = found[self.variants[0].name]
+        rows = tuple(
+            self.compare(variant, found[variant.name], reference) for variant in self.variants if variant.name in found
+        )
+        return FidelityRecord(
+            **self.about(provenance, command),
+            reference=self.variants[0].name,
+            spread=spread(reference),
+            reference_failed=len(self.x) - rows[0].comparison.compared,
+            variants=rows,
+            orders=fit_orders(rows),
+        )
+
+    def compare(self, variant: Variant, sample: Sample, reference: Sample) -> MeasuredVariant:
+        """Compare a variant's sample with the reference's."""
+        one, memory = variant, variant.make(self.env).memory()
+        found = compare(sample, reference, seed=self.seed)
+        return MeasuredVariant(one.name, one.changed, one.fidelity, one.engine, one.device, one.options, memory, found)
+
+
+def list_variants(env: Environment, settings: Sequence[str]) -> list[Variant]:
+    """Return the variants of a scene, the reference first, without those that only bear another name.
+
+    `env` is the reference, the last of the named fidelities: each of them is a variant, with its engine, device and
+    options, and all settings are changed of the others, but precision and device of the reference too. Raises
+    ValueError for a setting that there is not.
+    """
+    if unknown := set(settings) - set(SETTINGS):
+        raise ValueError(f"--settings takes {', '.join(SETTINGS)}; got {', '.join(sorted(unknown))}")
+    named = Variant.all_named(env)
+    found = [Variant.of(env), *named]
+    for setting in SETTINGS:
+        for base in named if setting in ("precision", "device") else named[:-1]:
+            found += _changes(base, setting, env) if setting in settings else ()
+    unique: dict[tuple[Any, ...], Variant] = {}
+    for variant in found:
+        unique.setdefault(variant.key(), variant)
+    return list(unique.values())
+
+
+def _changes(base: Variant, setting: str, env: Environment) -> Iterator[Variant]:
+    """Yield the variants that differ from a named fidelity in one setting."""
+    if setting == "dt" and base.fidelity.dt:
+        yield from (base.with_dt(env.nearest_dt(base.fidelity.dt * factor)) for factor in DT_FACTORS)
+    elif setting == "resolution" and base.fidelity.resolution:
+        yield from map(base.with_cells, CELL_FACTORS)
+    elif setting == "particles" and env.work().unit == "particle-substep":
+        yield from map(base.with_particles, PARTICLE_FACTORS)
+    elif setting == "precision":
+        yield base.with_other_precision()
+    elif setting == "stiffness" and (option := env.contact_stiffness):
+        for factor in STIFFNESS_FACTORS:
+            options = base.options | {option: base.options[option] * factor}
+            yield base.change(f"{base.name}-{option}-x{factor:g}", setting, options=options)
+    elif setting in ("engine", "device"):
+        for other in env.engines if setting == "engine" else env.devices:
+            if other != getattr(base, setting):
+                yield base.change(f"{base.name} on {other}", setting, **{setting: other})
+
+
+def fit_orders(variants: tuple[MeasuredVariant, ...]) -> tuple[ConvergenceOrder, ...]:
+    """Fit the order of convergence in dt of the variants that differ in it, and in precision at most, from the first.
+
+    With another resolution the errors would level off at that of the resolution.
+    """
+    reference, found = variants[0], list[ConvergenceOrder]()
+    for precision in ("float32", "float64"):
+        members = [
+            (one.fidelity.dt, error, one.name)
+            for one in variants
+            if not one.differs_beyond_dt(reference)
+            and one.fidelity.precision == precision
+            and one.fidelity.dt > reference.fidelity.dt
+            and (error := one.comparison.loss_error.median.value)
+        ]
+        if fit := fit_order_in_dt(sorted(members, reverse=True)):
+            found.append(fit)
+    return tuple(found)
+
+
+def fit_order_in_dt(members: Sequence[tuple[float, float, str]]) -> ConvergenceOrder | None:
+    """Fit error ~ dt^p to (dt, error, name); return None below three errors that are positive and finite."""
+    pairs = [(dt, error) for dt, error, _ in members if np.isfinite(error) and error > 0]
+    if len(pairs) < MIN_ERRORS:
+        return None
+    fit = fit_line(*np.log(pairs).T)
+    return ConvergenceOrder(tuple(name for *_, name in members), fit.slope, fit.standard_error)

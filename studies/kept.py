@@ -1,0 +1,119 @@
+"""Measured studies that other verbs read: the user's own, and those that are shipped with the gallery."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict
+from importlib import resources
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from platformdirs import user_data_path
+
+from ..landscapes.convert import from_json, to_json
+from ..landscapes.identity import MODEL_VERSION, current_identity
+from ..landscapes.plain import digest, number, text
+from ..landscapes.storage.disk import moved_by
+from ..landscapes.storage.records import read_json, reading, write_record
+from . import record_class
+
+if TYPE_CHECKING:
+    from ..envs.base import Environment
+    from .convergence import ConvergenceRecord
+    from .fidelity import FidelityRecord
+    from .variants import StudyRecord
+
+DEVICES = ("cpu", "cuda")
+FOLDER = "studies"
+
+
+def keep(found: StudyRecord) -> Path | None:
+    """Keep a study in the user's data folder, which replaces an earlier one of the same settings.
+
+    None where other verbs have no use for it, or nothing says when its scene has changed.
+    """
+    kept = found.to_keep()
+    if kept is None:
+        return None
+    settings = digest([kept.identity[name] for name in kept.kept_by])
+    path = own_folder() / file_name(kept.env, kept.device, kept.kind, settings)
+    with moved_by("XDG_DATA_HOME", "what was measured"):
+        write_record(path, to_json(kept))
+    return path
+
+
+def own_folder() -> Path:
+    """Return where the user's own studies are kept."""
+    return user_data_path("gradscape") / FOLDER
+
+
+def file_name(env: str, device: str, kind: str, of: str = "") -> str:
+    """Return what the file of a study is called, with a digest of its settings unless it is the only one."""
+    return f"{env}-{device}{f'-{of}' if of else ''}.{kind}.json"
+
+
+def read_study(path: Path, kind: str, data: Mapping[str, Any] | None = None) -> StudyRecord:
+    """Return the study of a kind in a file, whose `data` may be read already. Raises DamagedError for what is none."""
+    env = re.split(r"-(?:cpu|cuda)\b", path.name)[0]
+    with reading(path, f"delete it, and `landscape study {kind} {env}` measures it again"):
+        found = read_json(path) if data is None else data
+        identity = current_identity(found["identity"])
+        number(identity[MODEL_VERSION])
+        for name in ("engine", "device"):
+            text(identity[name])
+        dict(identity["options"])
+        return from_json(record_class(kind), {**found, "identity": identity})
+
+
+def kept_studies(kind: str, env: str) -> Iterator[tuple[Path, StudyRecord]]:
+    """Yield the studies of a kind that are kept of a scene, the user's own before the gallery's."""
+    for folder in (own_folder(), Path(str(resources.files("gradscape.gallery"))) / "data" / FOLDER):
+        for device in DEVICES:
+            for path in sorted(folder.glob(f"{env}-{device}*.{kind}.json")):
+                yield path, read_study(path, kind)
+
+
+def find_fidelity(env: Environment, device: str) -> tuple[FidelityRecord, Path] | None:
+    """Return the study of fidelities that is kept of a scene with the same options, and its file.
+
+    One of the device is preferred among the user's own, and then among the gallery's.
+    """
+    from .fidelity import FidelityRecord
+
+    options, own = asdict(env.options), own_folder()
+    found = [
+        (path, record)
+        for path, record in kept_studies("fidelity", env.name)
+        if isinstance(record, FidelityRecord) and record.identity["options"] == options
+    ]
+    found.sort(key=lambda one: (own not in one[0].parents, one[1].device != device))
+    return (found[0][1], found[0][0]) if found else None
+
+
+def find_convergence(of: FidelityRecord) -> ConvergenceRecord | None:
+    """Return the study of convergence that is kept of the same scene and model as a study of fidelities."""
+    from .convergence import ConvergenceRecord
+
+    same = ("engine", "options", MODEL_VERSION)
+    found = [
+        record
+        for _, record in kept_studies("convergence", of.env)
+        if isinstance(record, ConvergenceRecord) and all(record.identity[key] == of.identity[key] for key in same)
+    ]
+    return min(found, key=lambda record: record.device != of.device, default=None)
+
+
+def describe_margins(env: Environment) -> list[str]:
+    """Return a line for each kept study of a scene's extremes with these options: its step against its limit."""
+    from .extremes import ExtremesRecord
+
+    said, seen = list[str](), set[str]()
+    for _, record in kept_studies("extremes", env.name):
+        assert isinstance(record, ExtremesRecord)
+        known = record.identity
+        key = digest([known["settings"], known["options"], known["engine"], known["device"]])
+        if key not in seen and known["options"] == asdict(env.options):
+            said += record.margin_sentences(env)
+        seen.add(key)
+    return list(dict.fromkeys(said)) or [f"stability: not measured; `landscape study extremes {env.name}` measures it"]

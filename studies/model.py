@@ -1,0 +1,331 @@
+"""The study `model`: what each part of a scene's model is for.
+
+Every part is changed, left out or put in, at the same points as the full model and timed in turn with it.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from functools import cached_property, reduce
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+import torch
+
+from ..envs.records import Fidelity, ModelPart
+from ..landscapes.objective import failed, has_loss
+from ..landscapes.plain import digest
+from . import samples
+from .samples import Bootstrap, Comparison, Sample, Seconds, Turns, compare, evaluate_points, spread
+from .variants import Expected, StudyRecord, Variant, VariantStudy, samples_of
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from ..envs.base import Environment
+    from ..jobs.watch import Watch
+    from .samples import Follow
+    from .variants import StudyOptions
+
+NOISE_FACTOR = 2.0  # times the noise, above which a difference is the part's
+SAME_ORDER = 0.99  # rank correlation from which on the order of losses counts as kept: that of a standard fidelity
+FAILING_SHARE = 0.05  # of points, above which a model without the part fails where the full one does not
+REPEATS = 3  # of the full model, which say how noisy it is
+FULL, AGAIN, PART = "full", "full-again", "part"
+
+
+class Effect(StrEnum):
+    """Say what a part does to the landscape, in the words of its verdict."""
+
+    NOTHING = "moves nothing beyond the noise"
+    GRADIENTS = "changes gradients, not losses"
+    LOSSES = "changes losses, not their order"
+    ORDER = "changes the order"
+    FAILURE = "fails where the full model does not"
+
+
+class Price(StrEnum):
+    """Say what a changed part does to the time of an episode."""
+
+    SAVES = "saves time"
+    NOTHING = "costs nothing measurable"
+    COSTS = "takes longer"
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Hold the full model, evaluated again with parameters moved by their last digit, against itself.
+
+    `comparison` is over all repeats; `largest` is the largest difference of losses and `digit` the last digit of the
+    largest loss [loss unit], `rounding` the relative precision of the engine. A model that is not deterministic, or
+    chaotic, has much noise.
+    """
+
+    comparison: Comparison
+    largest: float
+    digit: float
+    rounding: float
+
+    @classmethod
+    def of(cls, repeats: Sample, full: Sample, *, rounding: float, seed: int) -> Noise:
+        """Compare repeats of the full model with it, point by point; those where either fails are no difference."""
+        fine = has_loss(repeats.status) & has_loss(full.status)
+        largest = np.abs(repeats.loss - full.loss)[fine].max(initial=0.0)
+        digit = rounding * np.abs(full.loss)[fine].max(initial=0.0)
+        return cls(compare(repeats, full, seed=seed), float(largest), float(digit), rounding)
+
+
+@dataclass(frozen=True)
+class MeasuredPart:
+    """Hold what changing a part of the model does: `change` says how it is changed, by which `options`.
+
+    A `missing` part is one that the full model leaves out, and that its options put in. `moved` is the share of points
+    whose loss moves beyond the noise; `cost` and `cost_forward` are the time of an episode with and without gradient,
+    as ratios to the full model's, measured in turn with it.
+    """
+
+    name: str
+    change: str
+    options: dict[str, Any]
+    missing: bool
+    comparison: Comparison
+    moved: float | None
+    cost: Bootstrap
+    cost_forward: Bootstrap
+    effect: Effect
+    price: Price
+
+    @property
+    def verdict(self) -> str:
+        """What is found of the part, in words."""
+        return f"{self.effect}; {self.price}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelRecord(StudyRecord):
+    """Hold the parts of a scene's model at the same points, all compared with the full model at one fidelity.
+
+    `spread` is the 5th to 95th percentile of the full model's losses [`loss_unit`], None where they are all equal;
+    `failed` points are left out, it fails there; `seconds` is what an episode of it takes.
+    """
+
+    kind: ClassVar[str] = "model"
+
+    fidelity: str
+    spread: float | None
+    failed: int
+    seconds: Seconds
+    noise: Noise
+    parts: tuple[MeasuredPart, ...]
+
+    def to_keep(self) -> None:
+        """Return nothing: no other verb reads it."""
+
+    @property
+    def present(self) -> tuple[MeasuredPart, ...]:
+        """The parts that the full model has."""
+        return tuple(part for part in self.parts if not part.missing)
+
+    @property
+    def missing(self) -> tuple[MeasuredPart, ...]:
+        """The parts that it leaves out."""
+        return tuple(part for part in self.parts if part.missing)
+
+    def table(self) -> pd.DataFrame:
+        """Return a row for each part, those that the model has first, indexed by `name`.
+
+        Columns: `change`, `missing`; `median` and `p95`, of how far losses move as shares of the spread, with the ends
+        of the latter's 95 % interval; `moved`, the share of points beyond the noise; `spearman`, `cosine`,
+        `relative_error`, `diverged`; `cost`, the time of an episode with gradient as a ratio to the full model's, with
+        the ends of its interval; `effect` and `price`, the verdict.
+        """
+        import pandas as pd
+
+        columns = [
+            {
+                **{"name": part.name, "change": part.change, "missing": part.missing, "moved": part.moved},
+                **part.comparison.columns(),
+                **{"cost": part.cost.value, "cost_low": part.cost.low, "cost_high": part.cost.high},
+                **{"effect": part.effect.value, "price": part.price.value},
+            }
+            for part in (*self.present, *self.missing)
+        ]
+        return pd.DataFrame(columns, columns=list(columns[0]) if columns else ["name"]).set_index("name")
+
+    def sentences(self) -> list[str]:
+        """Return the verdict on each part."""
+        return [f"{part.name}, {part.change}: {part.verdict}" for part in (*self.present, *self.missing)]
+
+
+class ModelStudy(VariantStudy):
+    """The full model, its repeats, and the model with each part changed."""
+
+    kind = "model"
+    what = "models"
+    advice = "compiling kernels comes on top; --points and a cheaper --fidelity lower it"
+
+    def __init__(self, env: Environment, options: StudyOptions) -> None:
+        if not env.model_parts:
+            raise ValueError(f"{env.name} names no parts of its model; its class lists them as `model_parts`")
+        super().__init__(env, options)
+        self._parts = {part.name: part for part in env.model_parts}
+        self._rounding = float(torch.finfo(getattr(torch, env.fidelity.precision)).eps)
+
+    @classmethod
+    def choose_fidelity(
+        cls, scene: Environment | type[Environment], given: Fidelity | str | None
+    ) -> Fidelity | str | None:
+        """Return the fidelity of the full model: the one that is given."""
+        return given
+
+    @cached_property
+    def variants(self) -> list[Variant]:
+        """The full model, the full model again, and the model with each part changed."""
+        own = Variant.of(self.env)
+        parts = [
+            replace(own, name=part.name, changed=PART, options={**own.options, **part.options})
+            for part in self.env.model_parts
+        ]
+        return [replace(own, name=FULL), replace(own, name=AGAIN), *parts]
+
+    def part(self, variant: Variant) -> str:
+        """Return the name of a variant's part of the checkpoint: another change of the same part is another one."""
+        if variant.changed != PART:
+            return variant.name
+        slug = re.sub(r"[^a-z0-9]+", "-", variant.name.lower()).strip("-")
+        return f"part-{slug}-{digest(dict(self._parts[variant.name].options))}"
+
+    def _make(self, variant: Variant) -> Environment:
+        """Make the model; raises ValueError where a changed part is the full model, or the scene refuses it."""
+        if variant.changed != PART:
+            return self.env
+        part = self._parts[variant.name]
+        env = self.env.remake(**part.options)
+        if env.options == self.env.options:
+            raise ValueError(f"the full model's options are those of {part.change!r} already")
+        return env
+
+    def measure(self, variant: Variant, follow: Follow) -> Mapping[str, Any]:
+        """Return the arrays of a model's sample, and of one with a part changed the times in turn with the full one."""
+        if variant.changed != PART:
+            return evaluate_points(self.env, self._moved() if variant.name == AGAIN else self.x, follow).arrays()
+        env = self._make(variant)
+        sample = evaluate_points(env, self.x, follow)
+        for one in (self.env, env):
+            self._make_room(one)
+            one.prepare()
+        turns = samples.take_turns(self.env, env, self.x)
+        return {**sample.arrays(), "batch": turns.batch, "full_seconds": turns.first, "part_seconds": turns.second}
+
+    def _moved(self) -> torch.Tensor:
+        """Return the points again and again, each moved within its last digit, so that rounding goes other ways."""
+        generator, box = torch.Generator().manual_seed(self.seed), self.env.space
+        x = self.x.repeat(REPEATS, 1)
+        moves = 2 * torch.rand(x.shape, generator=generator, dtype=torch.float64) - 1
+        return torch.clamp(x + moves * self._rounding * (box.upper - box.lower), box.lower, box.upper)
+
+    def _make_room(self, env: Environment) -> None:
+        """Let an environment take no more rows than are timed: two share a GPU, whose memory a solver takes whole."""
+        if env.device == "cuda" and env.preferred_batch > self._timed_rows:
+            env.shrink(self._timed_rows)
+
+    @cached_property
+    def _timed_rows(self) -> int:
+        return max(1, min(len(self.x), self.env.preferred_batch // 2))
+
+    def _expect(self, variant: Variant, env: Environment) -> Expected:
+        if variant.changed != PART:
+            return Expected(variant.name, env, len(self.x) * (REPEATS if variant.name == AGAIN else 1))
+        timed = 4 * (samples.MIN_ROUNDS + 2) * max(1, self.env.threads)  # both models, both ways
+        return Expected(variant.name, env, len(self.x) + timed, seconds=samples.MIN_SECONDS)
+
+    def run(self, watch: Watch, provenance: Mapping[str, Any], command: str) -> ModelRecord:
+        """Measure what is missing and return the record. Raises ValueError where the full model cannot be measured."""
+        arrays = self.measure_all(watch)
+        if AGAIN not in arrays:
+            raise ValueError(f"{self.env.name} cannot be repeated: {self.refused[AGAIN]}")
+        found = samples_of(arrays)
+        full = replace(found[FULL], forward=0.0, with_gradient=0.0)
+        turns = {
+            name: Turns(one["full_seconds"], one["part_seconds"], int(one["batch"]))
+            for name, one in arrays.items()
+            if name in self._parts
+        }
+        times = [one.first.min(axis=1) for one in turns.values()]
+        whole = reduce(Sample.join, [full] * REPEATS)
+        again = replace(found[AGAIN], forward=0.0, with_gradient=0.0)
+        noise = Noise.of(again, whole, rounding=self._rounding, seed=self.seed)
+        return ModelRecord(
+            **self.about(provenance, command),
+            fidelity=self.env.fidelity.name,
+            spread=spread(full),
+            failed=int(failed(full.status).sum()),
+            seconds=Seconds(*(min((float(one[way]) for one in times), default=0.0) for way in (0, 1))),
+            noise=noise,
+            parts=tuple(self._judge(self._parts[name], found[name], one, full, noise) for name, one in turns.items()),
+        )
+
+    def _judge(self, part: ModelPart, sample: Sample, turns: Turns, full: Sample, noise: Noise) -> MeasuredPart:
+        forward, with_gradient = map(float, turns.second.min(axis=1))
+        sample = replace(sample, forward=forward, with_gradient=with_gradient, batch=turns.batch)
+        found, moved = compare(sample, full, seed=self.seed), share_moved(sample, full, noise)
+        cost = turns.ratio(grad=True, seed=self.seed)
+        return MeasuredPart(
+            name=part.name,
+            change=part.change,
+            options=dict(part.options),
+            missing=part.missing,
+            comparison=found,
+            moved=moved,
+            cost=cost,
+            cost_forward=turns.ratio(grad=False, seed=self.seed),
+            effect=judge_effect(found, noise, moved),
+            price=judge_price(cost),
+        )
+
+
+def share_moved(part: Sample, full: Sample, noise: Noise) -> float | None:
+    """Return the share of points whose loss moves by more than twice the largest noise; None without points."""
+    fine = has_loss(part.status) & has_loss(full.status)
+    limit = NOISE_FACTOR * max(noise.largest, noise.digit)
+    return float((np.abs(part.loss - full.loss)[fine] > limit).mean()) if fine.any() else None
+
+
+def judge_effect(found: Comparison, noise: Noise, moved: float | None) -> Effect:
+    """Say by fixed rules what a part does.
+
+    It fails where more than one point in twenty fails. It moves losses where one of them moves by more than twice the
+    largest noise, or their median or 95th percentile by more than twice that of the noise; and their order where the
+    rank correlation is below 0.99 and below the interval of the noise's own. It moves gradients where their median
+    relative error is more than twice the noise's, or where more than one point in twenty has lost its own.
+    """
+    if found.diverged is None or round(found.diverged, 9) > FAILING_SHARE:
+        return Effect.FAILURE
+    own = noise.comparison
+    errors = [(found.loss_error.median, own.loss_error.median), (found.loss_error.p95, own.loss_error.p95)]
+    if not moved and not any(_exceeds(one, other, noise.digit) for one, other in errors):
+        changes = found.gradient.relative_error, own.gradient.relative_error
+        if round(found.missing or 0.0, 9) > FAILING_SHARE:
+            return Effect.GRADIENTS
+        return Effect.GRADIENTS if _exceeds(*changes, noise.rounding) else Effect.NOTHING
+    rank, low = found.spearman.value, own.spearman.low
+    kept = SAME_ORDER if low is None else min(SAME_ORDER, low)
+    return Effect.ORDER if rank is not None and rank < kept else Effect.LOSSES
+
+
+def _exceeds(found: Bootstrap, noise: Bootstrap, least: float) -> bool:
+    return _size(found) > NOISE_FACTOR * max(_size(noise), least)
+
+
+def _size(found: Bootstrap) -> float:
+    return np.inf if found.value is None else found.value
+
+
+def judge_price(cost: Bootstrap) -> Price:
+    """Say whether the interval of a ratio of times excludes 1."""
+    if cost.high is not None and cost.high < 1:
+        return Price.SAVES
+    return Price.COSTS if cost.low is not None and cost.low > 1 else Price.NOTHING

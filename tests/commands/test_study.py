@@ -1,0 +1,86 @@
+"""`landscape study`: what a kind of study takes, prints and refuses."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+import gradscape as gs
+from gradscape.envs import registry
+from gradscape.landscapes import cost
+from gradscape.landscapes.convert import to_json
+from gradscape.landscapes.storage.records import read_json
+from gradscape.studies import samples
+from gradscape.studies.model import ModelRecord
+
+from ..command import Said
+from ..parted import CLOCK, Parted
+
+Command = Callable[..., Said]
+TRADE = ["study", "model", "parted", "--points", "16", "--out", "parts"]
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Register the scene, and time it by its own clock in few rounds."""
+    for module in (samples, cost):
+        monkeypatch.setattr(module, "time", CLOCK)
+    for name, value in (("MIN_ROUNDS", 3), ("MIN_SECONDS", 0.0), ("BATCH_SECONDS", 0.0), ("RESAMPLES", 99)):
+        monkeypatch.setattr(samples, name, value)
+    monkeypatch.setitem(registry.entries(), "parted", registry.Entry("parted", Parted))
+
+
+@pytest.mark.drawn
+def test_the_parts_of_a_model_are_printed_drawn_and_kept(run: Command, tmp_path: Path) -> None:
+    done = run(*TRADE, "--json", "--figure-width-mm", "85", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    report = json.loads(done.stdout)
+    assert {**read_json(tmp_path / "parts/model.json"), "folder": "parts"} == report
+    for file, begins in (("model.png", b"\x89PNG"), ("model-85mm.pdf", b"%PDF")):
+        assert (tmp_path / "parts" / file).read_bytes().startswith(begins)
+    for said in (
+        "parts that are missing, and what putting each in does",
+        "paint, no paint: moves nothing beyond the noise; saves time",
+        "wind, no wind: changes the order; costs nothing measurable",
+        "tough glass, glass that breaks: fails where the full model does not; costs nothing measurable",
+        "refused: tank: parted needs its tank",
+        "-50% (-50:-50)",
+    ):
+        assert said in done.stderr
+    assert "about " in done.stderr.partition("models to measure")[2]  # the estimate comes first
+    again = run(*TRADE, cwd=tmp_path)
+    assert "0 models" not in again.stderr
+    assert "8 are there already" in again.stderr  # those that are refused are tried again
+
+
+def test_the_front_door_has_the_same_study(tmp_path: Path) -> None:
+    found = gs.study("model", Parted, points=16, out=tmp_path / "parts")
+    assert isinstance(found, ModelRecord)
+    assert to_json(found) == read_json(tmp_path / "parts/model.json")
+    assert found.command.startswith("gradscape.study('model', Parted, points=16")
+    with pytest.raises(ValueError, match="study model takes points, seed; got settings"):
+        gs.study("model", Parted, settings=("dt",))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["ladder", "bounce"], "Choose from"),
+        (["model", "parted", "--settings", "dt"], "study model takes points, seed; got settings"),
+        (["fidelity", "bounce", "--fidelity", "draft"], "got draft, leave it out"),
+        (["model", "branin"], "branin names no parts of its model"),
+        (["extremes", "bounce", "--time-limit", "3"], "got time_limit"),
+    ],
+)
+def test_what_a_study_does_not_take_is_refused(arguments: list[str], said: str, run: Command, tmp_path: Path) -> None:
+    done = run("study", *arguments, cwd=tmp_path)
+    assert done.returncode == 2
+    assert said in done.stderr
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("name", "kind"), [("tradeoff", "fidelity"), ("extremes", "extremes")])
+def test_a_former_function_names_the_present_one(name: str, kind: str) -> None:
+    with pytest.raises(AttributeError, match=f"gradscape.{name} is gradscape.study.'{kind}'"):
+        getattr(gs, name)

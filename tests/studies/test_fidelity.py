@@ -1,0 +1,392 @@
+"""`landscape study fidelity` and `--tolerance`: what they leave, say, go on from and refuse."""
+
+import json
+import weakref
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, ClassVar
+
+import pytest
+import torch
+from torch import Tensor
+
+import gradscape
+from gradscape.envs import registry
+from gradscape.envs.base import Environment, Fidelity, Work
+from gradscape.jobs.tolerance import read_tolerance
+from gradscape.landscapes import cost
+from gradscape.landscapes.objective import Evaluation
+from gradscape.landscapes.space import ParameterSpace
+from gradscape.landscapes.storage.records import read_json, write_record
+from gradscape.landscapes.verification import POINTS
+from gradscape.studies import samples, variants
+from gradscape.studies.fidelity import SETTINGS, list_variants
+
+from ..clock import Clock
+from ..command import Said
+
+Command = Callable[..., Said]
+CLOCK = Clock()
+TRADE = ["study", "fidelity", "converging", "--points", "16", "--device", "cpu", "--out", "trade"]
+
+
+class Converging(Environment):
+    """A bowl whose loss is off by (1 + x0) dt^2, in float32 by 1e-7 more, in 1e-3 / dt seconds a point.
+
+    Refuses dt of 0.4 or more, diverges at 0.2 where x0 is large.
+    """
+
+    name = "converging"
+    fidelities: ClassVar[dict[str, Fidelity]] = {
+        "draft": Fidelity("draft", dt=0.1),
+        "standard": Fidelity("standard", dt=0.05),
+        "reference": Fidelity("reference", dt=1e-4, precision="float64"),
+    }
+    space = ParameterSpace.box(["x0", "x1"], 0.0, 1.0)
+
+    def _setup(self) -> None:
+        if self.fidelity.dt >= 0.4:
+            raise ValueError(f"converging takes dt below 0.4; got {self.fidelity.dt}")
+
+    def work(self) -> Work:
+        return Work(round(1 / self.fidelity.dt), "step")
+
+    def _evaluate(self, x: Tensor, *, grad: bool) -> Evaluation:
+        dt = self.fidelity.dt
+        CLOCK.sleep(len(x) * 1e-3 / dt)
+        rounding = 1e-7 if self.fidelity.precision == "float32" else 0.0
+        loss = x.square().sum(dim=1) + (1 + x[:, 0]) * dt**2 + rounding
+        loss[(x[:, 0] > 0.5) & (dt >= 0.2)] = torch.nan
+        return Evaluation.from_results(loss, 2 * x + dt**2 * x.new_tensor([1.0, 0.0]) if grad else None)
+
+
+@pytest.fixture(autouse=True)
+def own_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Keep measurements in a folder of the test's own, and time by the clock of the scene."""
+    monkeypatch.setattr("gradscape.studies.kept.user_data_path", lambda name: tmp_path / "data" / name)
+    for module in (samples, cost):
+        monkeypatch.setattr(module, "time", CLOCK)
+    monkeypatch.setattr(samples, "RESAMPLES", 99)
+    monkeypatch.setitem(registry.entries(), "converging", registry.Entry("converging", f"{__name__}:Converging"))
+    return tmp_path / "data"
+
+
+def by_name(report: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    return {row["name"]: row for row in report["variants"]}
+
+
+def study(report: dict[str, Any]) -> dict[str, Any]:
+    """Return what two studies have in common, however far the clock was when they began."""
+
+    def rounded(variant: dict[str, Any]) -> dict[str, Any]:
+        found = variant["comparison"]
+        seconds = {way: round(value, 9) for way, value in found["seconds"].items()}
+        return {**variant, "comparison": {**found, "seconds": seconds}}
+
+    return {
+        **report,
+        "variants": list(map(rounded, report["variants"])),
+        "command": None,
+        "folder": None,
+        "provenance": None,
+    }
+
+
+@pytest.mark.drawn
+def test_errors_and_order_of_convergence_are_those_of_the_scene(run: Command, tmp_path: Path) -> None:
+    done = run(*TRADE, "--json", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    report = json.loads(done.stdout)
+    assert {**read_json(tmp_path / "trade/fidelity.json"), "folder": "trade"} == report
+    assert (tmp_path / "trade/fidelity.png").read_bytes().startswith(b"\x89PNG")
+    rows = by_name(report)
+    x = Converging.space.sobol(16, seed=0)
+    for name, dt in (("draft", 0.1), ("standard", 0.05), ("standard-dt-x0.5", 0.025)):
+        off = (1 + x[:, 0]) * (dt**2 - 1e-8) + 1e-7
+        assert rows[name]["comparison"]["loss_error"]["median"]["value"] == pytest.approx(float(off.quantile(0.5)))
+        assert rows[name]["comparison"]["loss_error"]["p95"]["value"] == pytest.approx(float(off.sort().values[-1]))
+        assert rows[name]["comparison"]["seconds"] == pytest.approx(
+            dict.fromkeys(("forward", "with_gradient"), 1e-3 / dt)
+        )
+    (fit,) = report["orders"]  # of variants in float32, without the reference's own
+    assert fit["variants"] == ["draft", "standard", "standard-dt-x0.5"]
+    assert fit["order"] == pytest.approx(2, abs=0.01)
+
+
+def test_a_study_is_printed_without_being_measured_again(
+    run: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert run(*TRADE, "--settings", "precision", cwd=tmp_path).returncode == 0
+    simulate, rows = Converging._evaluate, list[int]()
+    monkeypatch.setattr(Converging, "_evaluate", lambda *x, grad: rows.append(len(x[1])) or simulate(*x, grad=grad))
+    done = run(*TRADE, "--settings", "precision", "--figure-width-mm", "85", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "fidelity-85mm.pdf, fidelity-85mm.svg" in done.stderr
+    assert (tmp_path / "trade/fidelity-85mm.pdf").read_bytes().startswith(b"%PDF")
+    assert run(*TRADE, "--settings", "precision", cwd=tmp_path).returncode == 0
+    assert rows == [POINTS, POINTS]  # those that are verified, each time
+
+
+def test_variants_that_are_refused_are_listed_and_those_that_diverge_are_counted(run: Command, tmp_path: Path) -> None:
+    done = run(*TRADE, "--json", cwd=tmp_path)
+    report = json.loads(done.stdout)
+    assert report["refused"] == [{"name": "draft-dt-x4", "why": "converging takes dt below 0.4; got 0.4"}]
+    assert "refused: draft-dt-x4: converging takes dt below 0.4; got 0.4" in done.stderr
+    coarse = by_name(report)["draft-dt-x2"]
+    x = Converging.space.sobol(16, seed=0)
+    assert coarse["comparison"]["diverged"] == pytest.approx(float((x[:, 0] > 0.5).double().mean()))
+    assert coarse["comparison"]["loss_error"]["p95"]["value"] is None
+
+
+def test_a_variant_whose_engine_gives_up_is_listed_too(
+    run: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    simulate = Converging._evaluate
+
+    def short_of_memory(self: Converging, x: Tensor, *, grad: bool) -> Evaluation:
+        if self.fidelity.name == "standard":
+            raise RuntimeError("out of memory")
+        return simulate(self, x, grad=grad)
+
+    monkeypatch.setattr(Converging, "_evaluate", short_of_memory)
+    report = json.loads(run(*TRADE, "--settings", "precision", "--json", cwd=tmp_path).stdout)
+    assert report["refused"] == [{"name": "standard", "why": "out of memory"}]
+    assert {"draft", "draft-float64", "standard-float64", "reference"} < set(by_name(report))
+
+
+def test_a_variant_is_gone_when_the_next_one_is_measured(
+    run: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On a GPU it would hold the memory that the next one measures how quick it is with."""
+    simulate, simulated = Converging._evaluate, list[weakref.ref[Converging]]()
+
+    def followed(self: Converging, x: Tensor, *, grad: bool) -> Evaluation:
+        if not simulated or simulated[-1]() is not self:
+            assert all(env() is None for env in simulated)
+            self.cycle = self  # type: ignore[attr-defined]
+            simulated.append(weakref.ref(self))
+        return simulate(self, x, grad=grad)
+
+    monkeypatch.setattr(Converging, "_evaluate", followed)
+    done = run(*TRADE, "--settings", "precision", "--json", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert len(simulated) == 2 + len(json.loads(done.stdout)["variants"])  # one to verify by, one for the estimate
+
+
+def test_a_dt_that_does_not_divide_the_episode_is_refused() -> None:
+    env = Converging(fidelity="draft")
+    base = variants.Variant.of(env)
+    thirds = base.change("thirds", "dt", fidelity=Fidelity("thirds", dt=0.3))
+    with pytest.raises(ValueError, match=r"with dt 0.3 s it would be 0.9 times as long"):
+        thirds.make(env)
+    assert base.change("halves", "dt", fidelity=Fidelity("halves", dt=0.05)).make(env).fidelity.dt == 0.05
+
+
+def cells(scene: str, fidelity: str, factor: float) -> str:
+    """Return the name of the variant that has so many times the cells of a fidelity, an even number."""
+    own = registry.environment_class(scene).fidelities[fidelity].resolution
+    return f"{fidelity}-resolution-{2 * round(own * factor / 2)}"
+
+
+@pytest.mark.parametrize(
+    ("scene", "wanted"),
+    [
+        ("bounce", {"draft-ke-x4", "draft-dt-x2", "draft-float64", "reference-float32", "draft on cuda"}),
+        ("fluid", {cells("fluid", "standard", 1.5), "draft-particles-x2", "draft on taichi", "standard-dt-x2"}),
+        ("table", {"standard-particles-x0.5", cells("table", "draft", 2 / 3)}),
+        ("flip", {cells("flip", "standard", 2 / 3), "draft on taichi"}),
+    ],
+)
+def test_scenes_have_the_variants_of_their_knobs(scene: str, wanted: set[str]) -> None:
+    found = list_variants(registry.make(scene, fidelity="reference", device="cpu"), SETTINGS)
+    names = [variant.name for variant in found]
+    assert names[0] == "reference"
+    assert wanted <= set(names)
+    assert len({variant.key() for variant in found}) == len(found)
+    assert ("draft-ke-x4" in names) == (scene == "bounce")
+    particles = {one.changed for one in found} & {"particles"}
+    assert bool(particles) == (scene in ("fluid", "table"))
+
+
+def test_a_stopped_study_goes_on_with_the_next_variant(
+    run: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "whole").mkdir()
+    whole = json.loads(run(*TRADE, "--json", cwd=tmp_path / "whole").stdout)
+    measure, measured = samples.measure, []
+
+    def stopped(env: Any, x: Tensor, **how: Any) -> samples.Sample:
+        if len(measured) == 3:
+            raise KeyboardInterrupt
+        measured.append(env.fidelity.name)
+        return measure(env, x, **how)
+
+    monkeypatch.setattr(samples, "measure", stopped)
+    done = run(*TRADE, "--json", cwd=tmp_path)
+    assert (done.returncode, done.stdout) == (130, "")
+    assert "stopped: 3 of" in done.stderr
+    assert not (tmp_path / "trade/fidelity.json").exists()
+    kept = {path.name: path.read_bytes() for path in (tmp_path / "trade/pieces").iterdir()}
+    monkeypatch.setattr(samples, "measure", measure)
+    resumed = json.loads(run(*TRADE, "--json", cwd=tmp_path).stdout)
+    assert study(resumed) == study(whole)
+    assert kept == {name: (tmp_path / "trade/pieces" / name).read_bytes() for name in kept}
+
+
+def test_another_study_is_not_overwritten(run: Command, tmp_path: Path) -> None:
+    run(*TRADE, "--settings", "dt", cwd=tmp_path)
+    before = (tmp_path / "trade/fidelity.json").read_bytes()
+    other = run(*TRADE, "--seed", "1", cwd=tmp_path)
+    assert other.returncode == 2
+    assert "seed: wanted 1, found 0" in other.stderr
+    assert (tmp_path / "trade/fidelity.json").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["study", "fidelity", "branin"], "branin has one fidelity, exact, so there is nothing to compare"),
+        (["study", "fidelity", "bounce", "--settings", "speed"], "--settings takes dt, resolution"),
+        (
+            ["slice", "bounce", "--dims", "0", "1", "--tolerance", "5%", "--set", "horizon=0.5"],
+            "`landscape study fidelity bounce --set=horizon=0.5` measures them",
+        ),
+        (["slice", "bounce", "--dims", "0", "1", "--tolerance", "5%", "--fidelity", "draft"], "leave out one"),
+        (["slice", "bounce", "--dims", "0", "1", "--tolerance", "close"], "such as 5%"),
+        (["optimize", "bounce", "--method", "random", "--tolerance", "-1"], "such as 5%"),
+    ],
+)
+def test_what_cannot_be_is_refused(arguments: list[str], said: str, run: Command, tmp_path: Path) -> None:
+    done = run(*arguments, cwd=tmp_path)
+    assert done.returncode == 2
+    assert said in done.stderr
+
+
+def test_a_tolerance_takes_the_quickest_fidelity_within_it(run: Command, tmp_path: Path) -> None:
+    report = json.loads(run(*TRADE, "--json", cwd=tmp_path).stdout)
+    errors = {row["name"]: row["comparison"]["loss_error"]["p95_relative"]["value"] for row in report["variants"]}
+    within = [row for row in report["variants"] if (off := errors[row["name"]]) is not None and off <= 0.02]
+    wanted = min(within, key=lambda row: row["comparison"]["seconds"]["with_gradient"])
+    assert len(report["variants"]) > len(within) > 1
+    how = ["converging", "--device", "cpu", "--tolerance", "2%"]
+    cut = run("slice", *how, "--dims", "0", "1", "--resolution", "3", "--out", "cut", cwd=tmp_path)
+    assert cut.returncode == 0, cut.stderr
+    assert f"{wanted['name']}: the quickest of" in cut.stderr
+    assert gradscape.open_slice(tmp_path / "cut").identity["settings"] == wanted["fidelity"]
+    searched = run("optimize", *how, "--method", "random", "--budget", "3", "--json", cwd=tmp_path)
+    assert searched.returncode == 0, searched.stderr
+    assert json.loads(searched.stdout)["fidelity"] == wanted["fidelity"]["name"]
+
+
+def test_a_tolerance_that_nothing_meets_names_the_best(run: Command, tmp_path: Path) -> None:
+    kept = Path(tmp_path / "data").rglob("*.json")
+    run(*TRADE, cwd=tmp_path)
+    (path,) = kept
+    report = read_json(path)
+    report["variants"] = [
+        row for row in report["variants"] if row["name"] != "reference" and "reference" not in row["name"]
+    ]
+    report["identity"]["model_version"] = 0
+    write_record(path, report)
+    how = ["slice", "converging", "--device", "cpu", "--dims", "0", "1", "--resolution", "3", "--tolerance"]
+    none = run(*how, "1e-9", cwd=tmp_path)
+    assert none.returncode == 2
+    assert "the best is standard-dt-x0.5" in none.stderr
+    some = run(*how, "50%", cwd=tmp_path)
+    assert some.returncode == 0
+    assert "warning: measured by converging model 0; this is model 1" in some.stderr
+
+
+def test_a_name_whose_settings_changed_since_is_not_chosen(
+    run: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run(*TRADE, cwd=tmp_path)
+    how = ["slice", "converging", "--device", "cpu", "--dims", "0", "1", "--resolution", "3", "--tolerance", "50%"]
+    before = json.loads(run(*how, "--out", "before", "--json", cwd=tmp_path).stdout)["fidelity"]
+    monkeypatch.setattr(Converging, "fidelities", {**Converging.fidelities, "draft": Fidelity("draft", dt=0.125)})
+    after = json.loads(run(*how, "--out", "after", "--json", cwd=tmp_path).stdout)["fidelity"]
+    assert before == "draft"
+    assert after != "draft"
+
+
+def test_the_gallerys_variants_of_the_same_problem_are_found_where_nothing_of_the_users_own_is(
+    run: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    report = json.loads(run(*TRADE, "--json", cwd=tmp_path).stdout)
+    for kept in (tmp_path / "data").rglob("*.json"):
+        kept.unlink()
+    softer = json.loads(json.dumps(by_name(report)["draft"])) | {"name": "softer", "options": {"ke": 1.0}}
+    softer["comparison"]["seconds"] = {"forward": 0.0, "with_gradient": 0.0}
+    path = tmp_path / "data" / "studies" / "converging-cpu.fidelity.json"
+    path.parent.mkdir(parents=True)
+    monkeypatch.setattr("gradscape.studies.kept.resources.files", lambda package: tmp_path)
+    how = ["slice", "converging", "--device", "cpu", "--dims", "0", "1", "--resolution", "3", "--tolerance", "50%"]
+    write_record(path, {**report, "variants": [softer, *report["variants"]]})
+    done = run(*how, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert str(path) in done.stderr
+    assert "softer: " not in done.stderr
+    write_record(path, {**report, "identity": {**report["identity"], "options": {"ke": 1.0}}})
+    assert "no fidelities of converging with these options are measured" in run(*how, cwd=tmp_path).stderr
+
+
+def test_a_slice_at_a_measured_fidelity_can_be_cut_anew(run: Command, tmp_path: Path) -> None:
+    how = ["converging", "--device", "cpu", "--tolerance", "0.0015"]
+    run(*TRADE, "--settings", "dt", cwd=tmp_path)
+    run("slice", *how, "--dims", "0", "1", "--resolution", "3", "--out", "cut", cwd=tmp_path)
+    run("optimize", *how, "--method", "random", "--budget", "3", "--out", "searched", cwd=tmp_path)
+    assert json.loads((tmp_path / "cut/summary.json").read_text())["fidelity"] == "standard-dt-x0.5"
+    anew = run("overlay", "cut", "searched", "--through", "best", "--device", "cpu", "--out", "over", cwd=tmp_path)
+    assert anew.returncode == 0, anew.stderr
+
+
+def test_a_tolerance_is_a_share() -> None:
+    assert read_tolerance("5%") == read_tolerance("0.05") == 0.05
+
+
+def elsewhere(report: dict[str, Any]) -> dict[str, Any]:
+    """Return a report as it would be of a GPU, on which the finest variants_ are the quickest."""
+    finest = {"reference": 1e-9, "standard": 1e-6}
+
+    def of(name: str) -> dict[str, float]:
+        return dict.fromkeys(("forward", "with_gradient"), finest.get(name, 1.0))
+
+    variants_ = [
+        {**row, "device": "cuda", "comparison": {**row["comparison"], "seconds": of(row["name"])}}
+        for row in report["variants"]
+    ]
+    return {**report, "variants": variants_, "identity": {**report["identity"], "device": "cuda"}}
+
+
+def test_seconds_are_those_of_the_device_that_will_run(
+    run: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Errors measured on a GPU count here; its seconds do not: what may be quickest is timed, once, and kept."""
+    report = json.loads(run(*TRADE, "--json", cwd=tmp_path).stdout)
+    for kept in (tmp_path / "data").rglob("*.json"):
+        kept.write_text(json.dumps(elsewhere(report)))
+    timed: list[str] = []
+
+    def slow(env: gradscape.Environment) -> float:
+        timed.append(env.fidelity.name)
+        return variants.expected_work(env)
+
+    monkeypatch.setattr(variants, "seconds_with_gradient", slow)
+    how = ["slice", "converging", "--device", "cpu", "--dims", "0", "1", "--resolution", "3", "--json"]
+    errors = {row["name"]: row["comparison"]["loss_error"]["p95_relative"]["value"] for row in report["variants"]}
+    within = [name for name, off in errors.items() if off is not None and off <= 0.02]
+    work = {
+        row["name"]: variants.expected_work(gradscape.make("converging", fidelity=Fidelity(**row["fidelity"])))
+        for row in report["variants"]
+    }
+    done = run(*how, "--tolerance", "2%", cwd=tmp_path)
+    chosen = json.loads(done.stdout)["fidelity"]
+    assert work[chosen] == min(work[name] for name in within)
+    assert chosen not in ("reference", "standard")
+    likely = {name for name in within if work[name] <= 2 * min(work[other] for other in within)}
+    assert set(timed) == likely
+    assert 1 < len(timed) < len(within)  # what is dearer from the outset is not tried
+    assert "one alone on cpu, timed here" in done.stderr
+    timed.clear()
+    assert json.loads(run(*how, "--tolerance", "2%", cwd=tmp_path).stdout)["episodes"] == 0
+    assert timed == []
