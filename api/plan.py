@@ -14,7 +14,8 @@ from .call import calling, current, verb
 from .options import ARGUMENT
 
 if TYPE_CHECKING:
-    from ..jobs.plan import Plan, Work
+    from ..jobs.plan import Plan
+    from ..jobs.watch import Work
 
 
 class _Planner(Watch):

@@ -12,9 +12,8 @@ from ..studies import study_class
 from ..studies.variants import Study, StudyOptions, StudyRecord, expected_work
 from .folder import ROOT, STUDIES, Results, folder_named
 from .job import CheckpointedJob
-from .plan import Work
 from .scene import SceneSpec, provenance
-from .watch import PREPARING, Watch
+from .watch import PREPARING, Watch, Work
 
 if TYPE_CHECKING:
     from ..envs.base import Environment
