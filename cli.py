@@ -148,7 +148,10 @@ class Verb:
 
         shown = {name: named.pop(name) for name in self.displayed & set(named)}
         as_object, results, code = named.pop("json", False), [], 0
-        for one in _for_each_point(named):
+        calls = _for_each_point(named)
+        for one in calls if len(calls) > 1 else ():
+            _refuse(self.function, given, one)
+        for one in calls:
             bars = Bars()
             with calling(Call(command_line(), bars, on_disk=True)):
                 result = _plan(self.function, given, one) if self.planned else self.function(*given, **one)
@@ -161,6 +164,16 @@ class Verb:
 
             print(json.dumps(results[0] if len(results) == 1 else {f"{self.words}s": results}))
         return code
+
+
+def _refuse(function: Callable[..., Any], given: Sequence[Any], named: dict[str, Any]) -> None:
+    """Raise what one of several calls would be refused with, before any of them is begun."""
+    from .api.call import Call, calling
+    from .api.plan import work_of
+    from .jobs.watch import Watch
+
+    with calling(Call("", Watch(), on_disk=True)):
+        work_of(function, given, named)
 
 
 def _plan(function: Callable[..., Any], given: Sequence[Any], named: dict[str, Any]) -> Any:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from inspect import signature
 from pathlib import Path
@@ -43,19 +43,26 @@ def plan(verb: Annotated[Callable[..., Any], ARGUMENT], *given: Any, **named: An
     verb
         The verb to plan, followed by its own arguments and options: in Python the function, such as `gradscape.slice`.
     """
-    call, parameters = current(), signature(verb).parameters
-    elsewhere = _elsewhere(named)
-    with tempfile.TemporaryDirectory() as folder:
-        if "out" in parameters:
-            named["out"] = str(Path(folder) / "planned")
-        try:
-            with calling(replace(call, watch=_Planner())):
-                verb(*given, **named | ({"device": "cpu"} if elsewhere else {}))
-        except Planned as planned:
-            from ..jobs.plan import plan_work
+    call, elsewhere = current(), _elsewhere(named)
+    works = work_of(verb, given, named | ({"device": "cpu"} if elsewhere else {}))
+    if not works:
+        raise ValueError(f"{verb.__name__} simulates nothing that could be planned: what it writes is there in seconds")
+    from ..jobs.plan import plan_work
 
-            return plan_work(planned.works, call.command, call.watch, device=elsewhere)
-    raise ValueError(f"{verb.__name__} simulates nothing that could be planned: what it writes is there in seconds")
+    return plan_work(works, call.command, call.watch, device=elsewhere)
+
+
+def work_of(verb: Callable[..., Any], given: Sequence[Any], named: dict[str, Any]) -> Sequence[Work]:
+    """Return what a call of a verb would simulate. Raises ValueError for what the verb refuses before that."""
+    with tempfile.TemporaryDirectory() as folder:
+        if "out" in signature(verb).parameters:
+            named = named | {"out": str(Path(folder) / "planned")}
+        try:
+            with calling(replace(current(), watch=_Planner())):
+                verb(*given, **named)
+        except Planned as planned:
+            return planned.works
+    return []
 
 
 def _elsewhere(named: dict[str, Any]) -> str | None:

@@ -41,7 +41,7 @@ def spec_of(scene: Scene, keywords: SceneKeywords, *, dims: Sequence[int | str] 
         words = [str(dim) for dim in dims or ()] if not spec.options else []
         refuse_unknown(scene, fidelity=spec.fidelity, device=spec.device, engine=spec.engine, dims=words)
         if spec.tolerance is not None:
-            from ..jobs.tolerance import tolerance_of
+            from ..jobs.scene import tolerance_of
 
             tolerance_of(spec)
     return spec

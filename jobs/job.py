@@ -3,22 +3,28 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Callable, Iterable, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 
+import torch
+
 from ..landscapes.convert import to_json
+from ..landscapes.objective import Evaluation, Objective
+from ..landscapes.sampling.memory import free_memory
 from ..landscapes.storage.checkpoint import Checkpoint
 from ..landscapes.storage.files import tidy
+from ..landscapes.storage.locks import holding
 from ..landscapes.storage.records import write_record
+from ..landscapes.verification import POINTS, StoredPoints, verify
 from .folder import Results
-from .studies import going_on
-from .watch import Watch, Work, resumable
+from .watch import PREPARING, Watch, Work, resumable
 
 if TYPE_CHECKING:
     from ..envs.base import Environment
+    from ..optim.runs.store import RunStore
 
 Found = TypeVar("Found")
 
@@ -102,3 +108,50 @@ class CheckpointedJob(Job[Found]):
     def verified(self) -> Environment | None:
         """Return the environment that the checkpoint is verified with; None verifies parts as they are read."""
         return None
+
+
+@contextmanager
+def going_on(
+    pieces: Checkpoint, make: Callable[[], Environment | None], kept: Callable[[], str], watch: Watch
+) -> Iterator[None]:
+    """Hold a study's folder, after another process that fills it, and verify the environment that `make` returns.
+
+    Raises StoreMismatchError where it gives other numbers than when the study began, and as `resumable` does.
+    """
+    with resumable(kept), holding(pieces.folder, watch.note):
+        _verify(pieces, make, watch)
+        yield
+
+
+def _verify(pieces: Checkpoint, make: Callable[[], Environment | None], watch: Watch) -> None:
+    """Verify the environment that `make` returns, which is gone afterwards with the memory it has taken."""
+    if (env := make()) is not None:
+        with watch.busy(PREPARING):
+            pieces.verify(env)
+            del env
+            free_memory()
+
+
+@contextmanager
+def filling(objective: Objective, runs: Sequence[RunStore], folder: Path, watch: Watch) -> Iterator[None]:
+    """Hold a folder of runs, after another process that fills it, and verify the runs.
+
+    Three points of a single run are evaluated anew, one of each of several, in one batch. Raises StoreMismatchError
+    where the objective gives other numbers than they hold.
+    """
+    with holding(folder, watch.note) as waited:
+        for run in runs if waited else ():
+            with run.lock():  # reads it
+                pass
+        begun = [_points(run) for run in runs if run.count]
+        with watch.busy(PREPARING):
+            verify(objective, begun, points=POINTS if len(begun) == 1 else 1)
+        yield
+
+
+def _points(run: RunStore) -> StoredPoints:
+    """Return what a run evaluated."""
+    data = run.dataset()
+    x, loss, grad, status = (torch.from_numpy(data[name].to_numpy()) for name in ("x", "loss", "grad", "status"))
+    path, sloped = run.path or Path(), run.gradient_cost is not None
+    return StoredPoints(path, "run", x, Evaluation(loss, grad, status), sloped)

@@ -114,7 +114,7 @@ def _plan_part(work: Work, device: str | None) -> PlannedWork:
     counts, rate = {False: work.losses, True: work.gradients}, MEASURED
     if device is not None:
         from ..envs.registry import as_environment
-        from .tolerance import find_variant
+        from .scene import find_variant
 
         variant, path = find_variant(as_environment(objective), device)
         kept = variant.comparison.seconds

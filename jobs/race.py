@@ -27,11 +27,11 @@ from ..optim.registry import optimizer_class
 from ..optim.runs.store import RunStore
 from ..optim.search import SearchProgress
 from .folder import RACE, RACE_FIGURES, ROOT, RUN_STORE, folder_named
+from .job import filling
 from .methods import able_methods, check_methods, require_room
 from .race_summary import RaceSummary
 from .scene import provenance
 from .search import make_optimizer, open_run_store
-from .studies import filling
 from .watch import PREPARING, Watch, Work, resumable
 from .workers import recipe
 

@@ -23,8 +23,8 @@ from ..optim.runs.run import Run
 from ..optim.runs.store import RunStore
 from ..optim.search import SearchProgress, search
 from .folder import ROOT, RUN, SUMMARY, folder_named
+from .job import filling
 from .scene import provenance
-from .studies import filling
 from .watch import PREPARING, Watch, Work, resumable
 
 if TYPE_CHECKING:

@@ -40,7 +40,7 @@ def test_it_prints_ranks_and_the_papers_claims(run: Callable[..., Said], tmp_pat
 def test_the_best_point_of_a_league_is_known_to_slices(
     run: Callable[..., Said], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("gradscape.jobs.known.best_of_league", lambda env: None)  # the gallery keeps a better one
+    monkeypatch.setattr("gradscape.jobs.scene.best_of_league", lambda env: None)  # the gallery keeps a better one
     short = ["--methods", "random", "--budget", "6", "--seeds", "1", "--device", "cpu", "--json"]
     league = run("league", "bounce@draft", *short, cwd=tmp_path)
     best = json.loads(league.stdout)["scenes"][0]["best"]

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from gradscape.landscapes.measures.unresolved import probes
+from gradscape.landscapes.measures.undersampled import probes
 
 import gradscape as gs
 from gradscape.jobs import plan as module
@@ -65,7 +65,7 @@ def test_a_plan_takes_as_many_episodes_as_the_slice(run: Callable[..., Said], tm
     planned = json.loads(run("plan", *words, cwd=tmp_path).stdout)
     made = json.loads(run(*words, cwd=tmp_path).stdout)
     assert planned["gradients"] == made["episodes"]
-    assert planned["episodes"] - planned["gradients"] >= made["unresolved"]["episodes"]
+    assert planned["episodes"] - planned["gradients"] >= made["undersampled"]["episodes"]
     taken = sum(file.stat().st_size for file in (tmp_path / made["folder"] / "slice.zarr").rglob("*") if file.is_file())
     assert taken <= planned["disk"]
 

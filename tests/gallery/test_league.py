@@ -16,7 +16,7 @@ from gradscape.gallery.figures import Figure
 from gradscape.gallery.files import LeagueSliceFiles
 from gradscape.gallery.league import LeaguePart, read_league, read_standings
 from gradscape.gallery.league_runs import PLACES, KeptRun, KeptRuns
-from gradscape.jobs import known
+from gradscape.jobs import scene
 from gradscape.jobs.race import RaceJob
 from gradscape.jobs.scene import point_of
 from gradscape.jobs.watch import Watch
@@ -189,11 +189,11 @@ def test_the_best_point_of_the_gallery_is_known_to_slices(
     assert found is not None
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(tmp_path / "elsewhere")  # where no race is known
-    monkeypatch.setattr(known, "league_file", lambda name: small / "league" / f"{name}.json")
+    monkeypatch.setattr(scene, "league_file", lambda name: small / "league" / f"{name}.json")
     best = point_of(env, "best")
     assert best.tolist() == list(found.x)
     assert float(env.evaluate(best[None], grad=False).loss) == found.loss  # the episode, again
-    assert known.best_of_league(make("ackley", device="cpu")) is None
+    assert scene.best_of_league(make("ackley", device="cpu")) is None
     torn = small / "league/branin.json"
     torn.write_text(torn.read_text().replace('"budget": 12', '"budget": 13'))
     with pytest.raises(DamagedError, match="is damaged"):
@@ -205,7 +205,7 @@ def test_a_better_run_is_preferred_to_the_gallery_s(small: Path, monkeypatch: py
     LeaguePart(FIGURES[0], small, "cpu").make(Watch())
     own = point_of(env, "best")
     for loss, expected in ((1e9, own), (-1e9, torch.zeros(2, dtype=torch.float64))):
-        monkeypatch.setattr(known, "best_of_league", lambda env, loss=loss: (torch.zeros(2, dtype=torch.float64), loss))
+        monkeypatch.setattr(scene, "best_of_league", lambda env, loss=loss: (torch.zeros(2, dtype=torch.float64), loss))
         assert torch.equal(point_of(env, "best"), expected)
 
 

@@ -137,7 +137,7 @@ def test_verbs_take_such_slices(run, tmp_path):
 
 def test_the_best_point_known_is_of_the_same_options(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("gradscape.jobs.known.best_of_league", lambda env: None)
+    monkeypatch.setattr("gradscape.jobs.scene.best_of_league", lambda env: None)
     envs = [gs.make("bounce", device="cpu", target_x=x) for x in (2.0, 3.0)]
     runs = [gs.optimize(env, "random", budget=12) for env in envs]
     for env, run in zip(envs, runs, strict=True):
@@ -187,7 +187,7 @@ def test_through_several_points_there_is_a_slice_for_each(run, tmp_path):
 )
 def test_what_cannot_be_cut_is_one_line_and_nothing_is_written(run, tmp_path, monkeypatch, words, said):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("gradscape.jobs.known.best_of_league", lambda env: None)  # the gallery keeps one of bounce
+    monkeypatch.setattr("gradscape.jobs.scene.best_of_league", lambda env: None)  # the gallery keeps one of bounce
     done = run("slice", "bounce", *words, cwd=tmp_path)
     assert done.returncode == 2
     assert said in done.stderr

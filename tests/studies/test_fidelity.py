@@ -13,7 +13,7 @@ from torch import Tensor
 import gradscape
 from gradscape.envs import registry
 from gradscape.envs.base import Environment, Fidelity, Work
-from gradscape.jobs.tolerance import read_tolerance
+from gradscape.jobs.scene import read_tolerance
 from gradscape.landscapes import cost
 from gradscape.landscapes.objective import Evaluation
 from gradscape.landscapes.space import ParameterSpace
