@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 PACKAGES = (
     *("numpy", "torch", "warp-lang", "taichi", "xarray", "zarr", "matplotlib"),
-    *("pyvista", "rerun-sdk", "botorch", "gpytorch", "cma", "typer", "rich"),
+    *("pyvista", "rerun-sdk", "botorch", "gpytorch", "cma", "cyclopts", "cattrs", "rich"),
 )
 AT = "@"  # between a scene and its fidelity
 ABSENT = "not installed"  # in the place of a version
