@@ -10,8 +10,7 @@ from .terminal import Console, table
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from ..jobs.bench import BatchRate, Bench
-    from ..jobs.kernel_times import KernelTable
+    from ..jobs.bench import BatchRate, Bench, KernelTable
 
 
 def show(found: Bench, console: Console) -> None:

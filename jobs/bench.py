@@ -17,7 +17,7 @@ from torch import Tensor
 
 from ..envs.base import Environment, Work
 from ..envs.engines import find_engine
-from ..envs.engines.profiling import count_compiled_modules
+from ..envs.engines.profiling import count_compiled_modules, time_kernels
 from ..envs.engines.runtime import cores, device_names, free_memory
 from ..landscapes.capacity import Need, require
 from ..landscapes.cost import duration
@@ -25,12 +25,11 @@ from ..landscapes.objective import Evaluation, ObjectiveWrapper
 from ..landscapes.plane import Plane
 from ..landscapes.sampling.fill import sample
 from ..landscapes.storage.store import SliceStore
-from .kernel_times import WAYS, KernelTable, tabulate_kernels
-from .roofline import Roof, measure_roof
 from .scene import SceneSpec
 from .watch import Watch
 
 K = TypeVar("K")
+WAYS = {"forward": False, "with_gradient": True}
 LEAST = 2  # repetitions of everything, whatever they take
 ADAPTED = 256  # episodes that an engine's own program is timed for
 SMALL = 64  # points along each axis of the sampler's slice, at most
@@ -117,12 +116,30 @@ class AdapterShare:
 
 
 @dataclass(frozen=True)
+class KernelSeconds:
+    """Say how often a kernel was launched, the seconds it took altogether, and their share of the time that passed."""
+
+    name: str
+    calls: int
+    seconds: float
+    share: float
+
+
+@dataclass(frozen=True)
+class KernelTable:
+    """Hold the kernels of one batch, slowest first, which took so many `seconds` altogether."""
+
+    batch: int
+    seconds: float
+    kernels: tuple[KernelSeconds, ...]
+
+
+@dataclass(frozen=True)
 class Bench:
     """Hold what was measured of an environment; fields are called as `landscape bench --json` has them.
 
     `start` is by engine, `kernels` by way (forward, with_gradient), None of other engines than Warp. Ratios are of the
-    largest batch, None without another engine. `adapter` is None of engines whose programs are our own, `roof` where it
-    was not asked for.
+    largest batch, None without another engine. `adapter` is None of engines whose programs are our own.
     """
 
     env: str
@@ -142,7 +159,6 @@ class Bench:
     kernels: dict[str, KernelTable] | None
     sampler: SamplerShare
     adapter: AdapterShare | None = None
-    roof: Roof | None = None
 
     def record(self) -> dict[str, Any]:
         """Return it as plain JSON."""
@@ -154,7 +170,7 @@ class BenchJob:
     """An environment to measure on an engine, in turn with another one if `against` names it.
 
     `make` returns the environment for an engine. Each of `batches` (1 and the preferred one by default) is timed for
-    about so many `seconds`. With `roofline`, kernels are held against what the device can do at best.
+    about so many `seconds`.
     """
 
     make: Callable[[str], Environment]
@@ -162,7 +178,6 @@ class BenchJob:
     against: str | None = None
     batches: Sequence[int] = ()
     seconds: float = 10.0
-    roofline: bool = False
 
     @classmethod
     def of(cls, scene: SceneSpec, **how: Any) -> BenchJob:
@@ -181,7 +196,6 @@ class BenchJob:
         """
         watch = watch or Watch()
         with watch.busy("preparing") as say:
-            roof = self._measure_roof(say) if self.roofline else None
             envs, starts = _start_engines(self.make, self.engine, self.against, say)
             env = envs[self.engine]
             for batch in self.batches:
@@ -193,7 +207,7 @@ class BenchJob:
                 rates += _time_batch(envs, _points(env, batch), self.seconds)
             say("timing kernels")
             part, profiled = _points(env, env._rows_per_part(env.preferred_batch)), find_engine(self.engine).profiled
-            kernels = tabulate_kernels(env, part, roof) if profiled else None
+            kernels = tabulate_kernels(env, part) if profiled else None
             adapter = _time_adapter(env, self.seconds)
             say("timing the sampler")
             own = [rate.with_gradient.episodes_per_second for rate in rates if rate.engine == self.engine]
@@ -217,16 +231,7 @@ class BenchJob:
             kernels=kernels,
             sampler=sampler,
             adapter=adapter,
-            roof=roof,
         )
-
-    def _measure_roof(self, follow: Callable[[str], None]) -> Roof:
-        """Measure the device before an engine takes its memory."""
-        if not find_engine(self.engine).profiled:
-            raise ValueError(f"--roofline reads Warp's kernels, of which {self.engine} has none; name another engine")
-        env = self.make(self.engine)
-        follow(f"measuring what {env.device} does at best")
-        return measure_roof(env.device, env.fidelity.precision)
 
 
 def _need(env: Environment, batch: int) -> Need:
@@ -309,6 +314,24 @@ def alternate(calls: Mapping[K, Callable[[], object]], seconds: float) -> dict[K
             times[key].append(time.perf_counter() - began)
         rounds += 1
     return times
+
+
+def tabulate_kernels(env: Environment, points: Float[Tensor, "count dim"]) -> dict[str, KernelTable]:
+    """Return the time by kernel, forward and with gradient, of points that one solver takes at once.
+
+    They run on one thread: what several launch at a time adds up to more than the time that passes.
+    """
+    env._simulate(points, grad=True)
+    found = {}
+    for way, grad in WAYS.items():
+        with time_kernels(env.device) as times:
+            began = time.perf_counter()
+            env._simulate(points, grad=grad)
+            wall = time.perf_counter() - began
+        slowest = sorted(times.items(), key=lambda item: -item[1].seconds)
+        rows = [KernelSeconds(name, one.calls, one.seconds, one.seconds / wall) for name, one in slowest]
+        found[way] = KernelTable(len(points), wall, tuple(rows))
+    return found
 
 
 def _time_adapter(env: Environment, seconds: float) -> AdapterShare | None:

@@ -1,19 +1,18 @@
-"""Time Warp's kernels, and count what they have to do, each by its name."""
+"""Time Warp's kernels by their names."""
 
 from __future__ import annotations
 
 import re
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import warp as wp
 
-from .demand import Demand, demand
 from .launches import one_by_one
 
 
@@ -48,72 +47,31 @@ def time_kernels(device: str) -> Iterator[dict[str, KernelTime]]:
 
 
 @contextmanager
-def count_demands() -> Iterator[dict[str, Demand]]:
-    """Add up what every Warp kernel launched within a with block has to move and to calculate, by name."""
-    found: dict[str, Demand] = defaultdict(lambda: Demand(0, 0.0))
-
-    def count(launch: _Launch) -> AbstractContextManager[None]:
-        name, one = launch.name, launch.demand()
-        found[name] = Demand(found[name].bytes + one.bytes, found[name].flops + one.flops)
-        return nullcontext()
-
-    with one_by_one(), _around_launches(count):
-        yield found
-
-
-@dataclass(frozen=True)
-class _Launch:
-    """A launch under way: of a kernel or of its adjoint, with the arguments that `wp.Launch` keeps."""
-
-    kernel: Any
-    backward: bool
-    command: Callable[[], Any]
-
-    @property
-    def name(self) -> str:
-        return kernel_name(self.kernel.key, backward=self.backward)
-
-    def demand(self) -> Demand:
-        kept = self.command()
-        return demand(kept.kernel, kept.bounds.shape, kept.fwd_args, kept.adj_args or (), backward=self.backward)
-
-
-@contextmanager
-def _around_launches(around: Callable[[_Launch], AbstractContextManager[None]]) -> Iterator[None]:
-    """Enter a context around every launch within a with block, be it made anew or stored."""
+def _time_on_cpu(times: dict[str, KernelTime]) -> Iterator[None]:
+    """Time launches, both new ones and those that were stored."""
     launch, relaunch = wp.launch, wp.Launch.launch
 
-    def watch_launch(kernel: Any, *arguments: Any, **named: Any) -> Any:
+    @contextmanager
+    def clock(kernel: Any, *, backward: bool) -> Iterator[None]:
+        start = time.perf_counter()
+        yield
+        times[kernel_name(kernel.key, backward=backward)].add(time.perf_counter() - start)
+
+    def time_launch(kernel: Any, *arguments: Any, **named: Any) -> Any:
         if named.get("record_cmd"):
             return launch(kernel, *arguments, **named)
-
-        def record() -> Any:
-            return launch(kernel, *arguments, **{**named, "record_cmd": True, "record_tape": False})
-
-        with around(_Launch(kernel, named.get("adjoint", False), record)):
+        with clock(kernel, backward=named.get("adjoint", False)):
             return launch(kernel, *arguments, **named)
 
-    def watch_relaunch(command: Any, *arguments: Any) -> None:
-        with around(_Launch(command.kernel, command.adjoint, lambda: command)):
+    def time_relaunch(command: Any, *arguments: Any) -> None:
+        with clock(command.kernel, backward=command.adjoint):
             relaunch(command, *arguments)
 
-    wp.launch, wp.Launch.launch = watch_launch, watch_relaunch  # type: ignore[assignment, method-assign]
+    wp.launch, wp.Launch.launch = time_launch, time_relaunch  # type: ignore[assignment, method-assign]
     try:
         yield
     finally:
         wp.launch, wp.Launch.launch = launch, relaunch  # type: ignore[method-assign]
-
-
-@contextmanager
-def _time_on_cpu(times: dict[str, KernelTime]) -> Iterator[None]:
-    @contextmanager
-    def clock(launch: _Launch) -> Iterator[None]:
-        start = time.perf_counter()
-        yield
-        times[launch.name].add(time.perf_counter() - start)
-
-    with _around_launches(clock):
-        yield
 
 
 @contextmanager

@@ -1,6 +1,5 @@
 """What a benchmark says is what was measured: rates, ratios, kernels, the sampler's share."""
 
-import math
 from types import SimpleNamespace
 
 import pytest
@@ -14,7 +13,6 @@ from gradscape.envs.engines.profiling import KernelTime, time_kernels
 from gradscape.envs.engines.runtime import cuda_available
 from gradscape.envs.mpm.fluid import Fluid
 from gradscape.jobs.bench import BenchJob, alternate
-from gradscape.jobs.roofline import Roof, measure_roof
 from gradscape.jobs.watch import Watch
 from gradscape.landscapes.objective import Evaluation, Status
 from gradscape.landscapes.plane import Plane
@@ -150,7 +148,7 @@ def timed(request, monkeypatch):
     """Return kernels' times by the way of a ball's flight; on a CPU every look at the clock takes a second."""
     if request.param == "cpu":
         clock = Clock(tick=1.0)
-        for module in ("jobs.bench", "jobs.kernel_times", "envs.engines.profiling"):
+        for module in ("jobs.bench", "envs.engines.profiling"):
             monkeypatch.setattr(f"gradscape.{module}.time", clock)
         monkeypatch.setattr(Bounce, "threads", 1)  # a solver takes fewer rows than are worth evaluating at once
     job = BenchJob(lambda engine: Bounce(device=request.param, engine=engine), "warp", batches=[1], seconds=0.0)
@@ -227,31 +225,3 @@ def test_an_engine_that_is_not_there_is_refused_before_anything_runs(engine, aga
     with pytest.raises(ValueError, match=said):
         BenchJob(lambda name: Bounce(device="cpu", engine=name), engine, against=against).run(watch)
     assert heard == []
-
-
-def test_a_roofline_says_what_kernels_take_at_the_roof(monkeypatch):
-    roof = Roof(1e9, 2e9)
-    monkeypatch.setattr("gradscape.jobs.bench.measure_roof", lambda device, precision: roof)
-    job = BenchJob(
-        lambda engine: Fluid(fidelity="draft", device="cpu", horizon=0.02), "warp", None, [1], 0.0, roofline=True
-    )
-    record = job.run().record()
-    assert record["roof"] == {"bytes_per_second": 1e9, "flops_per_second": 2e9}
-    rows = [row for way in record["kernels"].values() for row in way["kernels"]]
-    assert {"transfers_in_rows.p2g", "transfers_in_rows.adjoint_p2g"} <= {row["name"] for row in rows}
-    for row in rows:
-        assert row["bytes"] > 0
-        assert row["of_roof"] == pytest.approx(max(row["bytes"] / 1e9, row["flops"] / 2e9) / row["seconds"])
-
-
-def test_a_roofline_is_refused_of_an_engine_without_kernels_of_ours():
-    with pytest.raises(ValueError, match="--roofline reads Warp's kernels, of which taichi has none"):
-        BenchJob(lambda engine: Sleeper(engine=engine), "taichi", roofline=True).run()
-
-
-def test_a_roof_is_what_a_device_does():
-    """A core of any machine moves a byte in a microsecond, and multiplies two numbers in one."""
-    roof = measure_roof("cpu", "float32")
-    assert 1e6 < roof.bytes_per_second < math.inf
-    assert 1e6 < roof.flops_per_second < math.inf
-    assert roof.seconds(10, 0.0) == pytest.approx(10 / roof.bytes_per_second)
