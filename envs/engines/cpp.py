@@ -5,9 +5,9 @@ module by: one that changes is compiled again.
 """
 
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from functools import cache
-from inspect import signature
+from inspect import Parameter, Signature, signature
 from pathlib import Path
 from typing import Any
 
@@ -70,3 +70,57 @@ def func_native(
         return wp.func_native(code, adj_snippet=back, replay_snippet=None if replay else "")(function)
 
     return declare
+
+
+def kernel_in_rows(name: str, *, called: str | None = None, constants: Iterable[object] = ()) -> Callable[[Any], Any]:
+    """Declare a kernel for a CPU, each of whose threads has the row of an environment, by a function without a body.
+
+    The function of the headers, `called` as this one is unless another name is given, takes the environment's number,
+    the kernel's arguments, and `constants`. `name` is that of the kernel's module.
+    """
+
+    def declare(function: Any) -> Any:
+        kinds = dict(function.__annotations__)
+        known = {"e": int} | {_adjoint_last(one): kind for one, kind in kinds.items()}
+
+        def row() -> None: ...
+
+        def kernel() -> Any:
+            return row  # which Warp finds here by its name
+
+        code = call(called or function.__name__, [*known, *map(str, constants)])
+        row = wp.func_native(code)(with_arguments(row, known))
+        given = ", ".join(kinds)
+        made = wp.Kernel(
+            with_arguments(kernel, kinds),
+            key=re.sub("[^0-9a-zA-Z_]", "", function.__qualname__.replace(".", "__")),
+            module=wp.get_module(module(name)),
+            options={"enable_backward": False},
+            source=f"def kernel({given}):\n    e, _ = wp.tid()\n    row(e, {given})\n",
+        )
+        return take_rows(made)
+
+    return declare
+
+
+def _adjoint_last(name: str) -> str:
+    """Return what Warp lets an argument be called: `adj_x` is the name of another one's adjoint."""
+    return f"{name.removeprefix('adj_')}_adjoint" if name.startswith("adj_") else name
+
+
+def with_arguments(function: Any, kinds: Mapping[str, Any]) -> Any:
+    """Return a function that says of itself that it takes arguments of these names and kinds, as Warp asks it."""
+    parameters = [Parameter(name, Parameter.POSITIONAL_OR_KEYWORD, annotation=kind) for name, kind in kinds.items()]
+    function.__signature__, function.__annotations__ = Signature(parameters), dict(kinds)
+    return function
+
+
+def take_rows(kernel: Any) -> Any:
+    """Note that a thread of a kernel has the row of an environment."""
+    kernel.has_rows = True
+    return kernel
+
+
+def threads(kernel: Any, elements: int) -> int:
+    """Return how many threads of a kernel an environment takes that has so many elements: one where it has rows."""
+    return 1 if getattr(kernel, "has_rows", False) else elements

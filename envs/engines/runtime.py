@@ -58,24 +58,6 @@ def precision(name: str) -> Precision:
     return Precision(name, real, vector(3, real), vector(4, real), matrix((3, 3), real), dtype)
 
 
-def take_rows(kernel: Any, plain: Any, elements: str) -> None:
-    """Note that a thread of a kernel has the row of an environment, for each element of which `plain` has a thread.
-
-    `elements` names an argument that has as many elements: an array, or a lattice of nodes.
-    """
-    kernel.plain, kernel.elements = plain, elements
-
-
-def has_rows(kernel: Any) -> bool:
-    """Say whether a thread of a kernel has the row of an environment."""
-    return hasattr(kernel, "plain")
-
-
-def threads(kernel: Any, elements: int) -> int:
-    """Return how many threads of a kernel an environment takes that has so many elements: one where it has rows."""
-    return 1 if has_rows(kernel) else elements
-
-
 def cuda_available() -> bool:
     """Say whether Warp can drive a CUDA device here."""
     return bool(wp.is_cuda_available())

@@ -19,7 +19,9 @@ from .sdf import bowl, rod
 
 
 class Boundary(Protocol):
-    """What a solver asks of a boundary."""
+    """What a solver asks of a boundary; `walls` are what the headers call them."""
+
+    walls: ClassVar[str]
 
     @property
     def slots(self) -> int:
@@ -37,6 +39,7 @@ class Open:
     """No boundary at all."""
 
     slots: ClassVar[int] = 1
+    walls: ClassVar[str] = "OpenWalls"
 
     def function(self, name: str) -> tuple[Any, Any]:
         """Return the boundary's Warp function and its struct."""
@@ -67,6 +70,7 @@ class LadleInTank:
     friction: float
     slip: float = 1.0
     slots: ClassVar[int] = 1
+    walls: ClassVar[str] = "TankWalls"
 
     def function(self, name: str) -> tuple[Any, Any]:
         """Return the boundary's Warp function and its struct."""

@@ -15,7 +15,6 @@ import warp as wp
 
 from .. import cpp
 from ..launches import blocks
-from ..rows import with_arguments
 from ..runtime import precision
 from .cells import SEGMENT, most_walks
 from .layout import layout
@@ -107,7 +106,7 @@ def walking_kernel(key: str, name: str, team: Team, given: Any, *, sloping: bool
     kinds |= {"walks": wp.array2d[wp.vec4i]} | own | {"parts": wp.array2d[vec4]}
     bounds = {"grid_stride": False} | ({"launch_bounds": blocks(name)} if blocks(name) else {})
     return wp.Kernel(
-        with_arguments(kernel, kinds),
+        cpp.with_arguments(kernel, kinds),
         key=key.replace(".", "__locals__"),
         module=wp.get_module(cpp.module(given.module.name)),
         options={"enable_backward": False} | bounds,

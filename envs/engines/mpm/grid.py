@@ -8,11 +8,20 @@ import warp as wp
 from .. import cpp
 from ..launches import blocks
 from ..runtime import precision
+from .boundaries import Boundary
 from .cells import SEGMENT
 from .exact import LANES
 from .nodes import node_taker
 from .stencil import lattice
 from .walk import PARTS
+
+
+def velocity_on(name: str, boundary: Boundary, *, columns: bool) -> Any:
+    """Return the kernel of a node's velocity in one precision: by `columns` for a GPU, in rows for a CPU."""
+    function, Data = boundary.function(name)
+    if columns:
+        return velocity_of_columns(name, function, Data)
+    return velocity_in_rows(name, function, Data, boundary.walls)
 
 
 @cache
@@ -51,18 +60,51 @@ def velocity_at(name: str, boundary_velocity: Any, Data: Any) -> Any:
 
 @cache
 @no_type_check
-def velocity_kernel(name: str, boundary_velocity: Any, Data: Any) -> Any:
-    """Return the kernel that turns a node's momentum into its velocity after gravity and boundary."""
+def velocity_in_rows(name: str, boundary_velocity: Any, Data: Any, walls: str) -> Any:
+    """Return the kernel that turns nodes' momenta into their velocities after gravity and boundary, for a CPU.
+
+    What `walls` do is a few comparisons, four numbers at a time, in C++ (`native/grid.h`). The nodes that a tool may
+    reach are listed, and left to the boundary's Warp function and the adjoint that Warp makes of it. The list has room
+    for one number more than there are nodes.
+    """
     types = precision(name)
     real, vec3, vec4 = types.real, types.vec3, types.vec4
-    Lattice, velocity_at_node = lattice(name), velocity_at(name, boundary_velocity, Data)
+    Lattice, template = lattice(name), [f"gradscape::{walls}"]
 
-    # A node is read once, so that its adjoint can be set, where Warp would add to it atomically; and it is set once.
-    @cpp.func_native(called="read_node", adjoint="set_adj_read_node")
-    def read(grid: wp.array2d[vec4], e: int, i: int) -> vec4: ...
+    @cpp.func_native(called="place_of_node", template=[f"wp::{name}"], adjoint="")
+    def place(lattice: Lattice, i: int) -> vec3: ...
 
-    @cpp.func_native(called="write_node", adjoint="set_adj_write_node", replay=False)
-    def write(grid: wp.array2d[vec4], e: int, i: int, value: vec4): ...
+    @cpp.func_native(adjoint="adj_free_velocity")
+    def free_velocity(dt: real, gravity: real, grid_m: wp.array2d[vec4], e: int, i: int) -> vec3: ...
+
+    @cpp.func_native(template=template, adjoint="")
+    def list_near(
+        e: int,
+        lattice: Lattice,
+        data: Data,
+        empty: real,
+        step: int,
+        fraction: real,
+        tools: wp.array3d[vec3],
+        grid_m: wp.array2d[vec4],
+        near: wp.array2d[int],
+    ): ...
+
+    @cpp.func_native(template=template, adjoint="adj_velocity_of_others", replay=False)
+    def velocity_of_others(
+        e: int,
+        lattice: Lattice,
+        data: Data,
+        dt: real,
+        gravity: real,
+        empty: real,
+        step: int,
+        fraction: real,
+        tools: wp.array3d[vec3],
+        grid_m: wp.array2d[vec4],
+        near: wp.array2d[int],
+        grid_v: wp.array2d[vec4],
+    ): ...
 
     @wp.kernel(module="unique", module_options=cpp.options())
     def velocity(
@@ -78,22 +120,25 @@ def velocity_kernel(name: str, boundary_velocity: Any, Data: Any) -> Any:
         sums: wp.array2d[wp.int64],
         grid_m: wp.array2d[vec4],
         grid_v: wp.array2d[vec4],
+        near: wp.array2d[int],
     ):
-        e, i = wp.tid()
-        g = read(grid_m, e, i)
-        if g[3] > empty:
-            v = velocity_at_node(lattice, boundary, dt, gravity, g, e, i, tools, sums, step, fraction, rate)
-            write(grid_v, e, i, vec4(v[0], v[1], v[2], real(0.0)))
-        else:
-            write(grid_v, e, i, vec4())
+        e, _ = wp.tid()
+        list_near(e, lattice, boundary, empty, step, fraction, tools, grid_m, near)
+        velocity_of_others(e, lattice, boundary, dt, gravity, empty, step, fraction, tools, grid_m, near, grid_v)
+        count = near[e, 0]
+        for n in range(count):
+            i = near[e, count - n]  # the last comes first, so that adjoints come in the nodes' order
+            v = free_velocity(dt, gravity, grid_m, e, i)
+            v = boundary_velocity(boundary, place(lattice, i), v, e, i % LANES, tools, sums, step, fraction, rate)
+            grid_v[e, i] = vec4(v[0], v[1], v[2], real(0.0))
 
-    return velocity
+    return cpp.take_rows(velocity)
 
 
 @cache
 @no_type_check
 def velocity_of_columns(name: str, boundary_velocity: Any, Data: Any) -> Any:
-    """Return the same kernel, for sums by `columns`: it adds up a node's momentum, its adjoint that of the velocity.
+    """Return the same kernel for a GPU, which adds up a node's momentum, and its adjoint that of the velocity.
 
     It runs over [environment, place in the grid].
     """

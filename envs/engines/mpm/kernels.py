@@ -12,13 +12,11 @@ from .cells import cell_kernels
 from .columns import GPU_TEAM, column_kernels
 from .exact import settle_kernel
 from .extent import extent_kernels
-from .grid_cpu import velocity_on
+from .grid import velocity_on
 from .model import Model
 from .order import sorting_kernels
-from .smoothing_columns import smoothing_columns
-from .smoothing_cpu import smoothing_on_cpu
-from .transfers_columns import transfers_of_columns
-from .transfers_cpu import transfers_on_cpu
+from .smoothing import smoothing_columns, smoothing_kernels
+from .transfers import transfers, transfers_of_columns
 
 
 def compile_all(model: Model, device: str) -> None:
@@ -30,9 +28,9 @@ def kernels(model: Model, device: str) -> Iterator[Any]:
     """Yield a kernel or more of each module, those first that take longest to compile."""
     name = model.precision
     yield from (_of_cpu if device == "cpu" else _of_gpu)(name, any(body.material.smoothing for body in model.groups))
-    yield velocity_on(device, name, model.boundary, columns=device != "cpu")
+    yield velocity_on(name, model.boundary, columns=device != "cpu")
     for body in model.groups:
-        yield from body.material.kernels(name, rows=device == "cpu", columns=device != "cpu")
+        yield from body.material.kernels(name, columns=device != "cpu")
     yield extent_kernels(name).look
     sorting = sorting_kernels(name, wp.int32)  # with which all but huge batches are sorted
     yield sorting.label
@@ -41,10 +39,9 @@ def kernels(model: Model, device: str) -> Iterator[Any]:
 
 
 def _of_cpu(name: str, smooth: bool) -> Iterator[Any]:
-    yield transfers_on_cpu(name).p2g
+    yield transfers(name).p2g
     if smooth:
-        yield smoothing_on_cpu(name).spread
-        yield smoothing_on_cpu(name).clear  # of another module where the others take rows
+        yield smoothing_kernels(name).spread
 
 
 def _of_gpu(name: str, smooth: bool) -> Iterator[Any]:

@@ -8,11 +8,10 @@ import torch
 import warp as wp
 
 from .. import cpp
-from ..runtime import load, precision, threads, to_torch
+from ..runtime import load, precision, to_torch
 from .model import Model, place_grid
 from .stencil import lattice, stencil
-from .transfers_columns import transfers_of_columns
-from .transfers_cpu import transfers_on_cpu
+from .transfers import transfers, transfers_of_columns
 
 WHOLE = 2.0**60  # units of the mass of all particles
 
@@ -62,7 +61,7 @@ class Raster:
     ) -> None:
         name, types = model.precision, precision(model.precision)
         self.counting = device != "cpu" if counting is None else counting
-        self.kernels = (transfers_of_columns if self.counting else transfers_on_cpu)(name)
+        self.kernels = (transfers_of_columns if self.counting else transfers)(name)
         self.count = count_kernel(name)
         self.lattice, self.device = place_grid(model), device
         load([self.kernels.adjoint_p2g, *([self.count] if self.counting else [])], device)
@@ -114,7 +113,7 @@ class Raster:
     def _launch(self, kernel: Any, x: torch.Tensor, adjoints: list[Any]) -> None:
         self._place(x)
         inputs = [self.lattice, *self.starts, self.mass, *self.particles, self.grid, *adjoints]
-        dim = len(x), threads(kernel, self.mass.shape[1])
+        dim = len(x), cpp.threads(kernel, self.mass.shape[1])
         wp.launch(kernel, dim, inputs, device=self.device, record_tape=False)
 
 

@@ -24,21 +24,21 @@ import numpy as np
 import torch
 import warp as wp
 
+from ..cpp import threads
 from ..launches import Launches
-from ..runtime import free_memory, has_rows, load, threads, to_torch
+from ..runtime import free_memory, load, to_torch
 from .adjoint import Adjoint
 from .cells import segments
 from .checkpoints import Allocator, Frame, Room, Tape
 from .extent import Extent
-from .grid_cpu import velocity_on
+from .grid import velocity_on
 from .kernels import compile_all as compile_all
 from .layout import to_rows
 from .model import BOX_MARGIN, EMPTY, Box, Model, nodes_around
 from .order import Order, Sorter
 from .scatter import ByColumns, InPlace, Scatter, nodes
 from .smoothing import ColumnSmoother, Smoother
-from .transfers_columns import transfers_of_columns
-from .transfers_cpu import transfers_on_cpu
+from .transfers import transfers, transfers_of_columns
 
 CROWD = 8_000  # particles that hide what a launch costs on one core
 BUSY, FULL_CARD = 400_000, 1_750_000  # particles that keep a GPU busy; more than which gain nothing
@@ -100,13 +100,10 @@ class Solver:
         self.columns = columns = device != "cpu" if columns is None else columns
         self.allocator = Allocator(model, capacity, device, columns=columns)
         self.types = self.allocator.types
-        self.kernels = (transfers_of_columns if columns else transfers_on_cpu)(model.precision)
-        self.velocity = velocity_on(device, model.precision, model.boundary, columns=columns)
+        self.kernels = (transfers_of_columns if columns else transfers)(model.precision)
+        self.velocity = velocity_on(model.precision, model.boundary, columns=columns)
         self.boundary = model.boundary.data(model.precision, device)
-        self.materials = [
-            group.material.kernels(model.precision, rows=device == "cpu" and not columns, columns=columns)
-            for group in model.groups
-        ]
+        self.materials = [group.material.kernels(model.precision, columns=columns) for group in model.groups]
         load([*vars(self.kernels).values(), self.velocity, *chain.from_iterable(self.materials)], device)
         self.first = np.concatenate([[0], np.cumsum([len(group.x) for group in model.groups])]).tolist()
         self.empty = EMPTY * float(model.mass.min())
@@ -128,7 +125,7 @@ class Solver:
         self.spare_used = device == "cpu"  # whether spare memory has been put to use
         self.tools = self.allocator.paths()
         self.sums = self.allocator.sums()
-        self.listed = [self.allocator.array(wp.int32, model.cells + 1)] if has_rows(self.velocity) else []
+        self.listed = [] if columns else [self.allocator.array(wp.int32, model.cells + 1)]
         self.left_box, self.needed, self.escaped = (wp.zeros(capacity, dtype=wp.int32, device=device) for _ in range(3))
         self.adjoint: Adjoint | None = None
         self._start()

@@ -19,7 +19,7 @@ import math
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import cache, partial
-from typing import Any, no_type_check
+from typing import Any, ClassVar, no_type_check
 
 import numpy as np
 import warp as wp
@@ -78,6 +78,7 @@ class ToolsInRoom:
     friction: float
     softness: float
     dt: float = UPSTREAM_DT
+    walls: ClassVar[str] = f"Room<{STICKY:.0f}>::Walls"
 
     @property
     def slots(self) -> int:

@@ -5,8 +5,9 @@ import torch
 import warp as wp
 
 from gradscape.envs.engines import cpp
+from gradscape.envs.engines.mpm.materials.adjoints import alone
 from gradscape.envs.engines.mpm.stencil import lattice
-from gradscape.envs.engines.runtime import has_rows, precision, threads, to_torch
+from gradscape.envs.engines.runtime import precision, to_torch
 
 SCALE, MASS, VOLUME, DT = -0.7, 0.2, 0.3, 1e-3
 NAMES = ["float32", "float64"]
@@ -71,7 +72,7 @@ class MaterialBench:
         results = [self._array(torch.zeros_like(like)) for like in wanted]
         inputs = [0, dt, SCALE, *self.material.constants(), *each, *map(self._array, given), *results]
         kernel = self.kernels[which]
-        wp.launch(kernel, (1, threads(kernel, count)), inputs, record_tape=False)
+        wp.launch(kernel, (1, cpp.threads(kernel, count)), inputs, record_tape=False)
         return tuple(to_torch(array)[0].double().clone() for array in results)
 
     def _array(self, values):
@@ -79,18 +80,22 @@ class MaterialBench:
         return wp.array(values.to(self.types.torch)[None].contiguous().numpy(), dtype=kind, copy=True)
 
 
-def assert_rows_have_the_same_bits(material, state, C, adj_new, adj_A):
-    """Hold a material's kernels whose threads have rows, which there are in float32 only, against its plain ones."""
-    one, rows = MaterialBench(material, "float32"), MaterialBench(material, "float32")
-    rows.kernels = material.kernels("float32", rows=True)
-    assert all(map(has_rows, rows.kernels))
+def in_warp(material, kernels, name):
+    """Return a bench of a material's functions for a GPU, one particle at a time."""
+    bench, found = MaterialBench(material, name), kernels(name)
+    bench.kernels = found.update, alone(name, found)
+    return bench
+
+
+def assert_rows_have_the_same_bits(material, kernels, state, C, adj_new, adj_A):
+    """Hold a material's kernels in C++ against its `kernels` in Warp."""
+    one, rows = in_warp(material, kernels, "float32"), MaterialBench(material, "float32")
     for wanted, found in (
         *zip(one.update(state, C), rows.update(state, C), strict=True),
         *zip(one.adjoint(state, C, adj_new, adj_A), rows.adjoint(state, C, adj_new, adj_A), strict=True),
     ):
         assert wanted.isfinite().all()
         assert (wanted == found).all()
-    assert not any(map(has_rows, material.kernels("float64", rows=True)))
 
 
 def placed(name, origin, dx, nodes, first=(0, 0, 0)):

@@ -9,22 +9,22 @@ import warp as wp
 
 from gradscape.envs.engines import cpp
 from gradscape.envs.engines.mpm.boundaries import LadleInTank
-from gradscape.envs.engines.mpm.grid_cpu import velocity_on
+from gradscape.envs.engines.mpm.grid import velocity_on
 from gradscape.envs.engines.mpm.materials import Fluid, Plasticine
-from gradscape.envs.engines.mpm.smoothing_cpu import smoothing_on_cpu
+from gradscape.envs.engines.mpm.smoothing import smoothing_kernels
 from gradscape.envs.engines.mpm.tools import Kind, Tool, ToolsInRoom
-from gradscape.envs.engines.mpm.transfers_cpu import transfers_on_cpu
+from gradscape.envs.engines.mpm.transfers import transfers
 
 CLANGS = "EightInts"  # a header with these vectors only clang compiles, and so Warp
 HEADERS = sorted(path.name for path in cpp.HEADERS.glob("*.h") if CLANGS not in cpp.whole_text(path.name))
 STRICT = '#pragma clang diagnostic error "-Wall"\n#pragma clang diagnostic error "-Wextra"\n'
 IN_ROWS = {
-    "transfers": lambda: transfers_on_cpu("float32").p2g,
-    "smoothing": lambda: smoothing_on_cpu("float32").spread,
-    "fluid": lambda: Fluid(1.0, 1.0, 1.0).kernels("float32", rows=True)[0],
-    "plasticine": lambda: Plasticine(1.0, 1.0, 0.3, 1.0).kernels("float32", rows=True)[0],
-    "tank": lambda: velocity_on("cpu", "float32", LadleInTank(*[0.1] * 7), columns=False),
-    "room": lambda: velocity_on("cpu", "float32", ROOM, columns=False),
+    "transfers": lambda: transfers("float32").p2g,
+    "smoothing": lambda: smoothing_kernels("float32").spread,
+    "fluid": lambda: Fluid(1.0, 1.0, 1.0).kernels("float32")[0],
+    "plasticine": lambda: Plasticine(1.0, 1.0, 0.3, 1.0).kernels("float32")[0],
+    "tank": lambda: velocity_on("float32", LadleInTank(*[0.1] * 7), columns=False),
+    "room": lambda: velocity_on("float32", ROOM, columns=False),
 }
 ROOM = ToolsInRoom((Tool(Kind.SPHERE, (0.1,), 0.1),), (0.0,) * 3, (1.0,) * 3, 0.0, 0.1, 1.0)
 

@@ -16,8 +16,8 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ...runtime import precision
-from . import elastic, fluid, fluid_cpu, plasticine, plasticine_cpu, plasticine_series
-from .adjoints import MaterialKernels, after_p2g
+from . import elastic, fluid, plasticine, plasticine_series
+from .adjoints import after_p2g, alone
 
 
 @dataclass(frozen=True)
@@ -39,11 +39,12 @@ class Fluid:
         """Return J at which the fluid bears `pressure` [Pa], counted on its reference volume."""
         return np.asarray(np.exp(-pressure / self.bulk))  # K log J = -pressure
 
-    def kernels(self, name: str, *, rows: bool = False, columns: bool = False) -> tuple[Any, Any]:
-        """Return (update, adjoint) for one precision: those whose threads have `rows`, in float32, or for `columns`."""
-        if rows and name == "float32":
-            return fluid_cpu.kernels_in_rows()
-        return _choose(name, fluid.kernels(name), columns=columns, blocks=5)
+    def kernels(self, name: str, *, columns: bool = False) -> tuple[Any, Any]:
+        """Return (update, adjoint) of one precision for a CPU, or for `columns`."""
+        if not columns:
+            return fluid.kernels_in_rows(name)
+        found = fluid.kernels(name)
+        return found.update, after_p2g(name, found, 5)
 
     def constants(self) -> tuple[float, ...]:
         """Return what the kernels take besides state and motion."""
@@ -100,9 +101,10 @@ class Elastic(_Solid):
         modulus = density * speed**2  # lam + 2 mu
         return cls(density, modulus * (1.0 + poisson) * (1.0 - 2.0 * poisson) / (1.0 - poisson), poisson)
 
-    def kernels(self, name: str, *, rows: bool = False, columns: bool = False) -> tuple[Any, Any]:
-        """Return (update, adjoint) for one precision, or for `columns`; there are none whose threads have rows."""
-        return _choose(name, elastic.kernels(name), columns=columns)
+    def kernels(self, name: str, *, columns: bool = False) -> tuple[Any, Any]:
+        """Return (update, adjoint) of one precision for a CPU, or for `columns`."""
+        found = elastic.kernels(name)
+        return found.update, after_p2g(name, found, 4) if columns else alone(name, found)
 
     def constants(self) -> tuple[float, ...]:
         """Return what the kernels take besides state and motion."""
@@ -115,12 +117,12 @@ class Plasticine(_Solid):
 
     yield_stress: float
 
-    def kernels(self, name: str, *, rows: bool = False, columns: bool = False) -> tuple[Any, Any]:
-        """Return (update, adjoint) for one precision: those whose threads have `rows`, in float32, or for `columns`."""
-        if rows and name == "float32":
-            return plasticine_cpu.kernels_in_rows()
-        found = plasticine_series if columns and name == "float32" else plasticine
-        return _choose(name, found.kernels(name), columns=columns)
+    def kernels(self, name: str, *, columns: bool = False) -> tuple[Any, Any]:
+        """Return (update, adjoint) of one precision for a CPU, or for `columns`."""
+        if not columns:
+            return plasticine.kernels_in_rows(name)
+        found = (plasticine_series if name == "float32" else plasticine).kernels(name)
+        return found.update, after_p2g(name, found, 4)
 
     def constants(self) -> tuple[float, ...]:
         """Return what the kernels take besides state and motion; the last is the largest deviatoric log strain."""
@@ -128,7 +130,3 @@ class Plasticine(_Solid):
 
 
 Material = Fluid | Elastic | Plasticine
-
-
-def _choose(name: str, found: MaterialKernels, *, columns: bool, blocks: int = 4) -> tuple[Any, Any]:
-    return found.update, after_p2g(name, found, blocks) if columns else found.adjoint

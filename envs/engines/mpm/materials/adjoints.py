@@ -14,29 +14,28 @@ import warp as wp
 
 from ... import cpp
 from ...launches import blocks
-from ...rows import with_arguments
 from ...runtime import precision
 from ..gathers import adjoint_gatherers
 from ..layout import layout
 
 
 class MaterialKernels(NamedTuple):
-    """What a material does: the kernels `update, adjoint`, and functions of which a GPU makes one kernel.
+    """What a material does: the kernel `update`, and functions of which the adjoint's kernel is made.
 
     `turn_back` makes of a particle's adjoint of A those of its state and C; `affine_momentum` computes A again;
     `strain` is what these two would both compute, if that is slow.
     """
 
     update: Any
-    adjoint: Any
     turn_back: Any
     affine_momentum: Any
     strain: Any | None = None
 
 
 @cache
-def alone(name: str, turn_back: Any, strain: Any | None = None) -> Any:
+def alone(name: str, material: MaterialKernels) -> Any:
     """Return the kernel that reads `adj_A`."""
+    turn_back, strain = material.turn_back, material.strain
     read_matrix, mat33 = layout(name).read_matrix, precision(name).mat33
     kinds = {"adj_A" if key == "adj_a" else key: kind for key, kind in _taken(turn_back).items()}
     kinds["adj_A"] = wp.array2d[mat33]
@@ -104,7 +103,7 @@ def _kernel(
 ) -> Any:
     """Return the kernel of these lines, beside `turn_back`; the function holds what Warp finds by its name."""
     return wp.Kernel(
-        with_arguments(function, kinds),
+        cpp.with_arguments(function, kinds),
         key=f"kernels__locals__adjoint{called}",
         module=wp.get_module(cpp.module(f"{turn_back.module.name}{module}")),
         options={"enable_backward": False} | options,

@@ -8,7 +8,7 @@ import warp as wp
 from ... import cpp
 from ...runtime import precision
 from ..layout import layout
-from .adjoints import MaterialKernels, alone
+from .adjoints import MaterialKernels
 
 
 @cache
@@ -97,4 +97,4 @@ def kernels(name: str) -> MaterialKernels:
         write_matrix(adj_F, e, p, wp.transpose(advance) * adj_f)
         write_matrix(adj_C, e, first + p, mass[e, first + p] * adj_a + dt * adj_f * wp.transpose(before))
 
-    return MaterialKernels(update, alone(name, turn_back), turn_back, affine_momentum)
+    return MaterialKernels(update, turn_back, affine_momentum)

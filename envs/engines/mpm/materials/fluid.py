@@ -1,14 +1,14 @@
 """Kernels of a viscous, weakly compressible fluid, which carries its volume ratio J."""
 
 from functools import cache
-from typing import no_type_check
+from typing import Any, no_type_check
 
 import warp as wp
 
 from ... import cpp
 from ...runtime import precision
 from ..layout import layout
-from .adjoints import MaterialKernels, alone
+from .adjoints import MaterialKernels
 
 TORN = 1.04  # volume ratio at which a fluid tears
 
@@ -16,7 +16,7 @@ TORN = 1.04  # volume ratio at which a fluid tears
 @cache
 @no_type_check
 def kernels(name: str) -> MaterialKernels:
-    """Return the kernels.
+    """Return the kernels of a GPU.
 
     J' = min(exp(dt tr C) J, TORN), tau = K log J' I + J' mu (C + C^T - 2/3 tr C I).
     """
@@ -100,4 +100,47 @@ def kernels(name: str) -> MaterialKernels:
         dilation = dt * j * adj_j * wp.identity(n=3, dtype=real)
         write_matrix(adj_C, e, first + p, mass[e, first + p] * adj_a + j * viscosity * shear(g) + dilation)
 
-    return MaterialKernels(update, alone(name, turn_back), turn_back, affine_momentum)
+    return MaterialKernels(update, turn_back, affine_momentum)
+
+
+@cache
+@no_type_check
+def kernels_in_rows(name: str) -> tuple[Any, Any]:
+    """Return (update, adjoint) of one precision for a CPU, in C++: eight particles at a time (`native/materials.h`)."""
+    types = precision(name)
+    real, mat33 = types.real, types.mat33
+    module = f"gradscape.fluid.{name}.rows"
+
+    @cpp.kernel_in_rows(module, called="fluid_update", constants=[TORN])
+    def update(
+        first: int,
+        dt: real,
+        scale: real,
+        bulk: real,
+        viscosity: real,
+        mass: wp.array2d[real],
+        volume: wp.array2d[real],
+        J: wp.array2d[real],
+        C: wp.array2d[mat33],
+        J_new: wp.array2d[real],
+        A: wp.array2d[mat33],
+    ): ...
+
+    @cpp.kernel_in_rows(module, called="fluid_adjoint", constants=[TORN])
+    def adjoint(
+        first: int,
+        dt: real,
+        scale: real,
+        bulk: real,
+        viscosity: real,
+        mass: wp.array2d[real],
+        volume: wp.array2d[real],
+        J: wp.array2d[real],
+        C: wp.array2d[mat33],
+        adj_J_new: wp.array2d[real],
+        adj_A: wp.array2d[mat33],
+        adj_J: wp.array2d[real],
+        adj_C: wp.array2d[mat33],
+    ): ...
+
+    return update, adjoint

@@ -20,8 +20,8 @@ import warp as wp
 from ... import cpp
 from ...runtime import precision
 from ..layout import layout
-from .adjoints import MaterialKernels, alone
-from .decomposition import svd
+from .adjoints import MaterialKernels
+from .decomposition import ROUND_OFF, SWEEPS, TINY, svd
 
 SMALLEST = 0.05  # singular values below count as this; what is pressed flatter has lost its shape
 ROUNDED = 1e-8  # added to |d|^2, so that an undeformed body has a gradient
@@ -173,7 +173,7 @@ def responses(name: str) -> SimpleNamespace:
 
 @cache
 def kernels(name: str) -> MaterialKernels:
-    """Return the kernels."""
+    """Return the kernels of a GPU."""
     found: MaterialKernels = kernels_of(name, responses(name), cpp.module(f"gradscape.plasticine.{name}"))
     return found
 
@@ -261,4 +261,49 @@ def kernels_of(name: str, found: Any, module: str) -> MaterialKernels:
         adj_c = mass[n, first + p] * adj_a + dt * adj_trial * wp.transpose(before)
         write_matrix(adj_C, n, first + p, adj_c)
 
-    return MaterialKernels(update, alone(name, turn_back, strain), turn_back, affine_momentum, strain)
+    return MaterialKernels(update, turn_back, affine_momentum, strain)
+
+
+@cache
+@no_type_check
+def kernels_in_rows(name: str) -> tuple[Any, Any]:
+    """Return (update, adjoint) of one precision for a CPU, in C++: eight particles at a time (`native/materials.h`)."""
+    types = precision(name)
+    real, mat33 = types.real, types.mat33
+    module, constants = f"gradscape.plasticine.{name}.rows", [SMALLEST, ROUNDED, ROUND_OFF[name], TINY, SWEEPS]
+
+    @cpp.kernel_in_rows(module, called="plasticine_update", constants=constants)
+    def update(
+        first: int,
+        dt: real,
+        scale: real,
+        mu: real,
+        lam: real,
+        kappa: real,
+        mass: wp.array2d[real],
+        volume: wp.array2d[real],
+        F: wp.array2d[mat33],
+        C: wp.array2d[mat33],
+        F_new: wp.array2d[mat33],
+        A: wp.array2d[mat33],
+    ): ...
+
+    @cpp.kernel_in_rows(module, called="plasticine_adjoint", constants=constants)
+    def adjoint(
+        first: int,
+        dt: real,
+        scale: real,
+        mu: real,
+        lam: real,
+        kappa: real,
+        mass: wp.array2d[real],
+        volume: wp.array2d[real],
+        F: wp.array2d[mat33],
+        C: wp.array2d[mat33],
+        adj_F_new: wp.array2d[mat33],
+        adj_A: wp.array2d[mat33],
+        adj_F: wp.array2d[mat33],
+        adj_C: wp.array2d[mat33],
+    ): ...
+
+    return update, adjoint

@@ -9,9 +9,9 @@ import warp as wp
 from gradscape.envs.engines.mpm.boundaries import Open
 from gradscape.envs.engines.mpm.cells import SEGMENT, STRETCH, segments
 from gradscape.envs.engines.mpm.columns import GPU_TEAM, column_kernels
-from gradscape.envs.engines.mpm.grid_cpu import velocity_on
+from gradscape.envs.engines.mpm.grid import velocity_on
 from gradscape.envs.engines.mpm.model import Box, place_grid
-from gradscape.envs.engines.mpm.smoothing_columns import smoothing_columns
+from gradscape.envs.engines.mpm.smoothing import smoothing_columns
 from gradscape.envs.engines.mpm.transfers import transfers
 from gradscape.envs.engines.mpm.walk import PARTS
 from gradscape.envs.engines.runtime import to_torch
@@ -49,7 +49,7 @@ class Scattering:
         numbers = [0.0, 0.0, -1.0, 0, 0.0, 0.0]  # no gravity, and no node is empty
         tools, sums = wp.zeros((ROWS, 1, 1), dtype=wp.vec3), wp.zeros((1, 1), dtype=wp.int64)
         given = [self.lattice, Open().data("float32", "cpu"), *numbers, tools, sums, momentum, velocity]
-        kernel = velocity_on("cuda", "float32", Open(), columns=True)
+        kernel = velocity_on("float32", Open(), columns=True)
         emulate(kernel, (ROWS, self.box.cells), [*given, lists.planes, lists.touched, lists.nodes, parts])
         found = torch.zeros(ROWS, self.box.cells, 4)
         for row, (count, _) in enumerate(to_torch(lists.touched).tolist()):
@@ -60,7 +60,7 @@ class Scattering:
         """Return what `transfers` scatter of particles of momentum q and affine momentum A."""
         grid = self.zeros(self.box.cells, wp.vec4)
         inputs = [self.lattice, *map(self.array, (mass, self.x, q / mass[:, :, None], A)), grid]
-        wp.launch(transfers("float32").p2g, (ROWS, COUNT), inputs)
+        wp.launch(transfers("float32").p2g, (ROWS, 1), inputs)
         return to_torch(grid).clone()
 
     def zeros(self, count, kind=wp.int32):

@@ -6,11 +6,12 @@ import pytest
 import torch
 import warp as wp
 
+from gradscape.envs.engines import cpp
 from gradscape.envs.engines.mpm.boundaries import LadleInTank, Open
-from gradscape.envs.engines.mpm.grid import velocity_kernel
-from gradscape.envs.engines.mpm.grid_cpu import velocity_on
+from gradscape.envs.engines.mpm.grid import velocity_at, velocity_on
+from gradscape.envs.engines.mpm.stencil import lattice
 from gradscape.envs.engines.mpm.tools import STICKY, Kind, Tool, ToolsInRoom
-from gradscape.envs.engines.runtime import has_rows, precision, threads
+from gradscape.envs.engines.runtime import precision
 
 from ..bench import draw, placed
 
@@ -58,8 +59,8 @@ class Nodes:
 
     def run(self, kernel):
         """Return velocities, and the adjoints of momenta and tools, as integers of the same bits."""
-        size = threads(kernel, self.cells)
-        near = [wp.zeros((BATCH, self.cells + 1), dtype=wp.int32)] if has_rows(kernel) else []
+        size = cpp.threads(kernel, self.cells)
+        near = [wp.zeros((BATCH, self.cells + 1), dtype=wp.int32)] if size == 1 else []
         grid_v, adj_grid_m = (self.array(torch.full((BATCH, self.cells, 4), 7.0)) for _ in range(2))
         tools, adj_tools = self.array(self.tools), self.array(torch.zeros_like(self.tools))
         data, sums = self.boundary.data("float32", "cpu"), wp.zeros((1, 1), dtype=wp.int64)
@@ -78,12 +79,49 @@ class Nodes:
         return wp.array(values.float().contiguous().numpy(), dtype=kind, copy=True)
 
 
+def in_warp(boundary):
+    """Return the kernel of one node at a time, with the function and the adjoint that a GPU has."""
+    types, (function, Data) = precision("float32"), boundary.function("float32")
+    real, vec3, vec4, Lattice = types.real, types.vec3, types.vec4, lattice("float32")
+    velocity_at_node = velocity_at("float32", function, Data)
+
+    @cpp.func_native(called="read_node", adjoint="set_adj_read_node")
+    def read(grid: wp.array2d[vec4], e: int, i: int) -> vec4: ...
+
+    @cpp.func_native(called="write_node", adjoint="set_adj_write_node", replay=False)
+    def write(grid: wp.array2d[vec4], e: int, i: int, value: vec4): ...
+
+    @wp.kernel(module="unique", module_options=cpp.options())
+    def velocity(
+        lattice: Lattice,
+        boundary: Data,
+        dt: real,
+        gravity: real,
+        empty: real,
+        step: int,
+        fraction: real,
+        rate: real,
+        tools: wp.array3d[vec3],
+        sums: wp.array2d[wp.int64],
+        grid_m: wp.array2d[vec4],
+        grid_v: wp.array2d[vec4],
+    ):
+        e, i = wp.tid()
+        g = read(grid_m, e, i)
+        if g[3] > empty:
+            v = velocity_at_node(lattice, boundary, dt, gravity, g, e, i, tools, sums, step, fraction, rate)
+            write(grid_v, e, i, vec4(v[0], v[1], v[2], real(0.0)))
+        else:
+            write(grid_v, e, i, vec4())
+
+    return velocity
+
+
 @pytest.mark.parametrize("box", BOXES.values(), ids=BOXES)
 @pytest.mark.parametrize("boundary", BOUNDARIES.values(), ids=BOUNDARIES)
 def test_rows_of_a_cpu_have_the_same_bits(boundary, box):
-    nodes, rows = Nodes(boundary, box), velocity_on("cpu", "float32", boundary, columns=False)
-    assert has_rows(rows)
-    wanted = nodes.run(velocity_kernel("float32", *boundary.function("float32")))
+    nodes, rows = Nodes(boundary, box), velocity_on("float32", boundary, columns=False)
+    wanted = nodes.run(in_warp(boundary))
     found = nodes.run(rows)
     for one, other in zip(wanted, found, strict=True):
         assert torch.equal(one, other)
@@ -94,8 +132,3 @@ def test_rows_of_a_cpu_have_the_same_bits(boundary, box):
         assert wanted[2].any(dim=3).any(dim=2)[:, STEP:].all()
         assert (nodes.near > 0).all()
         assert (nodes.near < nodes.cells / 4).all()
-
-
-def test_only_a_cpu_in_single_precision_has_rows():
-    assert not has_rows(velocity_on("cpu", "float64", TANK, columns=False))
-    assert not has_rows(velocity_on("cuda", "float32", TANK, columns=True))

@@ -8,10 +8,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gradscape.envs.engines.mpm.materials import Plasticine, plasticine_series
+from gradscape.envs.engines.mpm.materials import Plasticine, plasticine, plasticine_series
 from gradscape.envs.engines.mpm.materials.plasticine import ROUNDED, SMALLEST
 
-from ..bench import IDENTITY, NAMES, MaterialBench, assert_rows_have_the_same_bits, draw, rotations
+from ..bench import IDENTITY, NAMES, MaterialBench, assert_rows_have_the_same_bits, draw, in_warp, rotations
 
 CLAY = Plasticine(1000.0, 5e3, 0.2, yield_stress=50.0)
 KAPPA = CLAY.yield_stress / (2 * CLAY.mu)  # largest deviatoric log strain
@@ -157,14 +157,7 @@ def test_rows_of_a_cpu_have_the_same_bits():
     odd = [torch.diag(torch.tensor(one)) for one in ([0.0, 0, 0], [1.0, 1, 0], [2.0, 1, -1], [1.0, 0, 0])]
     F = torch.cat([torch.stack(odd).double(), IDENTITY + sizes * draw(125, 3, 3, seed=30)])
     C, adj_F, adj_A = (scale * draw(len(F), 3, 3, seed=31 + k) for k, scale in enumerate((30.0, 1.0, 1.0)))
-    assert_rows_have_the_same_bits(CLAY, F, C, adj_F, adj_A)
-
-
-def by_series(material, name):
-    """Return a bench of the kernels that do without a decomposition, as a GPU has them in float32."""
-    bench = MaterialBench(material, name)
-    bench.kernels = plasticine_series.kernels(name)[:2]
-    return bench
+    assert_rows_have_the_same_bits(CLAY, plasticine.kernels, F, C, adj_F, adj_A)
 
 
 @pytest.mark.parametrize("yields_at", [50.0, 200.0, 5e6])
@@ -178,7 +171,7 @@ def test_series_do_what_decompositions_do(name, bound, size, yields_at):
     odd = [CASES[case][:1] for case in ("flat", "flatter", "flat both ways", "inverted", "undeformed", "swollen")]
     F = torch.cat([F, *odd])
     C, adj_F, adj_A = (scale * draw(len(F), 3, 3, seed=44 + k) for k, scale in enumerate((3.0, 1.0, 1.0)))
-    series, reference = by_series(clay, name), MaterialBench(clay)
+    series, reference = in_warp(clay, plasticine_series.kernels, name), MaterialBench(clay)
     for got, wanted in (
         *zip(series.update(F, C), reference.update(F, C), strict=True),
         *zip(series.adjoint(F, C, adj_F, adj_A), reference.adjoint(F, C, adj_F, adj_A), strict=True),
@@ -190,7 +183,7 @@ def test_series_do_what_decompositions_do(name, bound, size, yields_at):
 
 @pytest.mark.parametrize("case", ["elastic", "yielding", "undeformed", "swollen", "two equal, squeezed"])
 def test_adjoints_of_series_are_slopes(case):
-    F, bench = CASES[case].expand(8, 3, 3), by_series(CLAY, "float64")
+    F, bench = CASES[case].expand(8, 3, 3), in_warp(CLAY, plasticine_series.kernels, "float64")
     weights = [draw(8, 3, 3, seed=16), draw(8, 3, 3, seed=17)]
     for got, wanted in bench.slopes(F, draw(8, 3, 3, seed=18), *weights, 1e-3, step=3e-6):
         torch.testing.assert_close(got, wanted, rtol=0, atol=1e-6 * float(wanted.abs().max()))

@@ -8,8 +8,6 @@ from gradscape.envs.engines.mpm.boundaries import Open
 from gradscape.envs.engines.mpm.materials import Elastic
 from gradscape.envs.engines.mpm.model import Body, Model
 from gradscape.envs.engines.mpm.raster import Raster
-from gradscape.envs.engines.mpm.transfers import transfers
-from gradscape.envs.engines.runtime import has_rows
 
 from ..bench import draw
 
@@ -43,16 +41,6 @@ def test_masses_that_are_counted_do_not_depend_on_the_order_of_particles():
     x, turned = places(3, seed=7), torch.randperm(COUNT, generator=torch.Generator().manual_seed(8))
     one, other = (make_raster(counting=True, name="float32", mass=MASS[order]) for order in (range(COUNT), turned))
     assert torch.equal(one(x), other(x[:, turned]))
-
-
-def test_eight_particles_at_a_time_give_the_bits_of_one_after_another():
-    one, eight = (make_raster(counting=False, name="float32") for _ in range(2))
-    one.kernels = transfers("float32")
-    x = places(3, seed=9)
-    weights = draw(3, one.grid.shape[1], seed=10)
-    assert has_rows(eight.kernels.p2g)
-    assert torch.equal(one(x), eight(x))
-    assert torch.equal(one.gather(x, weights), eight.gather(x, weights))
 
 
 def test_nodes_hold_the_particles_mass_and_its_first_moment(raster):

@@ -8,8 +8,8 @@ import warp as wp
 from gradscape.envs.engines.mpm.cells import cell_kernels
 from gradscape.envs.engines.mpm.columns import GPU_TEAM, column_kernels
 from gradscape.envs.engines.mpm.materials import Fluid
-from gradscape.envs.engines.mpm.smoothing_columns import smoothing_columns
-from gradscape.envs.engines.mpm.transfers_columns import transfers_of_columns
+from gradscape.envs.engines.mpm.smoothing import smoothing_columns
+from gradscape.envs.engines.mpm.transfers import transfers_of_columns
 
 DEFINED = re.compile(r"^\s*([a-z][\w.]*)\s+(%\w+),", re.MULTILINE)
 FLOOR = re.compile(r"cvt\.rmi\S*\s+%\w+, (%\w+)")

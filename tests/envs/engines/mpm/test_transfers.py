@@ -1,16 +1,13 @@
-"""Transfers between particles and grid: conservation laws, exactness on affine fields, adjoints against Warp's own."""
+"""Transfers between particles and grid: conservation laws, exactness on affine fields, and formulas in torch."""
 
-from functools import cache
-from types import SimpleNamespace
+from itertools import product
 
 import pytest
 import torch
 import warp as wp
 
-from gradscape.envs.engines import cpp
-from gradscape.envs.engines.mpm.transfers import lattice, transfers
-from gradscape.envs.engines.mpm.transfers_cpu import transfers_in_rows, transfers_on_cpu
-from gradscape.envs.engines.runtime import has_rows, precision, to_torch
+from gradscape.envs.engines.mpm.transfers import transfers
+from gradscape.envs.engines.runtime import precision, to_torch
 
 from ..bench import placed
 
@@ -29,6 +26,7 @@ X = torch.tensor(ORIGIN, dtype=torch.float64) + DX * (
 )
 V, A, M = draw(BATCH, COUNT, 3, seed=1), draw(BATCH, COUNT, 3, 3, seed=2), 1.5 + draw(BATCH, COUNT, seed=3)
 CELLS = NODES[0] * NODES[1] * NODES[2]
+ROW = torch.arange(BATCH)[:, None, None]
 AT_NODES = draw(BATCH, CELLS, 4, seed=4) * torch.tensor([1, 1, 1, 0])  # a grid velocity has no fourth part
 
 
@@ -53,59 +51,32 @@ class Bench:
         return self.array(torch.zeros(BATCH, size, *tail))
 
     def launch(self, kernel, inputs):
-        wp.launch(kernel, (BATCH, COUNT), inputs, record_tape=False)
-
-    def adjoint(self, kernel, inputs, adjoints):
-        wp.launch(
-            kernel,
-            (BATCH, COUNT),
-            inputs,
-            adj_inputs=[lattice(self.types.name)(), *adjoints],
-            adj_outputs=[],
-            adjoint=True,
-            record_tape=False,
-        )
+        wp.launch(kernel, (BATCH, 1), inputs, record_tape=False)
 
     def p2g(self, x=X, v=V, a=A):
         grid_m = self.zeros(CELLS, 4)
         self.launch(self.kernels.p2g, [self.lattice, *map(self.array, (M, x, v, a)), grid_m])
         return double(grid_m)
 
-    def g2p(self, x=X, grid_v=AT_NODES):
+    def g2p(self, x=X, grid_v=AT_NODES, *, inside=True):
         new = [self.zeros(COUNT, 3), self.zeros(COUNT, 3), self.zeros(COUNT, 3, 3)]
         escaped = wp.zeros(BATCH, dtype=wp.int32)
         self.launch(self.kernels.g2p, [self.lattice, DT, self.array(x), self.array(grid_v), *new, escaped])
-        assert not to_torch(escaped).any()
+        assert to_torch(escaped).any() != inside
         return [double(array) for array in new]
 
-    def adjoint_p2g(self, adj_grid_m):
-        """Return the adjoints of x, v, A by the kernel written out."""
+    def adjoint_p2g(self, adj_grid_m, x=X):
+        """Return the adjoints of x, v, A."""
         adjoints = [self.zeros(COUNT, 3), self.zeros(COUNT, 3), self.zeros(COUNT, 3, 3)]
-        inputs = [self.lattice, *map(self.array, (M, X, V, A, adj_grid_m)), *adjoints]
+        inputs = [self.lattice, *map(self.array, (M, x, V, A, adj_grid_m)), *adjoints]
         self.launch(self.kernels.adjoint_p2g, inputs)
         return [double(array) for array in adjoints]
 
-    def adjoint_g2p(self, adj_x_new, adj_v_new, adj_C_new):
-        """Return the adjoints of x and grid_v by the kernel written out."""
+    def adjoint_g2p(self, adj_x_new, adj_v_new, adj_C_new, x=X):
+        """Return the adjoints of x and grid_v."""
         adj_grid_v, adj_x = self.zeros(CELLS, 4), self.zeros(COUNT, 3)
-        given = map(self.array, (X, AT_NODES, adj_x_new, adj_v_new, adj_C_new))
+        given = map(self.array, (x, AT_NODES, adj_x_new, adj_v_new, adj_C_new))
         self.launch(self.kernels.adjoint_g2p, [self.lattice, DT, *given, adj_grid_v, adj_x])
-        return double(adj_x), double(adj_grid_v)
-
-    def warp_adjoint_p2g(self, adj_grid_m):
-        """Return the adjoints of x, v, A by Warp's AD of p2g."""
-        adjoints = [self.zeros(COUNT, 3), self.zeros(COUNT, 3), self.zeros(COUNT, 3, 3)]
-        inputs = [self.lattice, *map(self.array, (M, X, V, A)), self.zeros(CELLS, 4)]
-        self.adjoint(differentiated(self.types.name).p2g, inputs, [None, *adjoints, self.array(adj_grid_m)])
-        return [double(array) for array in adjoints]
-
-    def warp_adjoint_g2p(self, adj_x_new, adj_v_new, adj_C_new):
-        """Return the adjoints of x and grid_v by Warp's AD of g2p."""
-        adj_x, adj_grid_v = self.zeros(COUNT, 3), self.zeros(CELLS, 4)
-        new = [self.zeros(COUNT, 3), self.zeros(COUNT, 3), self.zeros(COUNT, 3, 3), wp.zeros(BATCH, dtype=wp.int32)]
-        inputs = [self.lattice, DT, self.array(X), self.array(AT_NODES), *new]
-        given = [*map(self.array, (adj_x_new, adj_v_new, adj_C_new)), None]
-        self.adjoint(differentiated(self.types.name).g2p, inputs, [None, adj_x, adj_grid_v, *given])
         return double(adj_x), double(adj_grid_v)
 
 
@@ -113,12 +84,39 @@ def double(array):
     return to_torch(array).double().clone()
 
 
-@cache
-def differentiated(name):
-    """Return p2g and g2p built anew, this time with Warp's own adjoints."""
-    kernels = transfers(name)
-    decorate = wp.kernel(module=cpp.module(f"tests.transfers.{name}"), enable_backward=True)
-    return SimpleNamespace(p2g=decorate(kernels.p2g.func), g2p=decorate(kernels.g2p.func))
+def outside(x):
+    """Take some particles out of the grid, where they are clamped to its border."""
+    moved = x.clone()
+    moved[0, :4] += torch.tensor([[0.9, 0, 0], [-0.9, 0, 0], [0, 0.9, -0.9], [0, 0, 0.0]])
+    return moved
+
+
+def stencil(x):
+    """Return the numbers of the 27 nodes around each particle, their weights, and how far they are from it [m]."""
+    s, nodes = (x - torch.tensor(ORIGIN, dtype=torch.float64)) / DX, torch.tensor(NODES)
+    base = (s.detach() - 0.5).floor().long().clamp_min(0).minimum(nodes - 3)
+    f = s - base
+    along = torch.stack([(1.5 - f) ** 2 / 2, 0.75 - (f - 1) ** 2, (f - 0.5) ** 2 / 2], dim=-1)
+    weight = torch.einsum("bpi,bpj,bpk->bpijk", *along.unbind(dim=2)).flatten(2)
+    offsets = torch.tensor(list(product(range(3), repeat=3)))
+    i, j, k = (base[:, :, None] + offsets).unbind(dim=3)
+    return (i * NODES[1] + j) * NODES[2] + k, weight, DX * (offsets - f[:, :, None])
+
+
+def reference_p2g(x, v, a):
+    """Return momentum and mass at nodes, in torch."""
+    node, weight, apart = stencil(x)
+    momentum = M[:, :, None, None] * v[:, :, None] + torch.einsum("bpij,bpnj->bpni", a, apart)
+    given = weight[..., None] * torch.cat([momentum, M[:, :, None, None].expand(-1, -1, 27, 1)], dim=3)
+    return torch.zeros(BATCH, CELLS, 4).double().index_put((ROW, node), given, accumulate=True)
+
+
+def reference_g2p(x, grid_v):
+    """Return x, v and C after a step, in torch."""
+    node, weight, apart = stencil(x)
+    velocity = weight[..., None] * grid_v[ROW, node][..., :3]
+    v = velocity.sum(dim=2)
+    return x + DT * v, v, 4 / DX**2 * torch.einsum("bpni,bpnj->bpij", velocity, apart)
 
 
 @pytest.fixture(scope="module", params=NAMES)
@@ -158,44 +156,19 @@ def test_g2p_reproduces_an_affine_velocity_field(bench):
     assert_relative(x_new, X + DT * (v0 + X @ C.T), tolerance)
 
 
-@pytest.mark.parametrize(("transfer", "parts"), [("p2g", 3), ("g2p", 2)])
-def test_adjoints_equal_warps_own(bench, transfer, parts):
-    given = [draw(BATCH, CELLS, 4, seed=7)]
-    if transfer == "g2p":
-        given = [draw(BATCH, COUNT, *tail, seed=7 + i) for i, tail in enumerate([(3,), (3,), (3, 3)])]
-    ours = getattr(bench, f"adjoint_{transfer}")(*given)
-    warps = getattr(Bench("float64"), f"warp_adjoint_{transfer}")(*given)  # the sum of four floats has none of its own
-    assert len(ours) == len(warps) == parts
-    for got, wanted in zip(ours, warps, strict=True):
-        assert wanted.abs().max() > 0
-        assert_relative(got, wanted, {"float32": 1e-5, "float64": 1e-12}[bench.types.name])
-
-
-def slope(function, x, direction, step):
-    return (function(x + step * direction) - function(x - step * direction)) / (2 * step)
-
-
-def test_adjoint_of_p2g_is_its_slope():
-    bench = Bench("float64")
-    adj_grid_m = draw(BATCH, CELLS, 4, seed=8)
-    adjoints = bench.adjoint_p2g(adj_grid_m)
-    for name, at, adjoint in zip("xva", (X, V, A), adjoints, strict=True):
-        direction = draw(*at.shape, seed=9) * (DX if name == "x" else 1)
-        by_differences = slope(lambda y, name=name: (bench.p2g(**{name: y}) * adj_grid_m).sum(), at, direction, 1e-5)
-        torch.testing.assert_close((adjoint * direction).sum(), by_differences, rtol=1e-7, atol=0)
-
-
-def test_adjoint_of_g2p_is_its_slope():
-    bench = Bench("float64")
-    given = [draw(BATCH, COUNT, *tail, seed=10 + i) for i, tail in enumerate([(3,), (3,), (3, 3)])]
-    adjoints = bench.adjoint_g2p(*given)
-    for name, at, adjoint in zip(("x", "grid_v"), (X, AT_NODES), adjoints, strict=True):
-        direction = draw(*at.shape, seed=13) * (DX if name == "x" else 1)
-
-        def paired(y, name=name):
-            return sum((new * weight).sum() for new, weight in zip(bench.g2p(**{name: y}), given, strict=True))
-
-        torch.testing.assert_close((adjoint * direction).sum(), slope(paired, at, direction, 1e-5), rtol=1e-7, atol=0)
+@pytest.mark.parametrize("where", [X, outside(X)], ids=["within", "some without"])
+def test_transfers_and_their_adjoints_are_those_of_torch(bench, where):
+    """Of eight particles at a time, and three that are left; some are clamped to the grid's border."""
+    at = [one.clone().requires_grad_() for one in (where, V, A, AT_NODES)]
+    adj_grid, adj_new = draw(BATCH, CELLS, 4, seed=7), [draw(BATCH, COUNT, *t, seed=8) for t in ((3,), (3,), (3, 3))]
+    grid, new = reference_p2g(*at[:3]), reference_g2p(at[0], at[3])
+    wanted = [grid, *torch.autograd.grad((grid * adj_grid).sum(), at[:3])]
+    wanted += [*new, *torch.autograd.grad(sum((x * w).sum() for x, w in zip(new, adj_new, strict=True)), at[::3])]
+    found = [bench.p2g(where), *bench.adjoint_p2g(adj_grid, where), *bench.g2p(where, inside=where is X)]
+    found += bench.adjoint_g2p(*adj_new, where)
+    for got, exact in zip(found, wanted, strict=True):
+        assert exact.abs().max() > 0
+        assert_relative(got, exact.detach(), {"float32": 2e-5, "float64": 1e-12}[bench.types.name])
 
 
 def test_a_particle_near_the_edge_of_the_grid_is_reported():
@@ -207,43 +180,3 @@ def test_a_particle_near_the_edge_of_the_grid_is_reported():
     new = [bench.zeros(COUNT, 3), bench.zeros(COUNT, 3), bench.zeros(COUNT, 3, 3)]
     bench.launch(bench.kernels.g2p, [bench.lattice, DT, bench.array(x), bench.array(AT_NODES), *new, escaped])
     assert to_torch(escaped).tolist() == [0, 1]
-
-
-def outside(x):
-    """Take some particles out of the grid, where they are clamped to its border."""
-    moved = x.clone()
-    moved[0, :4] += torch.tensor([[0.9, 0, 0], [-0.9, 0, 0], [0, 0.9, -0.9], [0, 0, 0.0]])
-    return moved
-
-
-@pytest.mark.parametrize("x", [X, outside(X)], ids=["within", "some without"])
-def test_rows_of_a_cpu_have_the_same_bits(x):
-    """Eight particles at a time, and three that are left, give what Warp's own code gives, one at a time."""
-    bench, rows = Bench("float32"), transfers_in_rows()
-    place = [bench.lattice, bench.array(M), bench.array(x), bench.array(V), bench.array(A)]
-    moved = [bench.lattice, DT, bench.array(x), bench.array(AT_NODES)]
-    adjoints = [bench.array(draw(BATCH, COUNT, *tail, seed=7)) for tail in ((3,), (3,), (3, 3))]
-    free = bench.array(draw(BATCH, CELLS, 4, seed=8))
-
-    def zeros(*names):
-        tails = {"node": (CELLS, 4), "vector": (COUNT, 3), "matrix": (COUNT, 3, 3)}
-        return [bench.zeros(tails[name][0], *tails[name][1:]) for name in names]
-
-    calls = {
-        "p2g": (place, lambda: zeros("node")),
-        "g2p": (moved, lambda: [*zeros("vector", "vector", "matrix"), wp.zeros(BATCH, dtype=wp.int32)]),
-        "adjoint_p2g": ([*place, free], lambda: [bench.array(V), *zeros("vector", "matrix")]),
-        "adjoint_g2p": ([*moved, *adjoints], lambda: zeros("node", "vector")),
-    }
-    for name, (inputs, make) in calls.items():
-        wanted, found = make(), make()
-        wp.launch(getattr(bench.kernels, name), (BATCH, COUNT), [*inputs, *wanted], record_tape=False)
-        wp.launch(getattr(rows, name), (BATCH, 1), [*inputs, *found], record_tape=False)
-        for one, other in zip(wanted, found, strict=True):
-            assert (one.numpy() == other.numpy()).all(), name
-            assert one.numpy().any() or name == "g2p", name
-
-
-def test_only_a_cpu_in_single_precision_has_rows():
-    assert has_rows(transfers_on_cpu("float32").p2g)
-    assert not has_rows(transfers_on_cpu("float64").p2g)
