@@ -29,8 +29,8 @@ def info() -> Info:
     import sys
 
     from .. import __version__
+    from ..envs.engines import installed_version
     from ..envs.engines.runtime import cores, device_names
-    from ..envs.installed import installed_version
     from ..jobs.scene import ABSENT, PACKAGES
 
     packages = {package: installed_version(package) or ABSENT for package in PACKAGES}

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import abc
 import inspect
+import queue
 import threading
-from collections.abc import Callable, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import asdict, replace
 from functools import partial
 from importlib import import_module
 from types import ModuleType
-from typing import Any, ClassVar, TypeVar, final
+from typing import Any, ClassVar, Generic, TypeVar, final
 
 import torch
 from jaxtyping import Float, Int
@@ -23,15 +25,74 @@ from ..landscapes.objective import Evaluation, Objective, SimulatorError, Status
 from ..landscapes.options import NoOptions, read_options
 from ..landscapes.sampling.memory import free_memory, is_out_of_memory
 from ..landscapes.space import ParameterSpace, as_tensor
-from .batching import Pool, cores, map_parts
-from .engines import find_engine
-from .engines.engine import Engine
-from .installed import EXTRAS
+from .engines import EXTRAS, Engine, find_engine
 from .records import Fidelity as Fidelity
 from .records import MaterialRange as MaterialRange
 from .records import ModelPart as ModelPart
 from .records import Work as Work
 from .records import unknown_fidelity
+
+# ---- Spread a batch over threads, and lend them the solvers that serve one thread at a time.
+
+T = TypeVar("T")
+Part = TypeVar("Part")
+Result = TypeVar("Result")
+
+
+def cores() -> int:
+    """Count the cores this process may use."""
+    from .engines import runtime
+
+    return runtime.cores()
+
+
+class Pool(Generic[T]):
+    """Lend objects that serve one thread at a time, making a new one where none is idle; with `most` of them, wait."""
+
+    def __init__(self, make: Callable[[], T], *, most: int | None = None) -> None:
+        self._make = make
+        self._idle: queue.LifoQueue[T] = queue.LifoQueue()
+        self._making = threading.Lock()
+        self._room = threading.Semaphore(most) if most else nullcontext()
+
+    @contextmanager
+    def lend(self) -> Iterator[T]:
+        """Give an idle object, or a new one, for the length of a with block."""
+        with self._room:
+            try:
+                item = self._idle.get_nowait()
+            except queue.Empty:
+                with self._making:
+                    item = self._make()
+            try:
+                yield item
+            finally:
+                self._idle.put(item)
+
+
+def copied(values: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
+    """Copy numbers out of a solver's memory, which its next run overwrites, to float64 on the CPU.
+
+    `.double().cpu()` would return that memory itself where a solver computes in float64 on a CPU.
+    """
+    return values.to("cpu", torch.float64, copy=True)
+
+
+def map_parts(
+    work: Callable[[Part], Result], parts: Sequence[Part], *, threads: int, stop: threading.Event
+) -> list[Result]:
+    """Do the work on each part, in several threads at once where there are some; `stop` is set while they give up."""
+    if threads == 1 or len(parts) == 1:
+        return list(map(work, parts))
+    with ThreadPoolExecutor(threads) as executor:
+        try:
+            return list(executor.map(work, parts))
+        except BaseException:  # an interrupt too: let no thread simulate on
+            stop.set()
+            executor.shutdown(cancel_futures=True)
+            stop.clear()
+            raise
+
 
 T = TypeVar("T")
 FLOAT32 = torch.finfo(torch.float32).max
@@ -472,12 +533,17 @@ class Environment(Objective):
 
     def _find_device(self, device: str) -> str:
         if device == "auto":
-            return "cuda" if "cuda" in self.devices and _cuda() else "cpu"
+            return "cuda" if "cuda" in self.devices and self._has_cuda() else "cpu"
         if device not in self.devices:
             raise ValueError(f"{self.name} runs on {' and '.join(self.devices)}; got device {device!r}")
-        if device == "cuda" and not _cuda():
+        if device == "cuda" and not self._has_cuda():
             raise ValueError(f"{self.name} was asked to run on cuda; no CUDA device was found here, use --device cpu")
         return device
+
+    def _has_cuda(self) -> bool:
+        from .engines.runtime import cuda_available
+
+        return cuda_available()
 
 
 class _Bridge(torch.autograd.Function):
@@ -495,9 +561,3 @@ class _Bridge(torch.autograd.Function):
     def backward(ctx: Any, grad_loss: Tensor) -> tuple[Tensor, None]:
         (grad,) = ctx.saved_tensors
         return grad_loss[:, None] * grad, None
-
-
-def _cuda() -> bool:
-    from .engines.runtime import cuda_available
-
-    return cuda_available()

@@ -15,11 +15,10 @@ from torch import Tensor
 from ..landscapes.episode import Part, View
 from ..landscapes.objective import Evaluation, Status
 from ..landscapes.space import ParameterSpace
-from .base import Environment, Episode, Fidelity, MaterialRange, ModelPart, Work
-from .batching import Pool, copied
+from .base import Environment, Episode, Fidelity, MaterialRange, ModelPart, Pool, Work, copied
 from .engines.balls.rigid import Ball, Solver
 from .engines.runtime import to_torch
-from .options import EpisodeOptions
+from .records import EpisodeOptions
 
 START = (-0.5, 1.0, 0.0)  # [m]
 DURATION = 2.0  # [s]

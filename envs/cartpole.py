@@ -14,11 +14,10 @@ from torch import Tensor
 from ..landscapes.episode import Part, View
 from ..landscapes.objective import Evaluation, Status
 from ..landscapes.space import ParameterSpace
-from .base import Environment, Episode, Fidelity, ModelPart, Work
-from .batching import Pool, copied
+from .base import Environment, Episode, Fidelity, ModelPart, Pool, Work, copied
 from .controls import extend, hold
 from .engines.chain import Chain, Solver
-from .options import EpisodeOptions
+from .records import EpisodeOptions
 
 CHAIN = Chain(masses=(1.0, 0.5, 0.25), lengths=(1.0, 1.0, 1.0), gravity=9.81)
 CONTROLS, SPAN = 100, 0.02  # how many controls, and how long each is held [s]

@@ -3,19 +3,24 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Mapping
+import re
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, make_dataclass, replace
 from functools import cached_property, partial
-from typing import Any, Protocol, TypedDict
+from typing import TYPE_CHECKING, Any, Literal, Protocol, TypedDict, Unpack, get_args
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from ..landscapes.identity import UNNAMED
-from ..landscapes.objective import Evaluation, SimulatorError
-from ..landscapes.space import ParameterSpace, as_whole
+from ..landscapes.objective import Evaluation, SimulatorError, first_line
+from ..landscapes.space import ParameterSpace, as_tensor, as_whole
 from .base import Environment, Fidelity
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 NAMELESS = "function"  # what a lambda is called
 SAME_TIME = 0.01  # relative difference of what counts as the same time
@@ -41,7 +46,7 @@ class FunctionKeywords(TypedDict, total=False):
     `precision`, float64 or float32, is what it is given its points in, at most `rows` of them in one call.
     """
 
-    name: str | None
+    name: str
     loss_unit: str
     maximize: bool
     options: Mapping[str, Any] | None
@@ -51,11 +56,6 @@ class FunctionKeywords(TypedDict, total=False):
     precision: str
     rows: int
 
-
-DEFAULTS: FunctionKeywords = {
-    "name": None, "loss_unit": "", "maximize": False, "options": None, "fidelities": None, "horizon": None,
-    "seeds": 1, "precision": "float64", "rows": 256,
-}  # fmt: skip
 
 Compute = Callable[[Float[Tensor, "batch dim"], bool], tuple[Tensor, Tensor | None, str]]
 """Returns losses, gradients if asked for, and the type of numbers that the losses came in, at points."""
@@ -72,62 +72,58 @@ class Backend(Protocol):
     def devices(self) -> tuple[str, ...]:
         """What it runs on."""
 
-    def find_device(self, device: str) -> str:
-        """Return the device that auto stands for, or the one named. Raises ValueError where it is not there."""
+    @property
+    def device(self) -> str:
+        """Where it runs by default: auto, cpu or cuda."""
+
+    def has_cuda(self) -> bool:
+        """Say whether it finds a CUDA device."""
 
     def bind(self, call: Function, settings: Mapping[str, Any], precision: str, device: str) -> Compute:
         """Return what computes the function with these keyword arguments."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class Function:
-    """A function of points with what its user says of it."""
+    """A function of points with what its user says of it, as `FunctionKeywords` has it.
+
+    Raises ValueError for what does not go together.
+    """
 
     fn: Callable[..., Any]
     space: ParameterSpace
     backend: Backend
-    name: str
+    name: str = ""
     loss_unit: str = ""
     maximize: bool = False
-    options: Mapping[str, Any] = field(default_factory=dict)
-    fidelities: Mapping[str, Fidelity] = field(default_factory=dict)
-    fidelity_arguments: tuple[str, ...] = ()
-    horizon: str = ""
-    seed_argument: str = ""
+    options: Mapping[str, Any] | None = None
+    fidelities: Mapping[str, Mapping[str, Any]] | None = None
+    horizon: str | None = None
     seeds: int = 1
-    rows: int = DEFAULTS["rows"]
+    precision: str = "float64"
+    rows: int = 256
 
-    @classmethod
-    def of(cls, fn: Callable[..., Any], space: ParameterSpace, backend: Backend, said: FunctionKeywords) -> Function:
-        """Read what a user says of a function. Raises ValueError for what does not go together."""
+    def __post_init__(self) -> None:
+        fn, who = self.fn, f"from_{self.backend.engine}"
         if not callable(fn):
             raise ValueError(f"a function is wanted; got {type(fn).__name__} {fn!r}")
-        if not isinstance(space, ParameterSpace):
-            raise ValueError(f"a ParameterSpace is wanted, as gs.ParameterSpace({{'x': (-1, 1)}}); got {space!r}")
-        if unknown := said.keys() - FunctionKeywords.__annotations__.keys():
-            raise TypeError(f"from_{backend.engine} takes no keyword {', '.join(sorted(unknown))}")
-        who, said = f"from_{backend.engine}", {**DEFAULTS, **said}
-        name, known = said["name"] or function_name(fn), _arguments(fn)
-        given = {key: dict(value) for key, value in (said["fidelities"] or {}).items()}
+        if not isinstance(self.space, ParameterSpace):
+            raise ValueError(f"a ParameterSpace is wanted, as gs.ParameterSpace({{'x': (-1, 1)}}); got {self.space!r}")
+        self.name, known = self.name or function_name(fn), _arguments(fn)
+        given = {key: dict(value) for key, value in (self.fidelities or {}).items()}
         own = {argument: None for settings in given.values() for argument in settings if argument != "precision"}
-        options = said["options"]
         bound = fn.keywords if isinstance(fn, partial) else {}  # by the user: no setting any more
-        found = _default_options(known, {**own, **bound}) if options is None else dict(options)
-        _check_arguments(name, known, found, own, said["horizon"])
-        precision = _check_precision(said["precision"], who)
-        seeds = as_whole(said["seeds"], f"{who}'s seeds", least=1)
-        rows = as_whole(said["rows"], f"{who}'s rows", least=1)
-        seed_argument = next((one for one in SEED_ARGUMENTS if one in known and one not in own | found), "")
-        if seeds > 1 and not seed_argument:
-            raise ValueError(
-                f"seeds={seeds} averages over random numbers, and {name} takes no {' or '.join(SEED_ARGUMENTS)}"
-            )
-        if seed_argument:
-            found["seed"] = 0
-        return cls(
-            fn, space, backend, name, said["loss_unit"], said["maximize"], found,
-            _read_fidelities(name, given, precision), tuple(own), said["horizon"] or "", seed_argument, seeds, rows,
-        )  # fmt: skip
+        chosen = _default_options(known, {**own, **bound}) if self.options is None else dict(self.options)
+        _check_arguments(self.name, known, chosen, own, self.horizon)
+        self.seeds = as_whole(self.seeds, f"{who}'s seeds", least=1)
+        self.rows = as_whole(self.rows, f"{who}'s rows", least=1)
+        self.seed_argument = next((one for one in SEED_ARGUMENTS if one in known and one not in own | chosen), "")
+        if self.seeds > 1 and not self.seed_argument:
+            seeded = " or ".join(SEED_ARGUMENTS)
+            raise ValueError(f"seeds={self.seeds} averages over random numbers, and {self.name} takes no {seeded}")
+        self.defaults = chosen | ({"seed": 0} if self.seed_argument else {})
+        self.known_fidelities = _read_fidelities(self.name, given, _check_precision(self.precision, who))
+        self.fidelity_arguments = tuple(own)
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out what another process makes again."""
@@ -136,7 +132,7 @@ class Function:
     @cached_property
     def options_class(self) -> type[Any]:
         """The dataclass of the options, each of the type of its default."""
-        declared = [(name, type(value), field(default=value)) for name, value in self.options.items()]
+        declared = [(name, type(value), field(default=value)) for name, value in self.defaults.items()]
         return make_dataclass("Options", declared, frozen=True)
 
     @cached_property
@@ -144,10 +140,10 @@ class Function:
         """Whether the horizon counts time steps: times dt, it is the same time in every fidelity."""
         if not {self.horizon, "dt"} <= set(self.fidelity_arguments):
             return False
-        steps: list[Any] = [one.settings.get(self.horizon) for one in self.fidelities.values()]
+        steps: list[Any] = [one.settings.get(self.horizon) for one in self.known_fidelities.values()]
         if not all(isinstance(count, int) for count in steps):
             return False
-        times = [count * one.dt for count, one in zip(steps, self.fidelities.values(), strict=True)]
+        times = [count * one.dt for count, one in zip(steps, self.known_fidelities.values(), strict=True)]
         return bool(max(times) - min(times) <= SAME_TIME * max(times))
 
     def settings_of(self, options: Any, fidelity: Fidelity) -> dict[str, Any]:
@@ -158,8 +154,8 @@ class Function:
         for argument in self.fidelity_arguments:
             known = argument in FIDELITY_FIELDS
             found[argument] = getattr(fidelity, argument) if known else fidelity.settings.get(argument)
-        of = next((one for one in self.fidelities.values() if one.settings == fidelity.settings), fidelity)
-        if self.counts_steps and of.dt != fidelity.dt:  # a variant of a fidelity, of the same time
+        of = next((one for one in self.known_fidelities.values() if one.settings == fidelity.settings), fidelity)
+        if self.horizon and self.counts_steps and of.dt != fidelity.dt:  # a variant of a fidelity, of the same time
             found[self.horizon] = max(1, round(found[self.horizon] * of.dt / fidelity.dt))
         return {name: value for name, value in found.items() if value is not None}
 
@@ -176,7 +172,7 @@ class FunctionEnvironment(Environment):
         self.function = function
         self.name, self.space, self.loss_unit = function.name, function.space, function.loss_unit
         vars(self).update(
-            fidelities=function.fidelities,
+            fidelities=function.known_fidelities,
             Options=function.options_class,
             engines=(function.backend.engine,),
             devices=function.backend.devices,
@@ -264,7 +260,10 @@ class FunctionEnvironment(Environment):
         return range(first, first + self.function.seeds)
 
     def _find_device(self, device: str) -> str:
-        return self.function.backend.find_device(device)
+        return super()._find_device(self.function.backend.device if device == "auto" else device)
+
+    def _has_cuda(self) -> bool:
+        return self.function.backend.has_cuda()
 
     def _rows_per_part(self, rows: int) -> int:
         return min(rows, self.preferred_batch) or 1
@@ -363,3 +362,384 @@ def _check_precision(precision: Any, who: str) -> str:
     if precision not in ("float64", "float32"):
         raise ValueError(f"{who} takes precision float64 or float32; got {precision!r}")
     return str(precision)
+
+
+# ---- Functions of torch, NumPy, JAX and Warp, simulators with reset and step, and objects of one's own as
+# environments.
+
+LEAST_STEP = 1e-12  # of differences: losses are rounded to 1e-16 of themselves, and their difference is divided by it
+Mode = Literal["reverse", "forward"]
+Batch = Literal["vmap", "map"]
+
+
+def from_torch(
+    fn: Callable[..., Tensor],
+    space: ParameterSpace,
+    *,
+    vectorized: bool = True,
+    device: str = "cpu",
+    **said: Unpack[FunctionKeywords],
+) -> Environment:
+    """Make an environment of a torch function from points, shape (batch, dim), to losses, shape (batch,).
+
+    Gradients come by autograd. Each loss may depend on its own row only. With `vectorized=False` the function takes a
+    single point, shape (dim,), and returns one loss. Points lie on `device`, cpu or cuda. The other keywords are those
+    of `FunctionKeywords`: name, loss_unit, maximize, options, fidelities, horizon, seeds, precision, rows.
+
+    Raises ValueError for settings that the function does not take; evaluating raises it where the function returns no
+    losses of the batch, or losses that carry no gradient.
+    """
+    return _wrap(fn, space, _Torch(vectorized, device), said)
+
+
+def from_numpy(
+    fn: Callable[..., Any],
+    space: ParameterSpace,
+    *,
+    differences: float | None = None,
+    vectorized: bool = True,
+    **said: Unpack[FunctionKeywords],
+) -> Environment:
+    """Make an environment of a NumPy function from points, shape (batch, dim), to losses, shape (batch,).
+
+    The function may return (losses, gradients) instead, gradients of shape (batch, dim). If it returns losses only,
+    `differences` makes gradients by central differences with that step, a fraction of each parameter's range; at the
+    bounds they are one-sided, since the function is not asked beyond them. With `vectorized=False` the function takes a
+    single point, shape (dim,), and returns one loss, or that and its gradient. The other keywords are those of
+    `FunctionKeywords`: name, loss_unit, maximize, options, fidelities, horizon, seeds, precision, rows.
+
+    Raises ValueError where `differences` is no fraction of the bounds, or lost in rounding beside them.
+    """
+    step = None if differences is None else _step(differences, space)
+    return _wrap(fn, space, _NumPy(vectorized, step), said)
+
+
+def from_jax(
+    fn: Callable[..., Any],
+    space: ParameterSpace,
+    *,
+    mode: Mode = "reverse",
+    batch: Batch = "vmap",
+    **said: Unpack[FunctionKeywords],
+) -> Environment:
+    """Make an environment of a JAX function from one point, an array of shape (dim,), to its loss, of shape ().
+
+    Gradients come by reverse differentiation, or forward, which loops of unknown length need and few parameters
+    favour. `batch` says how many points are computed together: `vmap` vectorizes the function, `map` calls it point
+    after point, which functions without a batching rule and large simulations need. Batches smaller than `rows` are
+    padded to the next power of four, since the function is compiled for each size. It runs in its own precision,
+    whatever JAX is configured to. Settings are static: the function is compiled for each. The other keywords are those
+    of `FunctionKeywords`: name, loss_unit, maximize, options, fidelities, horizon, seeds, precision, rows.
+
+    Raises ValueError where JAX is not installed, and for other modes and batches; evaluating raises it where the
+    function returns no single number, or JAX cannot trace, differentiate or vectorize it.
+    """
+    for option, value, known in (("mode", mode, Mode), ("batch", batch, Batch)):
+        if value not in get_args(known):
+            raise ValueError(f"from_jax takes {option} {' or '.join(get_args(known))}; got {value!r}")
+    try:
+        from .engines.jax_functions import JaxBackend
+    except ImportError as error:
+        raise ValueError(f"from_jax needs JAX, which is not here ({error}): pip install jax") from error
+    return _wrap(fn, space, JaxBackend(mode, batch), said)
+
+
+def from_warp(
+    fn: Callable[..., Any],
+    space: ParameterSpace,
+    *,
+    device: str = "auto",
+    check_overwrites: bool = True,
+    **said: Unpack[FunctionKeywords],
+) -> Environment:
+    """Make an environment of a function that launches Warp kernels, from points to losses.
+
+    The function takes a Warp array of points, shape (batch, dim), and returns one of losses, shape (batch,), both of
+    its `precision`, by default float32; each loss may depend on its own row only. What it launches is recorded on a
+    tape, and the tape is played backwards for the gradients; the gradients of arrays that the function keeps are set to
+    zero after each evaluation. The losses are made with requires_grad=True.
+
+    A kernel that writes to an array which an earlier one has read makes gradients wrong without a word.
+    `check_overwrites` looks for that once, before the first gradient, and builds the function's kernels anew for it,
+    which may take long; leave it out for a simulator that is known to be right. The other keywords are those of
+    `FunctionKeywords`: name, loss_unit, maximize, options, fidelities, horizon, seeds, precision, rows.
+
+    Raises ValueError for other precisions and devices; evaluating raises it where the function returns no such array,
+    launches nothing, does not read its points, or writes to what was read.
+    """
+    from .engines.warp_functions import WarpBackend
+
+    return _wrap(fn, space, WarpBackend(check_overwrites, device), {"precision": "float32", **said})
+
+
+def from_step(
+    step: Callable[[Any], Any],
+    reset: Callable[..., Any],
+    space: ParameterSpace,
+    *,
+    steps: int,
+    differences: float | None = None,
+    **said: Unpack[FunctionKeywords],
+) -> Environment:
+    """Make an environment of a simulator with Gymnasium's `reset` and `step`: the loss is minus the sum of rewards.
+
+    A point holds the actions, the first one first; each is held for an equal share of the `steps` of an episode. An
+    episode starts with reset(seed=0), the same at every point, and ends early where `step` says terminated or
+    truncated. `step(action)` returns (observation, reward, terminated, truncated, info). Gradients come by central
+    `differences`, as for `from_numpy`.
+
+        gs.from_step(env.step, env.reset, gs.ParameterSpace.box([f"push {k}" for k in range(5)], -1, 1), steps=100)
+
+    Raises ValueError where the parameters are no whole number of actions.
+    """
+    steps = as_whole(steps, "from_step's steps", least=1)
+
+    def total(actions: NDArray[np.float64]) -> float:
+        reset(seed=0)
+        reward = 0.0
+        for action in actions[np.arange(steps) * len(actions) // steps]:
+            _, gained, terminated, truncated, *_ = step(action)
+            reward += float(gained)
+            if terminated or truncated:
+                break
+        return -reward
+
+    size = _action_size(step, space)
+    named: FunctionKeywords = {"name": "episode", **said}
+    return from_numpy(lambda x: total(x.reshape(-1, size)), space, differences=differences, vectorized=False, **named)
+
+
+def _action_size(step: Callable[[Any], Any], space: ParameterSpace) -> int:
+    """Return how many numbers an action has: those of the simulator's action space, where `step` is its method."""
+    simulator = getattr(step, "__self__", None)
+    shape = getattr(getattr(simulator, "action_space", None), "shape", None) or ()
+    size = int(np.prod(shape))
+    if space.dim % size:
+        raise ValueError(f"an action has {size} numbers, and {space.dim} parameters are no whole number of actions")
+    return size
+
+
+def _wrap(fn: Callable[..., Any], space: ParameterSpace, backend: Backend, said: FunctionKeywords) -> Environment:
+    if unknown := said.keys() - FunctionKeywords.__annotations__.keys():
+        raise TypeError(f"from_{backend.engine} takes no keyword {', '.join(sorted(unknown))}")
+    return FunctionEnvironment(Function(fn, space, backend, **said))
+
+
+@dataclass(frozen=True)
+class _Torch:
+    """Call functions of torch."""
+
+    vectorized: bool
+    device: str
+    engine: str = "torch"
+    devices: tuple[str, ...] = ("cpu", "cuda")
+
+    def has_cuda(self) -> bool:
+        """Say whether torch finds a CUDA device."""
+        return torch.cuda.is_available()
+
+    def bind(self, call: Function, settings: Mapping[str, Any], precision: str, device: str) -> Compute:
+        """Return what computes the function with these keyword arguments."""
+
+        def compute(x: Float[Tensor, "batch dim"], grad: bool) -> tuple[Tensor, Tensor | None, str]:
+            points = x.to(device, getattr(torch, precision), copy=True).requires_grad_(grad)
+            loss = self._losses(call, points, settings)
+            losses = _numbers(loss, f"the loss of {call.name}")
+            slope = _autograd(loss, points, call.name) if grad else None
+            return losses, slope, str(loss.dtype).removeprefix("torch.")
+
+        return compute
+
+    def _losses(self, call: Function, x: Float[Tensor, "batch dim"], settings: Mapping[str, Any]) -> Tensor:
+        if self.vectorized:
+            found = _called(call, x, settings)
+        else:
+            parts = [_called(call, point, settings) for point in x]
+            found = torch.stack(parts) if all(isinstance(one, Tensor) for one in parts) else parts[0]
+        if isinstance(found, tuple):
+            raise SimulatorError(
+                f"{call.name} must return losses alone, and torch differentiates them; got {len(found)} values "
+                "(from_numpy takes losses with gradients)"
+            )
+        if not isinstance(found, Tensor):
+            raise SimulatorError(f"{call.name} must return a tensor; got {type(found).__name__}")
+        check_shape(tuple(found.shape), (len(x),), "losses", call.name)
+        return found
+
+
+def _called(call: Function, x: Tensor, settings: Mapping[str, Any]) -> Any:
+    """Return what a function returns; say which precision it wants where torch refuses to mix two."""
+    try:
+        return call.fn(x, **settings)
+    except RuntimeError as error:
+        if "dtype" in str(error) and {"Float", "Double"} <= set(re.findall(r"\w+", str(error))):
+            other = "float32" if x.dtype == torch.float64 else "float64"
+            raise SimulatorError(
+                f"{call.name} mixes its points with numbers of another type ({first_line(error)}); pass "
+                f"precision={other!r} to from_torch, or convert its own with .to(x)"
+            ) from error
+        raise
+
+
+def _autograd(loss: Float[Tensor, " batch"], x: Float[Tensor, "batch dim"], name: str) -> Tensor:
+    (gradient,) = torch.autograd.grad(loss.sum(), x, allow_unused=True) if loss.requires_grad else (None,)
+    if gradient is None:
+        raise SimulatorError(
+            f"{name} returned losses that carry no gradient; compute them from x with torch operations, "
+            "or sample with gradients=0 (--no-gradients)"
+        )
+    return gradient.detach().to("cpu", torch.float64)
+
+
+@dataclass(frozen=True)
+class _NumPy:
+    """Call functions of NumPy."""
+
+    vectorized: bool
+    differences: float | None
+    device: str = "cpu"
+    engine: str = "numpy"
+    devices: tuple[str, ...] = ("cpu",)
+
+    def has_cuda(self) -> bool:
+        """Say no."""
+        return False
+
+    def bind(self, call: Function, settings: Mapping[str, Any], precision: str, device: str) -> Compute:
+        """Return what computes the function with these keyword arguments."""
+
+        def losses(x: Float[Tensor, "batch dim"]) -> tuple[Tensor, Tensor | None, str]:
+            return self._call(call, x, settings, precision)
+
+        def compute(x: Float[Tensor, "batch dim"], grad: bool) -> tuple[Tensor, Tensor | None, str]:
+            loss, slope, kind = losses(x)
+            if grad and slope is None:
+                slope = self._differences(lambda at: losses(at)[0], x, call)
+            return loss, slope if grad else None, kind
+
+        return compute
+
+    def _call(
+        self, call: Function, x: Float[Tensor, "batch dim"], settings: Mapping[str, Any], precision: str
+    ) -> tuple[Tensor, Tensor | None, str]:
+        points = x.numpy().astype(precision)  # a copy: what a function does to its points is its own affair
+        if self.vectorized:
+            result = call.fn(points, **settings)
+        else:
+            result = _columns([_copied(call.fn(point, **settings)) for point in points])
+        if isinstance(result, tuple) and len(result) != 2:
+            raise SimulatorError(
+                f"{call.name} must return losses, or (losses, gradients); got {len(result)} values, so drop the others"
+            )
+        loss, gradient = result if isinstance(result, tuple) else (result, None)
+        kind = str(np.asarray(loss).dtype)
+        losses = _numbers(loss, f"the loss of {call.name}")
+        check_shape(tuple(losses.shape), (len(x),), "losses", call.name)
+        if gradient is None:
+            return losses, None, kind
+        slope = _numbers(gradient, f"the gradient of {call.name}")
+        check_shape(tuple(slope.shape), tuple(x.shape), "gradients", call.name)
+        return losses, slope, kind
+
+    def _differences(
+        self, losses: Callable[[Tensor], Tensor], x: Float[Tensor, "batch dim"], call: Function
+    ) -> Float[Tensor, "batch dim"]:
+        """Return central differences, one-sided at the bounds; steps are fractions of the scaled box."""
+        if self.differences is None:
+            raise SimulatorError(
+                f"{call.name} returned losses without gradients; return (losses, gradients), pass differences=1e-4 "
+                "to from_numpy, or sample with gradients=0 (--no-gradients)"
+            )
+        space = call.space
+        lower, upper = space.to_values(space.lower), space.to_values(space.upper)
+        slopes, scaled = [], space.from_values(x)
+        for axis in range(space.dim):
+            step = torch.zeros_like(space.lower)
+            step[axis] = self.differences * (space.upper - space.lower)[axis]
+            ahead = torch.minimum(space.to_values(scaled + step), upper)
+            behind = torch.maximum(space.to_values(scaled - step), lower)
+            apart = (ahead - behind)[:, axis]
+            slopes.append((losses(ahead) - losses(behind)) / apart)
+        return torch.stack(slopes, dim=1)
+
+
+def _numbers(values: object, what: str) -> Tensor:
+    """Return a copy of a function's numbers as a tensor. Raises SimulatorError for what is none."""
+    try:
+        return as_tensor(values, what).clone()
+    except ValueError as error:
+        raise SimulatorError(str(error)) from None
+
+
+def _copied(result: Any) -> Any:
+    """Return a copy of what a function returned: one that returns its own buffer fills it anew at the next point."""
+    return tuple(map(_copied, result)) if isinstance(result, tuple) else np.array(result, subok=True)  # masks stay
+
+
+def _columns(found: Sequence[Any]) -> Any:
+    """Return results of single points as columns; what is none is returned for the caller to refuse."""
+    if found and isinstance(found[0], tuple):
+        return tuple(list(column) for column in zip(*found, strict=True))
+    return list(found)
+
+
+def _step(differences: object, space: ParameterSpace) -> float:
+    """Return a step, a fraction of the bounds, that is no larger than they are and not lost in rounding."""
+    fraction = float(as_tensor(differences, "from_numpy's differences"))
+    if not LEAST_STEP <= fraction <= 1:
+        raise ValueError(
+            f"from_numpy takes differences from {LEAST_STEP:g} to 1, a fraction of the bounds; got {fraction}"
+        )
+    farthest = torch.maximum(space.lower.abs(), space.upper.abs())
+    lost = (farthest + fraction * (space.upper - space.lower) == farthest).tolist()
+    if any(lost):
+        name = space.names[lost.index(True)]
+        raise ValueError(f"from_numpy's differences of {fraction:g} are lost in rounding beside the bounds of {name}")
+    return fraction
+
+
+class GivenEnvironment(Environment):
+    """An object of one's own with `space` and `evaluate` as an environment.
+
+    The model is the object's own, and so are its parameters and its loss.
+    """
+
+    model_version = 0  # nothing says when an object changes; stored results are compared with it by evaluating it
+    engines = ("object",)
+
+    def __init__(self, given: Any, /, **settings: Any) -> None:
+        self.given, self.space = given, given.space
+        self.name = str(getattr(given, "name", type(given).__name__))
+        for name in ("loss_unit", "beyond_box", "decisions", "whole_batches"):
+            vars(self)[name] = getattr(given, name, getattr(type(self), name))
+        super().__init__(**settings)
+
+    @classmethod
+    def of(cls, given: Any) -> GivenEnvironment:
+        """Return an object as an environment. Raises ValueError that says what it lacks."""
+        wanted = {"space": isinstance(getattr(given, "space", None), ParameterSpace)}
+        wanted["evaluate"] = callable(getattr(given, "evaluate", None))
+        if lacking := [name for name, there in wanted.items() if not there]:
+            raise ValueError(
+                f"{type(given).__name__} is no simulator: it has no {' and no '.join(lacking)}. An object needs a "
+                "ParameterSpace as `space` and a method evaluate(x, *, grad=True) that returns an Evaluation; a "
+                "function becomes an environment by gs.from_torch, from_jax, from_numpy or from_warp"
+            )
+        return cls(given)
+
+    @property
+    def preferred_batch(self) -> int:  # type: ignore[override] # read only
+        """Number of points worth evaluating at once."""
+        return min(int(getattr(self.given, "preferred_batch", super().preferred_batch)), self._max_rows)
+
+    def events(self, x: Float[Tensor, "batch dim"]) -> Mapping[str, Any]:
+        """Count what happens at each point, where the object says that."""
+        counts: Callable[[Tensor], Mapping[str, Any]] | None = getattr(self.given, "events", None)
+        return {} if counts is None else counts(x)
+
+    def _remake(self, **settings: Any) -> Environment:
+        return GivenEnvironment(self.given, **settings)
+
+    def _evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
+        found: Evaluation = self.given.evaluate(x, grad=grad)
+        return found

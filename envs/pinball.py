@@ -15,11 +15,9 @@ from torch.nn.functional import normalize, pad
 from ..landscapes.episode import Part, View
 from ..landscapes.objective import Evaluation, Status
 from ..landscapes.space import ParameterSpace
-from .base import Environment, Episode, Fidelity, MaterialRange, ModelPart, Work
-from .batching import Pool
-from .engines.balls.board import INERTIA, RIGID, Board
-from .engines.balls.impacts import SPARE, Solver
-from .options import EpisodeOptions
+from .base import Environment, Episode, Fidelity, MaterialRange, ModelPart, Pool, Work
+from .engines.balls.impacts import INERTIA, RIGID, SPARE, Board, Solver
+from .records import EpisodeOptions
 
 WIDTH, HEIGHT = 8.0, 10.0  # the board [m]
 BALL, BAR = 0.25, 0.1  # radius of the ball, half the thickness of a bar [m]

@@ -11,24 +11,94 @@ A program or a notebook registers a class by `register`, and the command takes w
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import ast
+import hashlib
+import re
+import sys
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from functools import cache
+from importlib import import_module
 from importlib.metadata import entry_points
+from importlib.util import decode_source, module_from_spec, spec_from_file_location
 from pathlib import Path
-from types import BuiltinFunctionType, FunctionType, MethodType
+from types import BuiltinFunctionType, FunctionType, MethodType, ModuleType
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from ..landscapes.storage.files import resolve
-from .engines import ENGINES
-from .importing import IN_FILE, import_named, refuse_absent_name
-from .installed import EXTRAS as EXTRAS
-from .installed import install_line, is_installed
+from .engines import ENGINES, EXTRAS, install_line, is_installed
 from .records import unknown_fidelity
 
 if TYPE_CHECKING:
     from .base import Environment, Fidelity
+
+# ---- Import what an environment's class is in: a module by its name, or somebody's file by its path.
+
+IN_FILE = re.compile(r".+\.py:\w+", re.DOTALL)  # FILE.py:NAME
+BINDS_UNSEEN = re.compile(r"import\s*\(?\s*\*|\b(globals|locals|vars|setattr|exec|eval|__dict__|modules)\b")
+
+
+def import_named(name: str) -> ModuleType:
+    """Import a module by its name, or a file by its path, once; what a file raises is said with its name.
+
+    A file finds modules beside it, as a program does. Raises ImportError for a module and ValueError for a file.
+    """
+    if not name.endswith(".py"):
+        return import_module(name)
+    known = f"gradscape_file_{hashlib.sha256(name.encode()).hexdigest()[:12]}"
+    if known not in sys.modules:
+        try:
+            sys.modules[known] = _load_file(known, name)
+        except SystemExit as error:
+            raise ValueError(
+                f"{name} called sys.exit({'' if error.code is None else repr(error.code)}) while it was imported; let "
+                'it do that as a program only, under `if __name__ == "__main__":`'
+            ) from error
+        except Exception as error:
+            raise ValueError(f"{name} cannot be imported: {type(error).__name__}: {error}") from error
+    return sys.modules[known]
+
+
+def _load_file(known: str, path: str) -> ModuleType:
+    spec = spec_from_file_location(known, path)
+    assert spec is not None  # of a path that ends in .py there is one,
+    assert spec.loader is not None  # which is loaded
+    module = module_from_spec(spec)
+    if (beside := str(Path(path).parent)) not in sys.path:
+        sys.path.append(beside)
+    sys.modules[known] = module  # dataclasses look there for their own module
+    try:
+        spec.loader.exec_module(module)
+    finally:
+        del sys.modules[known]
+    return module
+
+
+def refuse_absent_name(file: Path, name: str, path: str) -> None:
+    """Raise ValueError where a file has no such name in it, with those it defines; `path` is what it was called.
+
+    The file is read, not run. A file that may bind names which it does not spell is left to whoever imports it.
+    """
+    try:
+        text = decode_source(file.read_bytes())
+        there = [one for one in _defined(ast.parse(text)) if not one.startswith("_")]
+    except (SyntaxError, ValueError):
+        return  # which the import says better
+    if BINDS_UNSEEN.search(text) or re.search(rf"\b{name}\b", text):
+        return
+    raise ValueError(f"{path} holds no {name}; it has {', '.join(there) or 'no name at all'}")
+
+
+def _defined(module: ast.Module) -> Iterator[str]:
+    """Yield what a module calls its classes, functions and values, one after the other."""
+    for statement in module.body:
+        if isinstance(statement, ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+            yield statement.name
+        elif isinstance(statement, ast.Assign | ast.AnnAssign):
+            targets = statement.targets if isinstance(statement, ast.Assign) else [statement.target]
+            yield from (node.id for one in targets for node in ast.walk(one) if isinstance(node, ast.Name))
+
 
 Kind = TypeVar("Kind", bound="type[Environment] | Environment")
 GROUP = "gradscape.environments"
@@ -54,121 +124,73 @@ class Entry:
     extra: str = ""
 
 
-def _mjx_entry(name: str, target: str, dim: str, parameters: str, model: str) -> Entry:
-    return Entry(name, f"gradscape.envs.mjx.scenes:{target}", dim, parameters, f"MuJoCo in JAX: {model}", SCENE, "mjx")
+VELOCITY, CLOTH = "initial velocity x, y, z [m/s]", "mass-spring cloth, held at two corners, over a floor"
+BALL = "planar rigid ball, hard contacts with restitution"
 
 
-def _newton_entry(name: str, target: str, model: str) -> Entry:
-    where, parameters = f"gradscape.envs.newton.scenes:{target}", "initial velocity x, y, z [m/s]"
-    return Entry(name, where, "3", parameters, f"Newton: {model}", SCENE[:2], "newton")
+def _scene(name: str, target: str, dim: str, parameters: str, model: str) -> Entry:
+    return Entry(name, f"gradscape.envs.{target}", dim, parameters, model, SCENE)
 
 
-def _function_entry(name: str, target: str, model: str, dim: str = "2") -> Entry:
-    return Entry(name, f"gradscape.envs.functions:{target}", dim, "x0, x1, ... (no unit)", model, ("exact",))
-
-
-def _plasticine_entry(name: str, target: str, dim: str, tools: str, task: str) -> Entry:
+def _plasticine(name: str, target: str, dim: str, tools: str, task: str) -> Entry:
     parameters = f"5 x ({tools}{'' if ':' in tools else ': x, y, z'}), shares (no unit)"
     model = f"MLS-MPM: von Mises plasticine, tools; {task}"
-    return Entry(name, f"gradscape.envs.mpm.plasticine_scenes:{target}", dim, parameters, model, SCENE)
+    return _scene(name, f"mpm.plasticine_scenes:{target}", dim, parameters, model)
+
+
+def _mjx(name: str, target: str, dim: str, parameters: str, model: str) -> Entry:
+    return replace(_scene(name, f"mjx.scenes:{target}", dim, parameters, f"MuJoCo in JAX: {model}"), extra="mjx")
+
+
+def _newton(name: str, target: str, model: str) -> Entry:
+    found = _scene(name, f"newton.scenes:{target}", "3", VELOCITY, f"Newton: {model}")
+    return replace(found, fidelities=SCENE[:2], extra="newton")
+
+
+def _function(name: str, target: str, model: str, dim: str = "2") -> Entry:
+    return replace(_scene(name, f"functions:{target}", dim, "x0, x1, ... (no unit)", model), fidelities=("exact",))
 
 
 BUILTIN = (
-    Entry(
-        "bounce",
-        "gradscape.envs.bounce:Bounce",
-        "3",
-        "initial velocity x, y, z [m/s]",
-        "one ball, penalty contact with friction",
-        SCENE,
-    ),
-    Entry(
-        "cartpole",
-        "gradscape.envs.cartpole:Cartpole",
-        "400",
-        "100 x (cart velocity [m/s], torque at three joints [N m])",
+    _scene("bounce", "bounce:Bounce", "3", VELOCITY, "one ball, penalty contact with friction"),
+    _scene(
+        "cartpole", "cartpole:Cartpole", "400", "100 x (cart velocity [m/s], torque at three joints [N m])",
         "three-link chain on a cart, generalised coordinates",
-        SCENE,
     ),
-    Entry(
-        "fluid",
-        "gradscape.envs.mpm.fluid:Fluid",
-        "10",
-        "5 x (ladle speed x, ladle speed y) [· 0.2 m/s]",
+    _scene(
+        "fluid", "mpm.fluid:Fluid", "10", "5 x (ladle speed x, ladle speed y) [· 0.2 m/s]",
         "MLS-MPM: viscous fluid, elastic cube, moving ladle",
-        SCENE,
     ),
-    Entry(
-        "pinball-2",
-        "gradscape.envs.pinball:Pinball2",
-        "2",
-        "angles of 1 x 2 colliders [rad]",
-        "planar rigid ball, hard contacts with restitution",
-        SCENE,
-    ),
-    Entry(
-        "pinball-16",
-        "gradscape.envs.pinball:Pinball16",
-        "16",
-        "angles of 4 x 4 colliders, row by row [rad]",
-        "planar rigid ball, hard contacts with restitution",
-        SCENE,
-    ),
-    Entry(
-        "swing-velocity",
-        "gradscape.envs.sheets.swing:SwingVelocity",
-        "3",
-        "initial velocity x, y, z [m/s]",
-        "mass-spring cloth, held at two corners, over a floor",
-        SCENE,
-    ),
-    Entry(
-        "swing-stiffness",
-        "gradscape.envs.sheets.swing:SwingStiffness",
-        "16",
-        "stiffness of 4 x 4 patches [N/m]",
-        "mass-spring cloth, held at two corners, over a floor",
-        SCENE,
-    ),
-    Entry(
-        "flip",
-        "gradscape.envs.sheets.flip:Flip",
-        "15",
-        "5 x (pan x [m], pan y [m], tilt [rad])",
-        "mass-spring disc, moving pan",
-        SCENE,
-    ),
-    _plasticine_entry("assembly", "Assembly", "30", "2 spheres", "lift a ball onto a box"),
-    _plasticine_entry("pinch", "Pinch", "15", "sphere", "dent a cube"),
-    _plasticine_entry("rolling-pin", "RollingPin", "15", "pin: roll, turn, height", "roll a slab flat"),
-    _plasticine_entry("rope", "Rope", "30", "2 spheres", "bend a rope around a post"),
-    _plasticine_entry("table", "Table", "15", "sphere", "bend a table's leg"),
-    _plasticine_entry("torus", "Torus", "15", "ring", "press a ring into a slab"),
-    _plasticine_entry("triple-move", "TripleMove", "90", "6 spheres", "carry three blocks"),
-    _plasticine_entry("writer", "Writer", "15", "pen", "write into a slab"),
-    _mjx_entry("mjx-drop", "Drop", "3", "initial velocity x, y, z [m/s]", "a ball on a plane"),
-    _mjx_entry("mjx-bounce", "MjxBounce", "3", "initial velocity x, y, z [m/s]", "bounce's ball and target"),
-    _mjx_entry(
-        "mjx-cartpole",
-        "MjxCartpole",
-        "400",
-        "100 x (cart velocity [m/s], 3 torques [N m])",
-        "cartpole's chain",
-    ),
-    _mjx_entry("mjx-push", "Push", "10", "5 x (ball velocity x, y) [m/s]", "a box pushed across friction"),
-    _newton_entry("newton-flight", "Flight", "a sphere in free flight"),
-    _newton_entry("newton-ball", "Ball", "bounce's ball and target"),
-    _newton_entry("newton-cloth", "ClothThrow", "a cloth that bounces off a floor"),
-    _function_entry("ackley", "Ackley", "many shallow minima around a funnel", "any"),
-    _function_entry("beale", "Beale", "flat plain with sharp corner peaks"),
-    _function_entry("branin", "Branin", "three equal minima in a smooth valley"),
-    _function_entry("griewank", "Griewank", "regular ripples on a bowl", "any"),
-    _function_entry("levy", "Levy", "wavy steps", "any"),
-    _function_entry("rastrigin", "Rastrigin", "a lattice of minima on a bowl", "any"),
-    _function_entry("rosenbrock", "Rosenbrock", "a bent, narrow valley", "any"),
-    _function_entry("six-hump-camel", "SixHumpCamel", "six minima, two of them global"),
-    _function_entry("styblinski-tang", "StyblinskiTang", "two minima along each axis", "any"),
-)
+    _scene("pinball-2", "pinball:Pinball2", "2", "angles of 1 x 2 colliders [rad]", BALL),
+    _scene("pinball-16", "pinball:Pinball16", "16", "angles of 4 x 4 colliders, row by row [rad]", BALL),
+    _scene("swing-velocity", "sheets.swing:SwingVelocity", "3", VELOCITY, CLOTH),
+    _scene("swing-stiffness", "sheets.swing:SwingStiffness", "16", "stiffness of 4 x 4 patches [N/m]", CLOTH),
+    _scene("flip", "sheets.flip:Flip", "15", "5 x (pan x [m], pan y [m], tilt [rad])", "mass-spring disc, moving pan"),
+    _plasticine("assembly", "Assembly", "30", "2 spheres", "lift a ball onto a box"),
+    _plasticine("pinch", "Pinch", "15", "sphere", "dent a cube"),
+    _plasticine("rolling-pin", "RollingPin", "15", "pin: roll, turn, height", "roll a slab flat"),
+    _plasticine("rope", "Rope", "30", "2 spheres", "bend a rope around a post"),
+    _plasticine("table", "Table", "15", "sphere", "bend a table's leg"),
+    _plasticine("torus", "Torus", "15", "ring", "press a ring into a slab"),
+    _plasticine("triple-move", "TripleMove", "90", "6 spheres", "carry three blocks"),
+    _plasticine("writer", "Writer", "15", "pen", "write into a slab"),
+    _mjx("mjx-drop", "Drop", "3", VELOCITY, "a ball on a plane"),
+    _mjx("mjx-bounce", "MjxBounce", "3", VELOCITY, "bounce's ball and target"),
+    _mjx("mjx-cartpole", "MjxCartpole", "400", "100 x (cart velocity [m/s], 3 torques [N m])", "cartpole's chain"),
+    _mjx("mjx-push", "Push", "10", "5 x (ball velocity x, y) [m/s]", "a box pushed across friction"),
+    _newton("newton-flight", "Flight", "a sphere in free flight"),
+    _newton("newton-ball", "Ball", "bounce's ball and target"),
+    _newton("newton-cloth", "ClothThrow", "a cloth that bounces off a floor"),
+    _function("ackley", "Ackley", "many shallow minima around a funnel", "any"),
+    _function("beale", "Beale", "flat plain with sharp corner peaks"),
+    _function("branin", "Branin", "three equal minima in a smooth valley"),
+    _function("griewank", "Griewank", "regular ripples on a bowl", "any"),
+    _function("levy", "Levy", "wavy steps", "any"),
+    _function("rastrigin", "Rastrigin", "a lattice of minima on a bowl", "any"),
+    _function("rosenbrock", "Rosenbrock", "a bent, narrow valley", "any"),
+    _function("six-hump-camel", "SixHumpCamel", "six minima, two of them global"),
+    _function("styblinski-tang", "StyblinskiTang", "two minima along each axis", "any"),
+)  # fmt: skip
 
 
 @cache
@@ -247,7 +269,7 @@ def find_environment(what: Any) -> type[Environment] | Environment:
         return _import_from_file(what) if IN_FILE.fullmatch(what) else registered_environment(what)
     if isinstance(what, Environment) or (isinstance(what, type) and issubclass(what, Environment)):
         return what
-    from .adapters import GivenEnvironment
+    from .function import GivenEnvironment
 
     if isinstance(what, FunctionType | BuiltinFunctionType | MethodType):
         raise ValueError(
@@ -334,8 +356,7 @@ def source_of(env: Environment) -> str | type[Environment] | Environment:
 
     A class is enough where its settings make the environment again; a function goes there itself.
     """
-    from .adapters import GivenEnvironment
-    from .function import FunctionEnvironment
+    from .function import FunctionEnvironment, GivenEnvironment
 
     entry = entries().get(env.name)
     if entry is not None and isinstance(entry.target, str):

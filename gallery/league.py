@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..envs.batching import cores
+from ..envs.base import cores
 from ..jobs.league import Fixture, LeagueJob
 from ..jobs.scene import SceneSpec
 from ..jobs.watch import Watch

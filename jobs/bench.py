@@ -17,7 +17,7 @@ from torch import Tensor
 
 from ..envs.base import Environment, Work
 from ..envs.engines import find_engine
-from ..envs.engines.profiling import count_compiled_modules, time_kernels
+from ..envs.engines.launches import count_compiled_modules, time_kernels
 from ..envs.engines.runtime import cores, device_names, free_memory
 from ..landscapes.capacity import Need, require
 from ..landscapes.cost import duration

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from ..envs.installed import installed_version
+from ..envs.engines import installed_version
 from ..envs.registry import EXTRAS, entries, environment_class, installs
 from ..landscapes.capacity import require
 from ..landscapes.conformance.finding import FAIL, UNEXPECTED

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from .. import __version__
-from ..envs.installed import installed_version
+from ..envs.engines import installed_version
 from ..envs.registry import find_environment, make, registered_environment
 from ..landscapes.convert import from_json
 from ..landscapes.identity import MODEL_VERSION, PACKAGE, VERSIONS

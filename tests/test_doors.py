@@ -239,6 +239,6 @@ def test_what_is_no_simulator_is_refused_in_words(what: str, said: str, here: Pa
 
 
 def _module(folder: Path, name: str = "doors.py") -> Any:
-    from gradscape.envs.importing import import_named
+    from gradscape.envs.registry import import_named
 
     return import_named(str(folder / name))

@@ -8,10 +8,10 @@ import numpy as np
 import torch
 
 import gradscape
+from gradscape.envs.engines.mpm.boundaries import Kind, Tool, ToolsInRoom
 from gradscape.envs.engines.mpm.materials import Elastic
 from gradscape.envs.engines.mpm.model import Body, Model
 from gradscape.envs.engines.mpm.solver import Solver
-from gradscape.envs.engines.mpm.tools import Kind, Tool, ToolsInRoom
 from gradscape.envs.engines.runtime import to_torch
 
 from .protocol import Simulation, run

@@ -1,9 +1,78 @@
 """Simulation engines: the only place that knows Warp, Taichi, MuJoCo or Newton."""
 
-from . import mjx, newton, taichi, warp
-from .engine import Engine
+from __future__ import annotations
 
-ENGINES = {engine.name: engine for engine in (warp.ENGINE, taichi.ENGINE, mjx.ENGINE, newton.ENGINE)}
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from importlib.metadata import PackageNotFoundError, version
+
+EXTRAS = {"mjx": ("mujoco", "mujoco-mjx", "jax"), "newton": ("newton",)}  # of this package, and what each brings
+
+
+def installed_version(package: str) -> str | None:
+    """Return the version of a package, without importing it; None where it is not installed."""
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
+
+
+def is_installed(package: str) -> bool:
+    """Say whether a package is installed, without importing it."""
+    return installed_version(package) is not None
+
+
+def install_line(extra: str) -> str:
+    """Return the command that installs an extra of this package."""
+    return f"pip install 'gradscape[{extra}]'"
+
+
+@dataclass(frozen=True)
+class Engine:
+    """Describe an engine without loading it.
+
+    `solvers` maps what is simulated (mpm, springs) to the module with its solver, from this folder on. An engine that
+    is `deterministic` gives the same bits every time, on a GPU too, whatever else is in a batch. Solvers of a
+    `concurrent` engine run beside each other in the threads of one process; a solver of any other has all cores to
+    itself. A `profiled` engine tells the time by kernel. An engine that is not always installed comes with an `extra`
+    of this package. `newest_python` is the last Python that it has wheels for, where that is not the newest there is.
+    """
+
+    name: str
+    solvers: Mapping[str, str] = field(default_factory=dict)
+    deterministic: bool = True
+    concurrent: bool = True
+    profiled: bool = False
+    extra: str = ""
+    newest_python: tuple[int, int] | None = None
+
+    def explain(self, error: ImportError) -> str:
+        """Return why the engine cannot be imported here, and what to do."""
+        if self.newest_python and sys.version_info[:2] > self.newest_python:
+            newest, here = (".".join(map(str, one)) for one in (self.newest_python, sys.version_info[:2]))
+            return (
+                f"{self.name.capitalize()} has no wheels past Python {newest}, and this is Python {here}; take engine "
+                f"warp, or install gradscape with Python {newest}"
+            )
+        return f"{error}; {install_line(self.extra)}" if self.extra else str(error)
+
+
+ENGINES = {
+    engine.name: engine
+    for engine in (
+        Engine("warp", {"mpm": "mpm.solver", "springs": "sheets.springs"}, profiled=True),  # of every simulated scene
+        Engine(  # the independent reference: solvers written again in another language, with the compiler's gradients
+            "taichi",
+            {"mpm": "taichi.mpm", "springs": "taichi.springs"},
+            deterministic=False,
+            concurrent=False,
+            newest_python=(3, 12),
+        ),
+        Engine("mjx", {"rollout": "mjx.rollout"}, concurrent=False, extra="mjx"),  # MuJoCo in JAX
+        Engine("newton", {"rollout": "newton.rollout"}, concurrent=False, extra="newton"),  # by Warp's tape
+    )
+}
 
 
 def find_engine(name: str) -> Engine:

@@ -29,16 +29,13 @@ class JaxBackend:
 
     mode: str
     batch: str
+    device: str = "auto"
     engine: str = "jax"
     devices: tuple[str, ...] = ("cpu", "cuda")
 
-    def find_device(self, device: str) -> str:
-        """Return the device that auto stands for, JAX's default, or the one named. Raises ValueError for no device."""
-        if device == "auto":
-            return "cpu" if jax.default_backend() == "cpu" else "cuda"
-        if device not in self.devices or (device == "cuda" and jax.default_backend() == "cpu"):
-            raise ValueError(f"from_jax runs on cpu, and on cuda where JAX finds a device; got device {device!r}")
-        return device
+    def has_cuda(self) -> bool:
+        """Say whether JAX computes on a CUDA device by default."""
+        return bool(jax.default_backend() != "cpu")
 
     def bind(self, call: Function, settings: Mapping[str, Any], precision: str, device: str) -> Compute:
         """Return what computes the function with these keyword arguments, which are static."""

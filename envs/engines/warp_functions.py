@@ -28,20 +28,14 @@ CORRUPTS = "This may corrupt gradient computation"  # how Warp ends what it says
 class WarpBackend:
     """Call functions that launch Warp kernels."""
 
-    device: str
     check_overwrites: bool
+    device: str = "auto"
     engine: str = "warp"
     devices: tuple[str, ...] = ("cpu", "cuda")
 
-    def find_device(self, device: str) -> str:
-        """Return the device that auto stands for, or the one named. Raises ValueError where it is not there."""
-        wanted = self.device if device == "auto" else device
-        found = ("cuda" if cuda_available() else "cpu") if wanted == "auto" else wanted
-        if found not in self.devices or (found == "cuda" and not cuda_available()):
-            raise ValueError(
-                f"from_warp runs on auto, cpu, or cuda where there is a CUDA device; got device {wanted!r}"
-            )
-        return found
+    def has_cuda(self) -> bool:
+        """Say whether Warp finds a CUDA device."""
+        return cuda_available()
 
     def bind(self, call: Function, settings: Mapping[str, Any], precision: str, device: str) -> Compute:
         """Return what computes the function with these keyword arguments."""

@@ -16,7 +16,7 @@ from ...landscapes.episode import Part, View
 from ...landscapes.objective import Evaluation
 from ...landscapes.space import ParameterSpace
 from ..base import Environment, Episode, Fidelity, Work
-from ..options import EpisodeOptions
+from ..records import EpisodeOptions
 
 ROWS = 16
 FRAMES = 240  # of an episode that is drawn, at most

@@ -19,8 +19,8 @@ from ..engines.mpm.boundaries import LadleInTank
 from ..engines.mpm.materials import Elastic
 from ..engines.mpm.materials import Fluid as Liquid
 from ..engines.mpm.model import Body, Model
-from ..options import EpisodeOptions
 from ..outlines import skin
+from ..records import EpisodeOptions
 from .scene import SEGMENTS, STEPS, MpmScene, Stage
 
 TANK_WIDTH, TANK_HEIGHT, FILL = 0.4, 0.2, 0.15  # the tank, and the depth of the syrup [m]

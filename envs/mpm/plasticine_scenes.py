@@ -5,10 +5,9 @@ from __future__ import annotations
 from typing import ClassVar
 
 from ..base import Fidelity, ModelPart
-from ..engines.mpm.tools import STICKY, Kind, Tool
-from .plasticine import DEMONSTRATION, Plasticine
-from .plasticine_model import Anchor, Piece, Scene, fidelities
-from .shapes import Ball, Box, Point, Ring
+from ..engines.mpm.boundaries import STICKY, Kind, Tool
+from .plasticine import DEMONSTRATION, Anchor, Piece, Plasticine, Scene, fidelities
+from .targets import Ball, Box, Point, Ring
 
 SLAB = Piece(Box((0.5, 0.05, 0.5), (0.3, 0.1, 0.3)), 10_000)
 

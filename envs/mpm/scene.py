@@ -15,11 +15,10 @@ from torch import Tensor
 
 from ...landscapes.episode import Part, View
 from ...landscapes.objective import Evaluation, Status
-from ..base import Environment, Episode, Work
-from ..batching import Pool, copied
+from ..base import Environment, Episode, Pool, Work, copied
+from ..controls import describe_motion, watch
 from ..engines.mpm.model import Model
 from ..engines.mpm.solver import Solver, capacity, memory
-from ..observation import describe_motion, watch
 
 SEGMENTS, STEPS = 5, 50  # of the controls; control steps in an episode of horizon 1
 

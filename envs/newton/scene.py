@@ -14,9 +14,8 @@ from torch import Tensor
 from ...landscapes.episode import Part, View
 from ...landscapes.objective import Evaluation
 from ...landscapes.space import ParameterSpace
-from ..base import Environment, Episode, Work
-from ..batching import Pool
-from ..options import EpisodeOptions
+from ..base import Environment, Episode, Pool, Work
+from ..records import EpisodeOptions
 
 GRAVITY = 9.8  # [m/s^2]
 FRAMES = 240  # of an episode that is drawn, at most

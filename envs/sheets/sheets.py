@@ -15,12 +15,11 @@ from torch import Tensor
 
 from ...landscapes.episode import Part, View
 from ...landscapes.objective import Evaluation, Status
-from ..base import Environment, Episode, Work
-from ..batching import Pool, copied
+from ..base import Environment, Episode, Pool, Work, copied
+from ..controls import describe_motion, watch
 from ..engines.sheets.contact import Rule
 from ..engines.sheets.springs import Sheet, Solver, capacity
-from ..observation import describe_motion, watch
-from ..options import EpisodeOptions
+from ..records import EpisodeOptions
 
 FRAME = 0.01  # between the frames of an episode [s]
 REACH = 0.1  # what a policy measures lengths by [m]

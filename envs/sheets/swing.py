@@ -14,8 +14,7 @@ from torch import Tensor
 
 from ...landscapes.episode import Part, View
 from ...landscapes.space import ParameterSpace
-from ..base import Fidelity, ModelPart
-from ..batching import copied
+from ..base import Fidelity, ModelPart, copied
 from ..engines.sheets.contact import Floor
 from ..engines.sheets.springs import Sheet
 from ..outlines import triangles

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gradscape.envs.engines.balls.board import Board
+from gradscape.envs.engines.balls.impacts import Board
 
 SLOW = 0.2  # impacts slower than this [m/s] come close to resting, which is not modelled here
 

@@ -6,8 +6,7 @@ import pytest
 import torch
 
 from gradscape.envs.base import Environment
-from gradscape.envs.engines import ENGINES
-from gradscape.envs.engines.engine import Engine
+from gradscape.envs.engines import ENGINES, Engine
 from gradscape.envs.registry import entries, environment_class, make
 from gradscape.landscapes.objective import Status
 from gradscape.landscapes.space import ParameterSpace

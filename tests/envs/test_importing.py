@@ -6,8 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from gradscape.envs.importing import import_named
-from gradscape.envs.registry import make, refuse_unknown
+from gradscape.envs.registry import import_named, make, refuse_unknown
 
 SPELLED = {  # files that hold a Bowl, or may
     "assigned": "Bowl = 1\n",

@@ -4,11 +4,11 @@ import torch
 from gradscape.envs.base import Fidelity
 from gradscape.envs.cartpole import SPAN as CONTROL_SPAN
 from gradscape.envs.cartpole import TEMPO
+from gradscape.envs.controls import watch
 from gradscape.envs.mpm.fluid import SPAN
 from gradscape.envs.mpm.fluid import Fluid as FluidScene
-from gradscape.envs.mpm.plasticine_model import SPAN as SOFT_SPAN
+from gradscape.envs.mpm.plasticine import SPAN as SOFT_SPAN
 from gradscape.envs.mpm.scene import STEPS, MpmScene
-from gradscape.envs.observation import watch
 from gradscape.envs.registry import entries, environment_class, make
 
 from .scenes import of_family

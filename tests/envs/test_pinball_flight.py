@@ -5,8 +5,7 @@ import pytest
 import torch
 
 from gradscape.envs.base import Fidelity
-from gradscape.envs.engines.balls.board import Board
-from gradscape.envs.engines.balls.impacts import Solver
+from gradscape.envs.engines.balls.impacts import Board, Solver
 from gradscape.envs.pinball import BALL, BAR, HEIGHT, WIDTH, Pinball2, Pinball16
 
 from .pinball_oracle import end_of_flight

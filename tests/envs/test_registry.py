@@ -7,8 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from gradscape.envs.engines import ENGINES
-from gradscape.envs.engines.engine import Engine
+from gradscape.envs.engines import ENGINES, Engine
 from gradscape.envs.registry import BUILTIN, GROUP, entries, environment_class, make
 
 ENVIRONMENT = """

@@ -8,8 +8,7 @@ import warp as wp
 
 from gradscape.envs.base import Environment, Fidelity, Work
 from gradscape.envs.bounce import Bounce
-from gradscape.envs.engines.launches import Launches
-from gradscape.envs.engines.profiling import KernelTime, time_kernels
+from gradscape.envs.engines.launches import KernelTime, Launches, time_kernels
 from gradscape.envs.engines.runtime import cuda_available
 from gradscape.envs.mpm.fluid import Fluid
 from gradscape.jobs.bench import BenchJob, alternate

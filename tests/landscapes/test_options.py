@@ -6,7 +6,7 @@ from typing import Literal
 
 import pytest
 
-from gradscape.envs.options import EpisodeOptions
+from gradscape.envs.records import EpisodeOptions
 from gradscape.envs.registry import entries, environment_class
 from gradscape.landscapes.options import NoOptions, describe, in_full, read_options
 from gradscape.optim.registry import methods, optimizer_class

@@ -1,5 +1,1 @@
-"""The engine MJX: MuJoCo in JAX."""
-
-from ..engine import Engine
-
-ENGINE = Engine("mjx", {"rollout": "mjx.rollout"}, concurrent=False, extra="mjx")
+"""MuJoCo in JAX."""

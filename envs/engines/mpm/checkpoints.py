@@ -7,8 +7,8 @@ from typing import Any, NamedTuple, TypeVar
 import warp as wp
 
 from ..runtime import precision
-from .cells import Lists
-from .exact import LANES, SUMS
+from .boundaries import LANES, SUMS
+from .columns import Lists
 from .model import Box, Model, place_grid
 
 T = TypeVar("T")

@@ -8,12 +8,9 @@ import warp as wp
 from .. import cpp
 from ..launches import blocks
 from ..runtime import precision
-from .boundaries import Boundary
-from .cells import SEGMENT
-from .exact import LANES
-from .nodes import node_taker
+from .boundaries import LANES, Boundary
+from .columns import PARTS, SEGMENT, node_taker
 from .stencil import lattice
-from .walk import PARTS
 
 
 def velocity_on(name: str, boundary: Boundary, *, columns: bool) -> Any:

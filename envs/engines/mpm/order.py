@@ -16,9 +16,8 @@ import warp as wp
 from .. import cpp
 from ..launches import Launches
 from ..runtime import load, precision, to_torch
-from .layout import layout
 from .model import Model, place_grid
-from .stencil import lattice
+from .stencil import lattice, layout
 
 
 @cache

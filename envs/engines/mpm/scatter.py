@@ -9,11 +9,22 @@ from typing import Any, Protocol
 import warp as wp
 
 from ..runtime import load
-from .cells import SEGMENT, SIZES, STRETCH, Lists, cell_kernels, placing_warps, segments, warps
 from .checkpoints import Frame, spare
-from .columns import CPU_TEAM, GPU_TEAM, column_kernels
+from .columns import (
+    CPU_TEAM,
+    GPU_TEAM,
+    PARTS,
+    SEGMENT,
+    SIZES,
+    STRETCH,
+    Lists,
+    cell_kernels,
+    column_kernels,
+    placing_warps,
+    segments,
+    warps,
+)
 from .model import Box
-from .walk import PARTS
 
 
 class Scatter(Protocol):

@@ -21,14 +21,10 @@ from torch import Tensor
 
 from .. import cpp
 from ..runtime import precision
-from .columns import Team, node_sum, walking_kernel
-from .gathers import gatherers
-from .layout import layout
+from .columns import Team, node_sum, node_taker, walker, walking_kernel
 from .model import Model
-from .nodes import node_taker
 from .scatter import nodes
-from .stencil import lattice, stencil
-from .walk import walker
+from .stencil import gatherers, lattice, layout, stencil
 
 
 class Smoother:

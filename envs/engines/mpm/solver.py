@@ -13,32 +13,287 @@ large to be kept whole in pieces. Between control steps particles are sorted (`o
 smoothed (`smoothing`).
 """
 
+from __future__ import annotations
+
 import threading
-from collections.abc import Callable, Mapping
+import weakref
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, nullcontext
-from functools import partial
+from functools import cache, partial
 from itertools import chain
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, no_type_check
 
 import numpy as np
 import torch
 import warp as wp
 
+from .. import cpp
 from ..cpp import threads
 from ..launches import Launches
-from ..runtime import free_memory, load, to_torch
-from .adjoint import Adjoint
-from .cells import segments
+from ..runtime import free_memory, load, precision, to_torch
+from .boundaries import settle_kernel
 from .checkpoints import Allocator, Frame, Room, Tape
-from .extent import Extent
+from .columns import GPU_TEAM, cell_kernels, column_kernels, segments
 from .grid import velocity_on
-from .kernels import compile_all as compile_all
-from .layout import to_rows
 from .model import BOX_MARGIN, EMPTY, Box, Model, nodes_around
-from .order import Order, Sorter
+from .order import Order, Sorter, sorting_kernels
 from .scatter import ByColumns, InPlace, Scatter, nodes
-from .smoothing import ColumnSmoother, Smoother
+from .smoothing import ColumnSmoother, Smoother, smoothing_columns, smoothing_kernels
+from .stencil import lattice, to_rows
 from .transfers import transfers, transfers_of_columns
+
+# ---- All kernels of a model at once: compiled beside each other, where a solver's parts ask for theirs one by one.
+
+
+def compile_all(model: Model, device: str) -> None:
+    """Compile what a solver of the model launches, forward and backward, or fetch it from the cache."""
+    load(kernels(model, device), device)
+
+
+def kernels(model: Model, device: str) -> Iterator[Any]:
+    """Yield a kernel or more of each module, those first that take longest to compile."""
+    name = model.precision
+    yield from (_of_cpu if device == "cpu" else _of_gpu)(name, any(body.material.smoothing for body in model.groups))
+    yield velocity_on(name, model.boundary, columns=device != "cpu")
+    for body in model.groups:
+        yield from body.material.kernels(name, columns=device != "cpu")
+    yield extent_kernels(name).look
+    sorting = sorting_kernels(name, wp.int32)  # with which all but huge batches are sorted
+    yield sorting.label
+    for body in model.groups:
+        yield from sorting.states[body.material.state(name)]
+
+
+def _of_cpu(name: str, smooth: bool) -> Iterator[Any]:
+    yield transfers(name).p2g
+    if smooth:
+        yield smoothing_kernels(name).spread
+
+
+def _of_gpu(name: str, smooth: bool) -> Iterator[Any]:
+    yield from (transfers_of_columns(name).g2p, column_kernels(name, GPU_TEAM).p2g, cell_kernels(name).count)
+    yield settle_kernel(name)
+    if smooth:
+        yield smoothing_columns(name, GPU_TEAM).spread
+
+
+# ---- The backward pass of MLS-MPM: the adjoints of the states of particles, control step by control step, and of
+# tools.
+
+
+class Adjoint:
+    """Hold the adjoint arrays of a solver and run its backward pass."""
+
+    def __init__(self, solver: Any) -> None:
+        self.solver = weakref.proxy(solver)  # which holds this: a cycle would keep a GPU's memory until it is collected
+        self.new, self.old = solver.allocator.frame(), solver.allocator.frame()
+        self.A = None if solver.columns else solver.allocator.affine_momentum()
+        self.grid = solver.allocator.grid(max(tape.cells for tape in solver.tapes))
+        self.tools = solver.allocator.paths()
+        self.tools_by_axis: Any = wp.from_torch(to_torch(self.tools), requires_grad=False)
+        self.settle = settle_kernel(solver.model.precision)  # of a GPU, where nodes do not add to the adjoint itself
+        load([self.settle] if solver.device != "cpu" else [], solver.device)
+        # Adjoints that nobody wants, but Warp their place.
+        self.structs = lattice(solver.model.precision)(), type(solver.boundary)()
+
+    def run(self, adj_x: Mapping[int, torch.Tensor]) -> torch.Tensor:
+        """Return the adjoint of the tools, shape (batch, step + 1, slot, 3)."""
+        solver, batch = self.solver, len(next(iter(adj_x.values())))
+        for array in (*self.new.arrays(), self.tools, solver.sums):
+            array.zero_()
+        solver.scatter.begin()
+        for step in reversed(range(max(adj_x))):
+            if step + 1 in adj_x:
+                x = to_torch(self.new.x)[:batch]
+                x += solver.orders[step + 1].from_model(adj_x[step + 1].to(x))
+            if solver.tape(step).step != step:
+                solver.advance(step, batch)
+            self._retreat(step, batch)
+        return to_torch(self.tools)[:batch].clone()
+
+    def _retreat(self, step: int, batch: int) -> None:
+        solver = self.solver
+        if self.grid.m.shape[1] < solver.tape(step).cells:
+            self.grid = solver.allocator.grid(solver.tape(step).cells)
+            solver.launches.clear(lambda key: key[0] == "backward")
+        ends = (self.new, self.old) if solver.model.substeps % 2 else (self.old, self.new)  # as often exchanged
+        key = "backward", step, batch, id(self.new)
+        solver.launch_again(key, step, batch, lambda: self._substeps(step, batch))
+        self.new, self.old = ends  # launches that are kept exchange nothing here
+        if solver.pieces > 1:
+            solver.tape(step).step = -1  # it holds the first piece now
+
+    def _substeps(self, step: int, batch: int) -> None:
+        solver, count = self.solver, self.solver.model.substeps
+        solver.sorter.unsort(self.new, self.old, solver.orders[step + 1], batch)
+        self.new, self.old = self.old, self.new
+        length = solver.model.piece(solver.pieces)
+        for first in reversed(range(0, count, length)):
+            piece = range(first, min(first + length, count))
+            if piece.stop < count:
+                solver.substeps(step, batch, piece)
+            self._substeps_back(step, batch, piece)
+        for smoother in solver.smoothers:
+            smoother.run_back(solver, step, batch, self.new)
+        if solver.device != "cpu":
+            solver.launch(self.settle, 6 * solver.model.boundary.slots, batch, [step, solver.sums, self.tools_by_axis])
+
+    def _substeps_back(self, step: int, batch: int, substeps: range) -> None:
+        solver, frames = self.solver, self.solver.frames(step)
+        for s in reversed(substeps):
+            solver.scatter.adjoint_g2p(step, s, frames[s], self.new, self.grid.v, self.old.x, batch)
+            self._adjoint_velocity(step, s, batch)
+            self._adjoint_p2g(step, s, frames[s], batch)
+            self.new, self.old = self.old, self.new
+
+    def _adjoint_velocity(self, step: int, substep: int, batch: int) -> None:
+        solver = self.solver
+        inputs = solver.velocity_inputs(step, substep)
+        adjoints = [*self.structs, *[None] * 6, self.tools, None, self.grid.m, self.grid.v]
+        adjoints += [None] * (len(inputs) - len(adjoints))
+        how = {"adj_inputs": adjoints, "adj_outputs": [], "adjoint": True}
+        solver.launch_at_nodes(solver.velocity, step, batch, inputs, **how)
+
+    def _adjoint_p2g(self, step: int, substep: int, frame: Frame, batch: int) -> None:
+        """Launch the adjoint of p2g, and those of the materials after it or as its continuation."""
+        solver, tape, old, new = self.solver, self.solver.tape(step), self.old, self.new
+        if not solver.columns:
+            given = [tape.lattice, solver.orders[step].mass, frame.x, frame.v, tape.A[substep]]
+            inputs = [*given, self.grid.m, old.x, old.v, self.A]
+            solver.launch(solver.kernels.adjoint_p2g, solver.model.particles, batch, inputs)
+        for b, (_, adjoint) in enumerate(solver.materials):
+            inputs = [*solver.material_inputs(b, step, frame), new.S[b]]
+            if solver.columns:
+                given = [frame.x, frame.v, self.grid.m, old.v, tape.grids[substep].v, new.x, new.v, new.C, old.x]
+                inputs = [*solver.scatter.where(step, substep), *given, *inputs]
+            else:
+                inputs += [self.A]
+            with solver.beside_others(b):
+                solver.launch(adjoint, solver.size(b), batch, [*inputs, old.S[b], old.C])
+        solver.launches.join()
+
+
+# ---- Between which corners particles are, which decides on which nodes a control step runs.
+
+SHARES, LANES = 2048, 256  # of a GPU
+WARP = 32  # threads of a GPU that find out together
+
+
+@cache
+@no_type_check
+def extent_kernels(name: str) -> SimpleNamespace:
+    """Return the kernels `look`, at particles, and `gather` what was found; of each the first has the corners.
+
+    Of threads that are `together`, a warp of a GPU or one, one writes down what all have found.
+    """
+    types = precision(name)
+    real, vec3, module = types.real, types.vec3, cpp.module(f"gradscape.extent.{name}")
+
+    @cpp.func_native(called="least_of_warp")
+    def least(x: vec3) -> vec3: ...
+
+    @cpp.func_native(called="greatest_of_warp")
+    def greatest(x: vec3) -> vec3: ...
+
+    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
+    def look(
+        x: wp.array2d[vec3],
+        shares: int,
+        together: int,
+        low: wp.array[vec3],
+        high: wp.array[vec3],
+        left: wp.array[wp.int32],
+    ):
+        e, share = wp.tid()
+        lowest, highest = vec3(real(wp.inf)), vec3(real(-wp.inf))
+        for p in range(share, x.shape[1], shares):
+            here = x[e, p]
+            lowest, highest = wp.min(lowest, here), wp.max(highest, here)
+            if not wp.isfinite(here):  # a minimum passes over what is not a number
+                lowest = vec3(real(-wp.inf))
+                left[e] = 1
+        lowest, highest = least(lowest), greatest(highest)
+        if share % together == 0:
+            at = (e * shares + share) / together
+            low[at] = lowest
+            high[at] = highest
+
+    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
+    def gather(
+        batch: int,
+        shares: int,
+        low: wp.array[vec3],
+        high: wp.array[vec3],
+        left: wp.array[wp.int32],
+        needed: wp.array[wp.int32],
+        found: wp.array2d[real],
+    ):
+        _, lane = wp.tid()
+        lowest, highest = vec3(real(wp.inf)), vec3(real(-wp.inf))
+        gone, most = wp.int32(0), wp.int32(0)
+        for i in range(lane, batch * shares, found.shape[0]):
+            lowest, highest = wp.min(lowest, low[i]), wp.max(highest, high[i])
+        for e in range(lane, batch, found.shape[0]):
+            gone = wp.max(gone, left[e])
+            most = wp.max(most, needed[e])
+        for axis in range(3):
+            found[lane, axis] = lowest[axis]
+            found[lane, 3 + axis] = highest[axis]
+        found[lane, 6] = real(gone)
+        found[lane, 7] = real(most)
+
+    return SimpleNamespace(look=look, gather=gather)
+
+
+class Extent:
+    """Find the corners of the particles of a batch, and whether one has left its box of nodes.
+
+    Threads take one of `shares` of an environment's particles each, and one of a GPU's warp writes down what all of it
+    have found; then `lanes`, few enough to be read back, take all of that. By default both are one on a CPU.
+    """
+
+    def __init__(
+        self, allocator: Allocator, launches: Launches, *, shares: int | None = None, lanes: int | None = None
+    ) -> None:
+        model, types, device = allocator.model, allocator.types, allocator.device
+        self.launches, self.device = launches, device
+        self.kernels = extent_kernels(model.precision)
+        load([self.kernels.look], device)
+        self.shares, lanes = shares or (1 if device == "cpu" else SHARES), lanes or (1 if device == "cpu" else LANES)
+        self.together = 1 if device == "cpu" else WARP
+        size = allocator.capacity * self.shares // self.together
+        self.low, self.high = (wp.zeros(size, dtype=types.vec3, device=device) for _ in range(2))
+        self.found: wp.array = wp.zeros((lanes, 8), dtype=types.real, device=device)
+        self.event: Any = None if device == "cpu" else wp.Event(device)
+        self.host: wp.array = wp.zeros((lanes, 8), dtype=types.real, device="cpu", pinned=device != "cpu")
+
+    def find(self, x: wp.array, left: wp.array, needed: wp.array, batch: int, *, small: bool) -> None:
+        """Begin to find the corners of `x` [environment, particle], if any row has `left`, the most nodes one `needed`.
+
+        A row has where a particle's coordinates are not finite, too: a loss need not tell, if it looks at others only.
+        """
+        self.launches.run(("extent", batch), None, lambda: self._launch(x, left, needed, batch), small=small)
+        if self.device != "cpu":
+            wp.record_event(self.event)
+
+    def read(self) -> tuple[np.ndarray, np.ndarray, bool, int]:
+        """Return the lowest and highest coordinates [m], not finite where a particle's are not, if one left, and nodes.
+
+        These are the most that a row needed.
+        """
+        if self.device != "cpu":
+            wp.synchronize_event(self.event)
+        found = self.host.numpy().astype(np.float64)
+        return found[:, :3].min(axis=0), found[:, 3:6].max(axis=0), bool(found[:, 6].any()), int(found[:, 7].max())
+
+    def _launch(self, x: wp.array, left: wp.array, needed: wp.array, batch: int) -> None:
+        inputs = [x, self.shares, self.together, self.low, self.high, left]
+        self.launches.launch(self.kernels.look, (batch, self.shares), inputs)
+        inputs = [batch, self.shares // self.together, self.low, self.high, left, needed, self.found]
+        self.launches.launch(self.kernels.gather, (1, self.found.shape[0]), inputs)
+        self.launches.call(partial(wp.copy, self.host, self.found))  # which holds nothing that holds the launches
+
 
 CROWD = 8_000  # particles that hide what a launch costs on one core
 BUSY, FULL_CARD = 400_000, 1_750_000  # particles that keep a GPU busy; more than which gain nothing

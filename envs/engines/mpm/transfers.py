@@ -16,10 +16,8 @@ import warp as wp
 
 from .. import cpp
 from ..runtime import precision
-from .cells import counter
-from .gathers import adjoint_gatherers, gatherers
-from .layout import layout
-from .stencil import lattice, stencil
+from .columns import counter
+from .stencil import adjoint_gatherers, gatherers, lattice, layout, stencil
 
 
 @cache

@@ -1,5 +1,1 @@
-"""The engine Newton: its solvers as they are, differentiated by Warp's tape."""
-
-from ..engine import Engine
-
-ENGINE = Engine("newton", {"rollout": "newton.rollout"}, concurrent=False, extra="newton")
+"""Newton's solvers as they are."""

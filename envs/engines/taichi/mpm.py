@@ -18,7 +18,7 @@ more, and fills its one grid anew for each substep. Threads add in any order, so
 import threading
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, reduce
 from types import SimpleNamespace
 from typing import Any, no_type_check
 
@@ -26,13 +26,582 @@ import numpy as np
 import torch
 
 from ....landscapes.threads import one_torch_thread
-from ...batching import copied
+from ...base import copied
+from ..mpm.boundaries import FAINTEST, STICKY, TINY, UPSTREAM_DT, Boundary, Kind, LadleInTank, Open, Tool, ToolsInRoom
+from ..mpm.materials import Elastic, Fluid, Material, Plasticine
+from ..mpm.materials.fluid import TORN
+from ..mpm.materials.plasticine import ROUNDED, SMALLEST
 from ..mpm.model import EMPTY, Model
 from ..mpm.smoothing import smooth_volume_ratios
 from ..runtime import precision
-from .boundaries import boundary_contact
-from .materials import kernels, types
+from .runtime import real as real_type
 from .runtime import start, ti
+
+# ---- What particles are made of, as Taichi kernels: stress from state, and how motion changes the state.
+#
+# Each material is a pair (update, adjoint) of functions of the same arguments. `update` takes substep s to s + 1,
+#
+# S' = deform(S, C),    A = -dt V 4/dx^2 tau(S', C) + m C,
+#
+# and `adjoint` adds to the gradients of S[s] and C[s] what those of S[s + 1] and A[s] say: by the compiler's AD, but
+# for plasticine, whose singular value decomposition the compiler cannot differentiate. tau is the Kirchhoff stress
+# [Pa].
+
+SWEEPS = 5  # of Jacobi rotations; four reach round-off
+VANISHED = 1e-30  # keeps what has vanished from being divided by
+PAIRS = ((0, 1), (0, 2), (1, 2))
+CLOSE = 0.1  # relative gap of two numbers below which their divided differences are summed as a series
+
+
+def kernels(material: Material, name: str) -> tuple[Any, Any]:
+    """Return (update, adjoint) of a material in the precision `name`."""
+    makers = {Fluid: _fluid, Elastic: _elastic, Plasticine: _plasticine}
+    update, adjoint = makers[type(material)](name)
+    return update, adjoint
+
+
+@cache
+@no_type_check
+def _fluid(name: str) -> tuple[Any, Any]:
+    """J' = min(exp(dt tr C) J, TORN), tau = K log J' I + J' mu (C + C^T - 2/3 tr C I)."""
+    real, array = types(name)
+
+    @ti.kernel
+    def update(
+        s: ti.i32, batch: ti.i32, first: ti.i32, dt: real, scale: real, bulk: real, viscosity: real,
+        mass: array(1), volume: array(1), C: array(3, 3, 3), J: array(3), A: array(3, 3, 3),
+    ):  # fmt: skip
+        for e, p in ti.ndrange(batch, J.shape[2]):
+            c = C[s, e, first + p]
+            one = ti.Matrix.identity(real, 3)
+            j = ti.min(ti.exp(dt * c.trace()) * J[s, e, p], real(TORN))
+            shear = c + c.transpose() - real(2.0 / 3.0) * c.trace() * one
+            tau = bulk * ti.log(j) * one + j * viscosity * shear
+            J[s + 1, e, p] = j
+            A[s, e, first + p] = scale * volume[first + p] * tau + mass[first + p] * c
+
+    return update, update.grad
+
+
+@cache
+@no_type_check
+def _elastic(name: str) -> tuple[Any, Any]:
+    """F' = (I + dt C) F, tau = mu (F' F'^T - I) + lam log(det F') I."""
+    real, array = types(name)
+
+    @ti.kernel
+    def update(
+        s: ti.i32, batch: ti.i32, first: ti.i32, dt: real, scale: real, mu: real, lam: real,
+        mass: array(1), volume: array(1), C: array(3, 3, 3), F: array(3, 3, 3), A: array(3, 3, 3),
+    ):  # fmt: skip
+        for e, p in ti.ndrange(batch, F.shape[2]):
+            c = C[s, e, first + p]
+            one = ti.Matrix.identity(real, 3)
+            f = (one + dt * c) @ F[s, e, p]
+            tau = mu * (f @ f.transpose() - one) + lam * ti.log(f.determinant()) * one
+            F[s + 1, e, p] = f
+            A[s, e, first + p] = scale * volume[first + p] * tau + mass[first + p] * c
+
+    return update, update.grad
+
+
+@cache
+@no_type_check
+def _plasticine(name: str) -> tuple[Any, Any]:
+    """F' = U diag(f) V^T, tau = U diag(t) U^T of (I + dt C) F = U diag(s) V^T; see `_yield_functions`."""
+    real, array = types(name)
+    svd, (flow, pull) = _svd(name), _yield_functions(name)
+
+    @ti.kernel
+    def update(
+        s: ti.i32, batch: ti.i32, first: ti.i32, dt: real, scale: real, mu: real, lam: real, kappa: real,
+        mass: array(1), volume: array(1), C: array(3, 3, 3), F: array(3, 3, 3), A: array(3, 3, 3),
+    ):  # fmt: skip
+        for e, p in ti.ndrange(batch, F.shape[2]):
+            c = C[s, e, first + p]
+            U, sigma, V = svd((ti.Matrix.identity(real, 3) + dt * c) @ F[s, e, p])
+            f = flow(sigma, kappa)
+            J = f[0] * f[1] * f[2]
+            t = real(2.0) * mu * f * (f - real(1.0)) + lam * J * (J - real(1.0))
+            tau = U @ _spread(t) @ U.transpose()
+            F[s + 1, e, p] = U @ _spread(f) @ V.transpose()
+            A[s, e, first + p] = scale * volume[first + p] * tau + mass[first + p] * c
+
+    @ti.kernel
+    def transpose(
+        s: ti.i32, batch: ti.i32, first: ti.i32, dt: real, scale: real, mu: real, lam: real, kappa: real,
+        mass: array(1), volume: array(1), C: array(3, 3, 3), F: array(3, 3, 3),
+        adj_C: array(3, 3, 3), adj_F: array(3, 3, 3), adj_A: array(3, 3, 3),
+    ):  # fmt: skip
+        for e, p in ti.ndrange(batch, F.shape[2]):
+            advance = ti.Matrix.identity(real, 3) + dt * C[s, e, first + p]
+            U, sigma, V = svd(advance @ F[s, e, p])
+            a = adj_A[s, e, first + p]
+            G = U.transpose() @ adj_F[s + 1, e, p] @ V
+            T = scale * volume[first + p] * (U.transpose() @ a @ U)
+            adj_trial = U @ pull(sigma, G, T, mu, lam, kappa) @ V.transpose()
+            adj_F[s, e, p] += advance.transpose() @ adj_trial
+            adj_C[s, e, first + p] += mass[first + p] * a + dt * adj_trial @ F[s, e, p].transpose()
+
+    def adjoint(*inputs: Any) -> None:
+        *constants, C, F, A = inputs
+        transpose(*constants, C, F, C.grad, F.grad, A.grad)
+
+    return update, adjoint
+
+
+@ti.func
+@no_type_check
+def _diagonal(m):
+    return ti.Vector([m[0, 0], m[1, 1], m[2, 2]])
+
+
+@ti.func
+@no_type_check
+def _spread(v):
+    zero = v[0] - v[0]
+    return ti.Matrix([[v[0], zero, zero], [zero, v[1], zero], [zero, zero, v[2]]])
+
+
+@no_type_check
+def _svd(name: str) -> Any:
+    """Return the function F -> (U, s, V) with rotations U and V; the least of s, in no order, has the sign of det F.
+
+    Rotations from the right make the columns of F V orthogonal (Hestenes 1958). (ti.svd is off by up to 2e-10 in
+    float64.)
+    """
+    real, _ = types(name)
+
+    @ti.func
+    def column(M, i: ti.template()):
+        return ti.Vector([M[0, i], M[1, i], M[2, i]])
+
+    @ti.func
+    def rotate(M, i: ti.template(), j: ti.template(), c, s):
+        new = M
+        for row in ti.static(range(3)):
+            new[row, i] = c * M[row, i] - s * M[row, j]
+            new[row, j] = s * M[row, i] + c * M[row, j]
+        return new
+
+    @ti.func
+    def svd(F):
+        B, V = F, ti.Matrix.identity(real, 3)
+        for _ in range(SWEEPS):
+            for i, j in ti.static(PAIRS):
+                x, y = column(B, i), column(B, j)
+                gap, twice = y.dot(y) - x.dot(x), real(2.0) * x.dot(y)
+                span = ti.abs(gap) + ti.sqrt(gap * gap + twice * twice)
+                t = ti.select(gap < real(0.0), -twice, twice) / ti.max(span, real(VANISHED))
+                c = real(1.0) / ti.sqrt(real(1.0) + t * t)
+                B, V = rotate(B, i, j, c, t * c), rotate(V, i, j, c, t * c)
+        s = ti.Vector([column(B, i).norm() for i in ti.static(range(3))])
+        U = B
+        for i in ti.static(range(3)):
+            for row in ti.static(range(3)):
+                U[row, i] = B[row, i] / ti.max(s[i], real(VANISHED))
+        least = s.min()
+        for i, j, k in ti.static(((0, 1, 2), (1, 2, 0), (2, 0, 1))):
+            if s[i] == least:
+                u = column(U, j).cross(column(U, k))
+                s[i] = u.dot(column(B, i))
+                for row in ti.static(range(3)):
+                    U[row, i] = u[row]
+        return U, s, V
+
+    return svd
+
+
+@no_type_check
+def _yield_functions(name: str) -> tuple[Any, Any]:
+    """Return the von Mises flow s -> f, and the transpose of the differential of F' and tau.
+
+    With e = log max(s, SMALLEST), d = e - mean(e), n = sqrt(d.d + ROUNDED): f = s where n <= kappa, else
+    f = exp(mean(e) + kappa d / n); and t = 2 mu f (f - 1) + lam J (J - 1), J = f_0 f_1 f_2.
+
+    A change dB of the trial turns U and V, and P = U^T dB V gives what that does. Off the diagonal,
+
+        Q = U^T dF' V:    Q_ij + Q_ji = a (P_ij + P_ji),    Q_ij - Q_ji = b (P_ij - P_ji),
+        U^T dtau U:       (t_i - t_j) / (s_i^2 - s_j^2) (s_j P_ij + s_i P_ji),
+
+    with a = (f_i - f_j) / (s_i - s_j), b = (f_i + f_j) / (s_i + s_j), and t_i - t_j = 2 mu (f_i + f_j - 1)(f_i - f_j):
+    so a is the only quotient of differences, and it stays finite where singular values meet.
+    """
+    real = real_type(name)
+    exp_quotient, log_quotient = _quotients(name)
+
+    @ti.func
+    def strain(s):
+        e = ti.log(ti.max(s, real(SMALLEST)))
+        mean = e.sum() / real(3.0)
+        d = e - mean
+        return e, mean, d, ti.sqrt(d.dot(d) + real(ROUNDED))
+
+    @ti.func
+    def flow(s, kappa):
+        _, mean, d, n = strain(s)
+        return ti.select(n > kappa, ti.exp(mean + kappa / n * d), s)
+
+    @ti.func
+    def pull_diagonal(s, f, G, T, mu, lam, kappa):
+        J = f[0] * f[1] * f[2]
+        rest = ti.Vector([f[1] * f[2], f[0] * f[2], f[0] * f[1]])
+        g = _diagonal(G) + real(2.0) * mu * _diagonal(T) * (real(2.0) * f - real(1.0))
+        g += lam * (real(2.0) * J - real(1.0)) * T.trace() * rest
+        _, _, d, n = strain(s)
+        if n > kappa:
+            h = g * f
+            mean, c = h.sum() / real(3.0), kappa / n
+            h = mean + c * (h - mean) - c * d.dot(h) / (n * n) * d
+            g = ti.select(s > real(SMALLEST), h / s, real(0.0))
+        return g
+
+    @ti.func
+    def pull(s, G, T, mu, lam, kappa):
+        e, mean, d, n = strain(s)
+        f = flow(s, kappa)
+        k = mean + kappa / n * d
+        P = _spread(pull_diagonal(s, f, G, T, mu, lam, kappa))
+        for i, j in ti.static(PAIRS):
+            a = real(1.0)
+            if n > kappa:
+                a = kappa / n * exp_quotient(k[i], k[j]) * log_quotient(s[i], s[j], e[i], e[j])
+            total = ti.max(s[i] + s[j], real(1e-12))
+            b = (f[i] + f[j]) / total
+            bend = real(2.0) * mu * (f[i] + f[j] - real(1.0)) * a / total * (T[i, j] + T[j, i])
+            P[i, j] = (a * (G[i, j] + G[j, i]) + b * (G[i, j] - G[j, i])) / real(2.0) + bend * s[j]
+            P[j, i] = (a * (G[i, j] + G[j, i]) - b * (G[i, j] - G[j, i])) / real(2.0) + bend * s[i]
+        return P
+
+    return flow, pull
+
+
+@no_type_check
+def _quotients(name: str) -> tuple[Any, Any]:
+    """Return (exp x - exp y) / (x - y), and (e_i - e_j) / (s_i - s_j) for e = log max(s, SMALLEST)."""
+    real = real_type(name)
+
+    @ti.func
+    def exp_quotient(x, y):
+        h = (x - y) / real(2.0)
+        z = h * h
+        series = real(1.0) + z / real(6.0) * (real(1.0) + z / real(20.0) * (real(1.0) + z / real(42.0)))  # sinh(h) / h
+        ratio = ti.exp((x + y) / real(2.0)) * series
+        if ti.abs(h) > real(CLOSE):
+            ratio = (ti.exp(x) - ti.exp(y)) / (x - y)
+        return ratio
+
+    @ti.func
+    def log_quotient(si, sj, ei, ej):
+        total = si + sj
+        z = (si - sj) / total
+        ratio = real(0.0)
+        if ti.min(si, sj) > real(SMALLEST) and ti.abs(z) < real(CLOSE):
+            for k in ti.static(range(6)):  # atanh(z) / z
+                ratio += real(2.0) / total * z ** (2 * k) / real(2.0 * k + 1.0)
+        elif ti.max(si, sj) > real(SMALLEST):
+            ratio = (ei - ej) / (si - sj)
+        return ratio
+
+    return exp_quotient, log_quotient
+
+
+@no_type_check
+def types(name: str) -> tuple[Any, Any]:
+    """Return the scalar type, and the function (indices, then the element's shape) -> type of an array."""
+    real = real_type(name)
+
+    def array(ndim, *shape):
+        kinds = {0: lambda: real, 1: lambda n: ti.types.vector(n, real), 2: lambda n, m: ti.types.matrix(n, m, real)}
+        return ti.types.ndarray(dtype=kinds[len(shape)](*shape), ndim=ndim)
+
+    return real, array
+
+
+# ---- What grid velocities meet, as Taichi functions: the boundaries' data, made of contacts that act one after
+# another.
+#
+# A contact is a function (node position p [m], velocity v [m/s], environment e, tools, control step, fraction of it, 1
+# over its span [1/s]) -> velocity. In a shell around a tool, velocities lose a share of what goes into it and are
+# rubbed,
+#
+# v' = v + share(d) (rub(u - u_n n) - (u - u_n n) - u_n n)   where u = v - v_tool and u_n = n.u < 0,
+#
+# d being the signed distance and n its normal. Sizes and frictions are compiled in.
+
+LADLE_SLIP, TOOL_SLIP = 1e-10, 1e-8  # added to squared sliding speeds [m^2/s^2], so that rest has a gradient
+ON_WALL = 1e-6  # a wall's own nodes belong to it [m]
+
+
+@cache
+def boundary_contact(boundary: Boundary, name: str) -> Any:
+    """Return all of a boundary's contacts as one, in the precision `name`. Raises ValueError for an unknown one."""
+    if isinstance(boundary, Open):
+        return _free()
+    if isinstance(boundary, LadleInTank):
+        handle = [_handle(boundary, name)] if boundary.height else []
+        contacts = [_bowl(boundary, name), *handle, _drag(boundary, name)]
+        edge = boundary.half_width - ON_WALL
+        lower, upper = (-edge, ON_WALL, -edge), (edge, boundary.lid, edge)
+        return reduce(_apply_both, [*contacts, _walls(lower, upper, name)])
+    if isinstance(boundary, ToolsInRoom):
+        slots = [sum(tool.slots for tool in boundary.tools[:j]) for j in range(len(boundary.tools))]
+        contacts = [
+            _tool(tool, slot, _influence(boundary, name), name)
+            for tool, slot in zip(boundary.tools, slots, strict=True)
+        ]
+        lower = (boundary.lower[0], -1e9, boundary.lower[2])  # below it has a floor
+        return reduce(_apply_both, [*contacts, _floor(boundary, name), _walls(lower, boundary.upper, name)])
+    raise ValueError(f"the Taichi engine knows Open, LadleInTank and ToolsInRoom; got boundary {boundary!r}")
+
+
+@no_type_check
+def _free() -> Any:
+    @ti.func
+    def contact(p, v, e, tools: ti.template(), step, fraction, rate):
+        return v
+
+    return contact
+
+
+@no_type_check
+def _apply_both(first: Any, second: Any) -> Any:
+    @ti.func
+    def contact(p, v, e, tools: ti.template(), step, fraction, rate):
+        return second(p, first(p, v, e, tools, step, fraction, rate), e, tools, step, fraction, rate)
+
+    return contact
+
+
+@cache
+@no_type_check
+def _shapes(name: str) -> SimpleNamespace:
+    """Return signed distances (outward normal, distance [m]) of a point in each shape's own frame."""
+    real = real_type(name)
+
+    @ti.func
+    def sphere(p, radius):
+        length = ti.sqrt(p.dot(p) + real(TINY))
+        return p / length, length - radius
+
+    @ti.func
+    def capsule(p, axis, half_length, radius):
+        along = ti.max(-half_length, ti.min(p.dot(axis), half_length))
+        return sphere(p - along * axis, radius)
+
+    @ti.func
+    def torus(p, ring, tube):
+        axial = ti.sqrt(p[0] ** 2 + p[2] ** 2 + real(TINY))
+        to_ring = p - ti.Vector([p[0], real(0.0), p[2]]) * (ring / axial)
+        gap = axial - ring
+        length = ti.sqrt(gap**2 + p[1] ** 2 + real(TINY))
+        return to_ring / length, length - tube
+
+    @ti.func
+    def bowl(p, radius, half_thickness):
+        """Return the distance to an open half-sphere shell, its rim in the plane y = 0, its opening upwards."""
+        out, gap = sphere(p, radius)
+        side = ti.select(gap < real(0.0), -real(1.0), real(1.0))
+        rim, to_rim = torus(p, radius, half_thickness)
+        below = p[1] < real(0.0)
+        return ti.select(below, side * out, rim), ti.select(below, side * gap - half_thickness, to_rim)
+
+    @ti.func
+    def cylinder(p, radius, half_height):
+        axial = ti.sqrt(p[0] ** 2 + p[2] ** 2 + real(TINY))
+        outward = ti.Vector([p[0], real(0.0), p[2]]) / axial
+        upward = ti.Vector([real(0.0), ti.select(p[1] < real(0.0), -real(1.0), real(1.0)), real(0.0)])
+        out, over = axial - radius, ti.abs(p[1]) - half_height
+        to_edge = ti.sqrt(out**2 + over**2 + real(TINY))
+        past_edge = (out > real(0.0)) & (over > real(0.0))
+        n, d = ti.select(out > over, outward, upward), ti.max(out, over)
+        edge = (out * outward + over * upward) / to_edge
+        return ti.select(past_edge, edge, n), ti.select(past_edge, to_edge, d)
+
+    return SimpleNamespace(sphere=sphere, capsule=capsule, torus=torus, bowl=bowl, cylinder=cylinder)
+
+
+@cache
+@no_type_check
+def _laws(name: str) -> SimpleNamespace:
+    """Return what contacts share: a tool's motion, Coulomb's friction, and the two together."""
+    real = real_type(name)
+
+    @ti.func
+    def motion(tools: ti.template(), e, step, slot: ti.template(), fraction, rate):
+        start = tools[e, step, slot]
+        change = tools[e, step + 1, slot] - start
+        return start + fraction * change, rate * change
+
+    @ti.func
+    def rub(t, normal, friction, slip: ti.template()):
+        """Return the sliding velocity after a contact that stopped the `normal` velocity."""
+        speed = ti.sqrt(t.dot(t) + real(slip))
+        return t * ti.max(real(0.0), real(1.0) + friction * normal / speed)
+
+    @ti.func
+    def touch(v, body, n, share, friction, slip: ti.template()):
+        u = v - body
+        normal = u.dot(n)
+        t = u - normal * n
+        felt = ti.select(normal < real(0.0), share, real(0.0))
+        return v + felt * (rub(t, normal, friction, slip) - u)
+
+    return SimpleNamespace(motion=motion, rub=rub, touch=touch)
+
+
+@no_type_check
+def _bowl(ladle: LadleInTank, name: str) -> Any:
+    real, laws, bowl = real_type(name), _laws(name), _shapes(name).bowl
+    fade = _fade(ladle.band, name)
+
+    @ti.func
+    def contact(p, v, e, tools: ti.template(), step, fraction, rate):
+        rim, body = laws.motion(tools, e, step, 0, fraction, rate)
+        n, d = bowl(p - rim, real(ladle.radius), real(ladle.half_thickness))
+        return laws.touch(v, body, n, fade(d), real(ladle.friction), LADLE_SLIP)
+
+    return contact
+
+
+@no_type_check
+def _handle(ladle: LadleInTank, name: str) -> Any:
+    """Return the contact with an upright capsule that stands on the bowl's rim."""
+    real, laws, capsule = real_type(name), _laws(name), _shapes(name).capsule
+    fade = _fade(ladle.band, name)
+
+    @ti.func
+    def contact(p, v, e, tools: ti.template(), step, fraction, rate):
+        rim, body = laws.motion(tools, e, step, 0, fraction, rate)
+        half = real(ladle.height / 2)
+        middle = rim + ti.Vector([-real(ladle.radius), half, real(0.0)])
+        up = ti.Vector([real(0.0), real(1.0), real(0.0)])
+        n, d = capsule(p - middle, up, half, real(ladle.half_thickness))
+        return laws.touch(v, body, n, fade(d), real(ladle.friction), LADLE_SLIP)
+
+    return contact
+
+
+@no_type_check
+def _drag(tank: LadleInTank, name: str) -> Any:
+    """Return what the tank's floor and walls leave of the velocity along them."""
+    real = real_type(name)
+    edge = tank.half_width - ON_WALL
+
+    @ti.func
+    def contact(p, v, e, tools: ti.template(), step, fraction, rate):
+        on = ti.Vector([ti.abs(p[0]) > real(edge), p[1] < real(ON_WALL), ti.abs(p[2]) > real(edge)])
+        w = v
+        for a, b in ti.static(((0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1))):
+            w[b] = ti.select(on[a] and not on[b], real(tank.slip) * v[b], w[b])
+        return w
+
+    return contact
+
+
+@no_type_check
+def _fade(band: float, name: str) -> Any:
+    real = real_type(name)
+
+    @ti.func
+    def fade(d):
+        s = ti.max(real(0.0), ti.min(real(1.0) - d / real(band), real(1.0)))
+        return s * s * (real(3.0) - real(2.0) * s)
+
+    return fade
+
+
+@no_type_check
+def _tool(tool: Tool, slot: int, influence: Any, name: str) -> Any:
+    real, laws, distance = real_type(name), _laws(name), _distance(tool, name)
+    rolls = tool.kind is Kind.ROLLER
+
+    @ti.func
+    def contact(p, v, e, tools: ti.template(), step, fraction, rate):
+        place, body = laws.motion(tools, e, step, slot, fraction, rate)
+        local = p - place
+        axis = up = ti.Vector([real(0.0), real(1.0), real(0.0)])
+        if ti.static(rolls):
+            angles, spin = laws.motion(tools, e, step, slot + 1, fraction, rate)
+            axis = ti.Vector([ti.sin(angles[1]), real(0.0), ti.cos(angles[1])])
+            body += (spin[0] * axis + spin[1] * up).cross(local)
+        n, d = distance(local, axis)
+        return laws.touch(v, body, n, influence(d), real(tool.friction), TOOL_SLIP)
+
+    return contact
+
+
+@no_type_check
+def _influence(room: ToolsInRoom, name: str) -> Any:
+    """Return the share of what runs into a tool that a node at a distance loses in a substep."""
+    real, substeps = real_type(name), room.dt / UPSTREAM_DT
+
+    @ti.func
+    def influence(d):
+        left = (real(1.0) - ti.exp(-real(room.softness) * ti.max(d, real(0.0)))) / real(1.0 - FAINTEST)
+        inside = left <= real(0.0)
+        decay = ti.exp(real(substeps) * ti.log(ti.select(inside, real(1.0), left)))
+        return ti.select(inside, real(1.0), ti.max(real(1.0) - decay, real(0.0)))
+
+    return influence
+
+
+@no_type_check
+def _distance(tool: Tool, name: str) -> Any:
+    """Return a tool's signed distance, as a function of (point in its frame, its axis)."""
+    real, shapes = real_type(name), _shapes(name)
+    a, b = (*tool.size, 0.0)[:2]
+
+    @ti.func
+    def sphere(p, axis):
+        return shapes.sphere(p, real(a))
+
+    @ti.func
+    def torus(p, axis):
+        return shapes.torus(p, real(a), real(b))
+
+    @ti.func
+    def cylinder(p, axis):
+        return shapes.cylinder(p, real(a), real(b))
+
+    @ti.func
+    def capsule(p, axis):
+        return shapes.capsule(p, axis, real(a), real(b))
+
+    return {Kind.SPHERE: sphere, Kind.TORUS: torus, Kind.CYLINDER: cylinder}.get(tool.kind, capsule)
+
+
+@no_type_check
+def _floor(room: ToolsInRoom, name: str) -> Any:
+    """Return the contact with the floor's nodes: nothing sinks, what presses is rubbed, or sticks."""
+    real, laws = real_type(name), _laws(name)
+    sticky = room.friction >= STICKY
+
+    @ti.func
+    def contact(p, v, e, tools: ti.template(), step, fraction, rate):
+        t = ti.Vector([real(0.0), ti.max(v[1], real(0.0)), real(0.0)])
+        if ti.static(not sticky):
+            sliding = laws.rub(ti.Vector([v[0], real(0.0), v[2]]), v[1], real(room.friction), TOOL_SLIP)
+            t = ti.select(v[1] < real(0.0), sliding, v)
+        return ti.select(p[1] <= real(room.floor), t, v)
+
+    return contact
+
+
+@no_type_check
+def _walls(lower: tuple[float, ...], upper: tuple[float, ...], name: str) -> Any:
+    """Return the contact with slippery walls around a box."""
+    real = real_type(name)
+
+    @ti.func
+    def contact(p, v, e, tools: ti.template(), step, fraction, rate):
+        w = v
+        for a in ti.static(range(3)):
+            inward = ti.select(p[a] <= real(lower[a]), ti.max(v[a], real(0.0)), v[a])
+            w[a] = ti.select(p[a] >= real(upper[a]), ti.min(inward, real(0.0)), inward)
+        return w
+
+    return contact
 
 
 @dataclass(frozen=True, eq=False)

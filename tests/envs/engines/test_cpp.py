@@ -8,11 +8,10 @@ import pytest
 import warp as wp
 
 from gradscape.envs.engines import cpp
-from gradscape.envs.engines.mpm.boundaries import LadleInTank
+from gradscape.envs.engines.mpm.boundaries import Kind, LadleInTank, Tool, ToolsInRoom
 from gradscape.envs.engines.mpm.grid import velocity_on
 from gradscape.envs.engines.mpm.materials import Fluid, Plasticine
 from gradscape.envs.engines.mpm.smoothing import smoothing_kernels
-from gradscape.envs.engines.mpm.tools import Kind, Tool, ToolsInRoom
 from gradscape.envs.engines.mpm.transfers import transfers
 
 CLANGS = "EightInts"  # a header with these vectors only clang compiles, and so Warp

@@ -7,9 +7,8 @@ import pytest
 import torch
 
 from gradscape.envs.engines.mpm import solver
-from gradscape.envs.engines.mpm.tools import Kind
-from gradscape.envs.mpm.plasticine import DEMONSTRATION, SEGMENTS, TERMS, Plasticine
-from gradscape.envs.mpm.plasticine_model import PARTICLE
+from gradscape.envs.engines.mpm.boundaries import Kind
+from gradscape.envs.mpm.plasticine import DEMONSTRATION, PARTICLE, SEGMENTS, TERMS, Plasticine
 from gradscape.envs.mpm.plasticine_scenes import Assembly, RollingPin, Rope, Torus, TripleMove, Writer
 from gradscape.envs.mpm.scene import STEPS
 from gradscape.envs.mpm.targets import Target

@@ -8,17 +8,16 @@ import pytest
 import torch
 
 from gradscape.envs.base import Fidelity
+from gradscape.envs.engines.mpm.boundaries import Kind, Tool, ToolsInRoom
 from gradscape.envs.engines.mpm.materials import Plasticine as Clay
-from gradscape.envs.engines.mpm.materials.plasticine_series import NEAR
+from gradscape.envs.engines.mpm.materials.plasticine import NEAR
 from gradscape.envs.engines.mpm.model import Body, Model
 from gradscape.envs.engines.mpm.raster import Raster
 from gradscape.envs.engines.mpm.solver import Solver
-from gradscape.envs.engines.mpm.tools import Kind, Tool, ToolsInRoom
-from gradscape.envs.mpm.plasticine import DEMONSTRATION, Plasticine
-from gradscape.envs.mpm.plasticine_model import SPAN, YOUNG
+from gradscape.envs.mpm.plasticine import DEMONSTRATION, SPAN, YOUNG, Plasticine
 from gradscape.envs.mpm.plasticine_scenes import Assembly, Pinch, Table, Torus, TripleMove, Writer
 from gradscape.envs.mpm.scene import SEGMENTS
-from gradscape.envs.mpm.shapes import Ball, fill
+from gradscape.envs.mpm.targets import Ball, fill
 
 from ..engines.bench import BoundaryBench, MaterialBench, vectors
 from ..scenes import cheap

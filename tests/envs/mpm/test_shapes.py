@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gradscape.envs.mpm.shapes import Ball, Box, Ring, fill, shares
+from gradscape.envs.mpm.targets import Ball, Box, Ring, fill, shares
 
 BOX, BALL = Box((0.1, 0.2, 0.3), (0.2, 0.4, 0.6)), Ball((0.0, 1.0, 0.0), 0.5)
 RING = Ring((1.0, 0.0, 2.0), inner=0.3, outer=0.5, height=0.2)

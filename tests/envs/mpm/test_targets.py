@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from gradscape.envs.engines.mpm.tools import Kind, Tool
+from gradscape.envs.engines.mpm.boundaries import Kind, Tool
 from gradscape.envs.mpm import targets
-from gradscape.envs.mpm.plasticine import Fidelity
-from gradscape.envs.mpm.plasticine_model import SPAN, model
+from gradscape.envs.mpm.plasticine import SPAN, Fidelity, model
 from gradscape.envs.mpm.plasticine_scenes import Torus
 from gradscape.envs.mpm.targets import Target, compare, contact, distance_outside, load_or_make
 

@@ -16,7 +16,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ...runtime import precision
-from . import elastic, fluid, plasticine, plasticine_series
+from . import elastic, fluid, plasticine
 from .adjoints import after_p2g, alone
 
 
@@ -121,7 +121,7 @@ class Plasticine(_Solid):
         """Return (update, adjoint) of one precision for a CPU, or for `columns`."""
         if not columns:
             return plasticine.kernels_in_rows(name)
-        found = (plasticine_series if name == "float32" else plasticine).kernels(name)
+        found = (plasticine.series_kernels if name == "float32" else plasticine.kernels)(name)
         return found.update, after_p2g(name, found, 4)
 
     def constants(self) -> tuple[float, ...]:

@@ -15,8 +15,7 @@ import warp as wp
 from ... import cpp
 from ...launches import blocks
 from ...runtime import precision
-from ..gathers import adjoint_gatherers
-from ..layout import layout
+from ..stencil import adjoint_gatherers, layout
 
 
 class MaterialKernels(NamedTuple):

@@ -7,7 +7,7 @@ import warp as wp
 
 from ... import cpp
 from ...runtime import precision
-from ..layout import layout
+from ..stencil import layout
 from .adjoints import MaterialKernels
 
 TORN = 1.04  # volume ratio at which a fluid tears

@@ -9,8 +9,7 @@ import torch
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from gradscape.envs.engines.balls.board import Board
-from gradscape.envs.engines.balls.impacts import JAM, Solver
+from gradscape.envs.engines.balls.impacts import JAM, Board, Solver
 
 AWAY = (100.0, 100.0)  # a bar there is never met
 BOARD = Board(

@@ -5,11 +5,10 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from gradscape.envs.engines.mpm.boundaries import LadleInTank, Open
+from gradscape.envs.engines.mpm.boundaries import Kind, LadleInTank, Open, Tool, ToolsInRoom
 from gradscape.envs.engines.mpm.materials import Elastic, Fluid, Plasticine
 from gradscape.envs.engines.mpm.model import Body, Model
 from gradscape.envs.engines.mpm.solver import Solver
-from gradscape.envs.engines.mpm.tools import Kind, Tool, ToolsInRoom
 from gradscape.envs.engines.runtime import to_torch
 
 DENSITY, SPEED, GRAVITY = 1330.0, 6.0, 9.81  # [kg/m^3], of sound [m/s], [m/s^2]

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from gradscape.envs.engines.mpm.cells import (
+from gradscape.envs.engines.mpm.columns import (
     SEGMENT,
     SIZES,
     Lists,

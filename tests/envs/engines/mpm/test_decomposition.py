@@ -7,7 +7,7 @@ import pytest
 import torch
 import warp as wp
 
-from gradscape.envs.engines.mpm.materials.decomposition import svd
+from gradscape.envs.engines.mpm.materials.plasticine import svd
 from gradscape.envs.engines.runtime import precision
 
 from ..bench import IDENTITY, NAMES, draw, rotations

@@ -7,13 +7,11 @@ import torch
 import warp as wp
 
 from gradscape.envs.engines.mpm.boundaries import Open
-from gradscape.envs.engines.mpm.cells import SEGMENT, STRETCH, segments
-from gradscape.envs.engines.mpm.columns import GPU_TEAM, column_kernels
+from gradscape.envs.engines.mpm.columns import GPU_TEAM, PARTS, SEGMENT, STRETCH, column_kernels, segments
 from gradscape.envs.engines.mpm.grid import velocity_on
 from gradscape.envs.engines.mpm.model import Box, place_grid
 from gradscape.envs.engines.mpm.smoothing import smoothing_columns
 from gradscape.envs.engines.mpm.transfers import transfers
-from gradscape.envs.engines.mpm.walk import PARTS
 from gradscape.envs.engines.runtime import to_torch
 
 from .bodies import kneading

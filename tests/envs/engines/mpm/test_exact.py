@@ -7,7 +7,7 @@ import pytest
 import torch
 import warp as wp
 
-from gradscape.envs.engines.mpm.exact import BITS, LANES, LOWEST, SUMS, settle_kernel
+from gradscape.envs.engines.mpm.boundaries import BITS, LANES, LOWEST, SUMS, settle_kernel
 from gradscape.envs.engines.runtime import precision, to_torch
 
 SLOTS, STEPS = 2, 3

@@ -6,7 +6,7 @@ import warp as wp
 
 from gradscape.envs.engines.launches import Launches
 from gradscape.envs.engines.mpm.checkpoints import Allocator
-from gradscape.envs.engines.mpm.extent import Extent
+from gradscape.envs.engines.mpm.solver import Extent
 from gradscape.envs.engines.runtime import to_torch
 
 from .bodies import free_model

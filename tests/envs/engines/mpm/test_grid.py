@@ -7,10 +7,9 @@ import torch
 import warp as wp
 
 from gradscape.envs.engines import cpp
-from gradscape.envs.engines.mpm.boundaries import LadleInTank, Open
+from gradscape.envs.engines.mpm.boundaries import STICKY, Kind, LadleInTank, Open, Tool, ToolsInRoom
 from gradscape.envs.engines.mpm.grid import velocity_at, velocity_on
 from gradscape.envs.engines.mpm.stencil import lattice
-from gradscape.envs.engines.mpm.tools import STICKY, Kind, Tool, ToolsInRoom
 from gradscape.envs.engines.runtime import precision
 
 from ..bench import draw, placed

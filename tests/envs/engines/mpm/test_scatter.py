@@ -7,7 +7,7 @@ import pytest
 import torch
 import warp as wp
 
-from gradscape.envs.engines.mpm.cells import SEGMENT, SIZES, STEP, STRETCH, segments
+from gradscape.envs.engines.mpm.columns import SEGMENT, SIZES, STEP, STRETCH, segments
 from gradscape.envs.engines.mpm.model import Body, Box, Model, place_grid
 from gradscape.envs.engines.mpm.solver import Solver
 from gradscape.envs.engines.runtime import to_torch

@@ -6,7 +6,7 @@ import pytest
 import torch
 import warp as wp
 
-from gradscape.envs.engines.mpm.sdf import bowl, capsule, cylinder, rod, sphere, torus
+from gradscape.envs.engines.mpm.boundaries import bowl, capsule, cylinder, rod, sphere, torus
 from gradscape.envs.engines.runtime import precision
 
 RADIUS, THICKNESS, HEIGHT = 0.07, 0.01, 0.25

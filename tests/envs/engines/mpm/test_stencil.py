@@ -5,8 +5,7 @@ import re
 import pytest
 import warp as wp
 
-from gradscape.envs.engines.mpm.cells import cell_kernels
-from gradscape.envs.engines.mpm.columns import GPU_TEAM, column_kernels
+from gradscape.envs.engines.mpm.columns import GPU_TEAM, cell_kernels, column_kernels
 from gradscape.envs.engines.mpm.materials import Fluid
 from gradscape.envs.engines.mpm.smoothing import smoothing_columns
 from gradscape.envs.engines.mpm.transfers import transfers_of_columns

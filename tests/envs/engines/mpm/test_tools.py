@@ -7,8 +7,18 @@ import torch
 import warp as wp
 
 from gradscape.envs.controls import roll
-from gradscape.envs.engines.mpm.sdf import capsule, cylinder, sphere, torus
-from gradscape.envs.engines.mpm.tools import FAINTEST, STICKY, UPSTREAM_DT, Kind, Tool, ToolsInRoom
+from gradscape.envs.engines.mpm.boundaries import (
+    FAINTEST,
+    STICKY,
+    UPSTREAM_DT,
+    Kind,
+    Tool,
+    ToolsInRoom,
+    capsule,
+    cylinder,
+    sphere,
+    torus,
+)
 from gradscape.envs.engines.runtime import precision
 
 from ..bench import BoundaryBench, draw, vectors

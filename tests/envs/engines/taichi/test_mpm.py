@@ -9,13 +9,11 @@ import torch
 
 from gradscape.envs.base import Fidelity
 from gradscape.envs.engines.mpm import solver as mpm
-from gradscape.envs.engines.mpm.boundaries import Open
+from gradscape.envs.engines.mpm.boundaries import STICKY, Kind, Open, Tool, ToolsInRoom
 from gradscape.envs.engines.mpm.materials import Elastic, Fluid, Plasticine
 from gradscape.envs.engines.mpm.model import Body, Model
-from gradscape.envs.engines.mpm.tools import STICKY, Kind, Tool, ToolsInRoom
 from gradscape.envs.engines.taichi import mpm as taichi_mpm
-from gradscape.envs.engines.taichi.boundaries import boundary_contact
-from gradscape.envs.engines.taichi.materials import kernels
+from gradscape.envs.engines.taichi.mpm import boundary_contact, kernels
 from gradscape.envs.engines.taichi.runtime import real, start
 from gradscape.envs.mpm import fluid, plasticine_model
 from gradscape.envs.mpm.plasticine_scenes import RollingPin
