@@ -27,7 +27,8 @@ from types import BuiltinFunctionType, FunctionType, MethodType, ModuleType
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from ..landscapes.storage.files import resolve
-from .engines import ENGINES, EXTRAS, install_line, is_installed
+from .engines import ENGINES, install_line, is_installed
+from .engines import EXTRAS as EXTRAS
 from .records import unknown_fidelity
 
 if TYPE_CHECKING:
@@ -269,7 +270,7 @@ def find_environment(what: Any) -> type[Environment] | Environment:
         return _import_from_file(what) if IN_FILE.fullmatch(what) else registered_environment(what)
     if isinstance(what, Environment) or (isinstance(what, type) and issubclass(what, Environment)):
         return what
-    from .function import GivenEnvironment
+    from .adapters import GivenEnvironment
 
     if isinstance(what, FunctionType | BuiltinFunctionType | MethodType):
         raise ValueError(
@@ -356,7 +357,7 @@ def source_of(env: Environment) -> str | type[Environment] | Environment:
 
     A class is enough where its settings make the environment again; a function goes there itself.
     """
-    from .function import FunctionEnvironment, GivenEnvironment
+    from .adapters import FunctionEnvironment, GivenEnvironment
 
     entry = entries().get(env.name)
     if entry is not None and isinstance(entry.target, str):
@@ -392,7 +393,7 @@ def _place_in_file(text: str) -> tuple[Path, str, str]:
 
 def _named(found: type[Environment] | Environment, attribute: str) -> type[Environment] | Environment:
     """Return a function that has no name of its own by what its file calls it."""
-    from .function import NAMELESS, FunctionEnvironment
+    from .adapters import NAMELESS, FunctionEnvironment
 
     return found.named(attribute) if isinstance(found, FunctionEnvironment) and found.name == NAMELESS else found
 

@@ -25,7 +25,7 @@ import torch
 from distributed.comm import connect
 from distributed.security import Security
 
-from gradscape.envs.function import from_torch
+from gradscape.envs.adapters import from_torch
 from gradscape.envs.functions import Branin
 from gradscape.envs.registry import make
 from gradscape.jobs.slice import STORE

@@ -10,7 +10,7 @@ from importlib import import_module
 from typing import Any, get_overloads
 
 import gradscape
-from gradscape.envs.function import DEFAULTS
+from gradscape.envs.adapters import DEFAULTS
 from gradscape.jobs.scene import SceneSpec
 
 from .text import CODE, cell, code, contents, page, table

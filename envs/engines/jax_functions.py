@@ -17,7 +17,7 @@ from torch import Tensor
 from ...landscapes.objective import SimulatorError
 
 if TYPE_CHECKING:
-    from ..function import Compute, Function
+    from ..adapters import Compute, Function
 
 GROWTH = 4
 _TRACED: dict[str, str] = {}  # the precision that JAX has last traced a function in

@@ -15,11 +15,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ...landscapes.objective import SimulatorError
-from ..function import check_shape
+from ..adapters import check_shape
 from .runtime import cuda_available, precision
 
 if TYPE_CHECKING:
-    from ..function import Compute, Function
+    from ..adapters import Compute, Function
 
 CORRUPTS = "This may corrupt gradient computation"  # how Warp ends what it says of an array that is overwritten
 

@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from .api.study import study
     from .api.surface import surface
     from .api.sweep import sweep
+    from .envs.adapters import from_jax, from_numpy, from_step, from_torch, from_warp
     from .envs.base import Environment, Fidelity
-    from .envs.function import from_jax, from_numpy, from_step, from_torch, from_warp
     from .envs.registry import as_environment, make, register
     from .jobs.scene import SceneSpec
     from .landscapes.episode import Episode
@@ -46,7 +46,7 @@ _HOMES = {
     "api.study": ("study",),
     "api.surface": ("surface",),
     "api.sweep": ("sweep",),
-    "envs.function": ("from_jax", "from_numpy", "from_step", "from_torch", "from_warp"),
+    "envs.adapters": ("from_jax", "from_numpy", "from_step", "from_torch", "from_warp"),
     "envs.base": ("Environment", "Fidelity"),
     "envs.registry": ("as_environment", "make", "register"),
     "jobs.scene": ("SceneSpec",),

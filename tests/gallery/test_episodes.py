@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from gradscape.envs.function import from_numpy
+from gradscape.envs.adapters import from_numpy
 from gradscape.gallery.episodes import choose_nodes
 from gradscape.gallery.records import Node
 from gradscape.landscapes.plane import Plane

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from gradscape.cli import main
-from gradscape.envs.function import from_numpy
+from gradscape.envs.adapters import from_numpy
 from gradscape.envs.registry import make
 from gradscape.gallery import league as gallery_league
 from gradscape.gallery.compute import PARTS

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import xarray as xr
 
-from gradscape.envs.function import from_numpy
+from gradscape.envs.adapters import from_numpy
 from gradscape.gallery.runs import open_run, save_run
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.optim.search import search

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import gradscape as gs
-from gradscape.envs.function import from_torch
+from gradscape.envs.adapters import from_torch
 from gradscape.jobs.cut import points_in
 from gradscape.jobs.scene import named_point
 from gradscape.landscapes.space import ParameterSpace

@@ -5,7 +5,7 @@ import pytest
 import torch
 from torch.func import jacrev, vmap
 
-from gradscape.envs.function import from_numpy, from_torch
+from gradscape.envs.adapters import from_numpy, from_torch
 from gradscape.landscapes.objective import Objective, Status
 from gradscape.landscapes.space import ParameterSpace
 

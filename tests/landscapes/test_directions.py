@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from gradscape.envs.function import from_torch
+from gradscape.envs.adapters import from_torch
 from gradscape.jobs.cut import cut, points_in
 from gradscape.landscapes.directions import (
     barrier,

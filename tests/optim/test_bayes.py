@@ -3,7 +3,7 @@ import pytest
 import torch
 from botorch.acquisition.analytic import UpperConfidenceBound
 
-from gradscape.envs.function import from_torch
+from gradscape.envs.adapters import from_torch
 from gradscape.envs.registry import make
 from gradscape.landscapes.objective import Evaluation, Objective, Status
 from gradscape.landscapes.space import ParameterSpace

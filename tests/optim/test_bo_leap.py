@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from gradscape.envs.function import from_torch
+from gradscape.envs.adapters import from_torch
 from gradscape.envs.registry import make
 from gradscape.landscapes.objective import Evaluation, Objective, Status
 from gradscape.landscapes.space import ParameterSpace

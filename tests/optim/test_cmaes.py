@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy.stats import special_ortho_group
 
-from gradscape.envs.function import from_torch
+from gradscape.envs.adapters import from_torch
 from gradscape.landscapes.objective import Evaluation, Objective, Status
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.optim.base import Kind, Points

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from gradscape.envs.function import from_torch
+from gradscape.envs.adapters import from_torch
 from gradscape.landscapes.objective import Evaluation, Objective, Status
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.optim.base import Kind

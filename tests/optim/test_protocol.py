@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from gradscape.envs.function import from_torch
+from gradscape.envs.adapters import from_torch
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.optim.registry import methods, optimizer_class
 

@@ -2,7 +2,7 @@ import numpy as np
 import torch
 from scipy.stats import kstest
 
-from gradscape.envs.function import from_torch
+from gradscape.envs.adapters import from_torch
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.optim.base import Kind
 from gradscape.optim.methods.random import RandomSearch

@@ -9,7 +9,7 @@ from botorch.optim.closures import get_loss_closure_with_grads
 from gpytorch.mlls import ExactMarginalLogLikelihood
 from scipy.optimize import Bounds, basinhopping, minimize
 
-from gradscape.envs.function import from_torch
+from gradscape.envs.adapters import from_torch
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.optim.base import Kind
 from gradscape.optim.methods.adam import Adam, AdamOptions

@@ -7,7 +7,7 @@ import pytest
 import torch
 import xarray as xr
 
-from gradscape.envs.function import from_torch
+from gradscape.envs.adapters import from_torch
 from gradscape.landscapes.cost import LONG, MOMENT, episode_cost
 from gradscape.landscapes.objective import Evaluation, Objective, Status
 from gradscape.landscapes.space import ParameterSpace

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from gradscape.envs.function import from_torch
+from gradscape.envs.adapters import from_torch
 from gradscape.landscapes.conformance.extremes import CORNERS, ExtremeCase, corners
 from gradscape.landscapes.conformance.suite import check
 from gradscape.landscapes.objective import Evaluation, Objective, Status

@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from gradscape.envs.function import from_numpy, from_torch
+from gradscape.envs.adapters import from_numpy, from_torch
 from gradscape.landscapes.measures.sensitivity import Design, Responses, default_samples, explore, rank
 from gradscape.landscapes.objective import Evaluation, Objective
 from gradscape.landscapes.space import ParameterSpace

@@ -10,7 +10,7 @@ import torch
 import xarray as xr
 from torch import Tensor
 
-from gradscape.envs.function import from_numpy, from_torch
+from gradscape.envs.adapters import from_numpy, from_torch
 from gradscape.jobs.slice import look_between
 from gradscape.landscapes.measures.undersampled import (
     ATTRIBUTE,

@@ -16,7 +16,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gradscape.envs.function import from_torch
+from gradscape.envs.adapters import from_torch
 from gradscape.landscapes.identity import StoreError
 from gradscape.landscapes.objective import Evaluation, Objective, Status
 from gradscape.landscapes.plane import Plane

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 import torch
 
+from gradscape.envs.adapters import from_torch
 from gradscape.envs.engines.sheets import springs
-from gradscape.envs.function import from_torch
 from gradscape.envs.registry import make
 from gradscape.landscapes.cost import seconds_per_episode
 from gradscape.landscapes.identity import StoreError

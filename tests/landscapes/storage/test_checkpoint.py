@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import gradscape as gs
-from gradscape.envs.function import from_torch
+from gradscape.envs.adapters import from_torch
 from gradscape.landscapes.identity import DamagedError, StoreError, StoreMismatchError
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.landscapes.storage.checkpoint import Checkpoint

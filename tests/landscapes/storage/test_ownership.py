@@ -12,7 +12,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from gradscape.envs.function import from_torch
+from gradscape.envs.adapters import from_torch
 from gradscape.landscapes.identity import StoreError
 from gradscape.landscapes.plane import Plane
 from gradscape.landscapes.sampling.fill import sample
