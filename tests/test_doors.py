@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import warp as wp
 
 import gradscape as gs
+from gradscape.cli import verbs
 
 space = gs.ParameterSpace({"x": (-1, 2, "m"), "y": (-1, 2, "m")})
 of_torch = gs.from_torch(lambda x: (x**2).sum(1), space, name="of-torch")
@@ -163,6 +164,7 @@ import jax
 import jax.numpy as jnp
 
 import gradscape as gs
+from gradscape.cli import verbs
 
 
 def swing(p, damping=0.1, dt=0.1, steps=10):
