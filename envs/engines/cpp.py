@@ -72,35 +72,29 @@ def func_native(
     return declare
 
 
-def kernel_in_rows(name: str, *, called: str | None = None, constants: Iterable[object] = ()) -> Callable[[Any], Any]:
-    """Declare a kernel for a CPU, each of whose threads has the row of an environment, by a function without a body.
+def kernel_in_rows(name: str, function: str, *constants: object, **kinds: Any) -> Any:
+    """Return a kernel of a module for a CPU, each of whose threads has the row of an environment.
 
-    The function of the headers, `called` as this one is unless another name is given, takes the environment's number,
-    the kernel's arguments, and `constants`. `name` is that of the kernel's module.
+    Its arguments are of these `kinds`, by their names. It calls a function of the headers, which takes the
+    environment's number, the arguments, and `constants`.
     """
+    known = {"e": int} | {_adjoint_last(one): kind for one, kind in kinds.items()}
 
-    def declare(function: Any) -> Any:
-        kinds = dict(function.__annotations__)
-        known = {"e": int} | {_adjoint_last(one): kind for one, kind in kinds.items()}
+    def row() -> None: ...
 
-        def row() -> None: ...
+    def kernel() -> Any:
+        return row  # which Warp finds here by its name
 
-        def kernel() -> Any:
-            return row  # which Warp finds here by its name
-
-        code = call(called or function.__name__, [*known, *map(str, constants)])
-        row = wp.func_native(code)(with_arguments(row, known))
-        given = ", ".join(kinds)
-        made = wp.Kernel(
-            with_arguments(kernel, kinds),
-            key=re.sub("[^0-9a-zA-Z_]", "", function.__qualname__.replace(".", "__")),
-            module=wp.get_module(module(name)),
-            options={"enable_backward": False},
-            source=f"def kernel({given}):\n    e, _ = wp.tid()\n    row(e, {given})\n",
-        )
-        return take_rows(made)
-
-    return declare
+    row = wp.func_native(call(function, [*known, *map(str, constants)]))(with_arguments(row, known))
+    given = ", ".join(kinds)
+    made = wp.Kernel(
+        with_arguments(kernel, kinds),
+        key=f"rows__locals__{function}",
+        module=wp.get_module(module(name)),
+        options={"enable_backward": False},
+        source=f"def kernel({given}):\n    e, _ = wp.tid()\n    row(e, {given})\n",
+    )
+    return take_rows(made)
 
 
 def _adjoint_last(name: str) -> str:

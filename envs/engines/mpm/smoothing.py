@@ -9,7 +9,7 @@ therefore averaged over the grid, as its logarithm beyond hydrostatic equilibriu
 Fluid at rest keeps its J to round-off, uneven J is taken to its neighbours', and the fluid's volume stays.
 """
 
-from functools import cache
+from functools import cache, partial
 from itertools import product
 from types import SimpleNamespace
 from typing import Any, no_type_check
@@ -156,73 +156,38 @@ def _sum_at_nodes(
 def smoothing_kernels(name: str) -> SimpleNamespace:
     """Return `clear, spread, collect, adjoint_collect, adjoint_spread`, kernels of one precision for a CPU."""
     types = precision(name)
-    real, vec3, Lattice = types.real, types.vec3, lattice(name)
-    module = f"gradscape.smoothing.{name}"
+    real, Lattice, module = types.real, lattice(name), f"gradscape.smoothing.{name}"
 
     @wp.kernel(module=cpp.module(module), enable_backward=False)
     def clear(values: wp.array2d[real]):
         e, i = wp.tid()
         values[e, i] = real(0.0)
 
-    @cpp.kernel_in_rows(module, called="smoothing_spread")
-    def spread(
-        lattice: Lattice,
-        first: int,
-        slope: real,
-        volume: wp.array2d[real],
-        x: wp.array2d[vec3],
-        J: wp.array2d[real],
-        amount: wp.array2d[real],
-        weight: wp.array2d[real],
-    ):
-        """Scatter V s and V."""
-
-    @cpp.kernel_in_rows(module, called="smoothing_collect")
-    def collect(
-        lattice: Lattice,
-        first: int,
-        slope: real,
-        share: real,
-        x: wp.array2d[vec3],
-        J: wp.array2d[real],
-        amount: wp.array2d[real],
-        weight: wp.array2d[real],
-        J_new: wp.array2d[real],
-    ):
-        """Gather the nodes' means and take J so far towards them."""
-
-    @cpp.kernel_in_rows(module, called="smoothing_adjoint_collect")
-    def adjoint_collect(
-        lattice: Lattice,
-        first: int,
-        share: real,
-        x: wp.array2d[vec3],
-        J_new: wp.array2d[real],
-        amount: wp.array2d[real],
-        weight: wp.array2d[real],
-        adj_J: wp.array2d[real],
-        adj_x: wp.array2d[vec3],
-        adj_mean: wp.array2d[real],
-    ):
-        """Scatter the adjoints of the nodes' means; add to adj_x, turn adj_J from that of J' into that of log J'."""
-
-    @cpp.kernel_in_rows(module, called="smoothing_adjoint_spread")
-    def adjoint_spread(
-        lattice: Lattice,
-        first: int,
-        slope: real,
-        share: real,
-        volume: wp.array2d[real],
-        x: wp.array2d[vec3],
-        J: wp.array2d[real],
-        amount: wp.array2d[real],
-        weight: wp.array2d[real],
-        adj_mean: wp.array2d[real],
-        adj_J: wp.array2d[real],
-        adj_x: wp.array2d[vec3],
-    ):
-        """Gather the adjoint of s; add to adj_x, turn adj_J from that of log J' into that of J."""
-
+    numbers, vectors = wp.array2d[types.real], wp.array2d[types.vec3]
+    declare = partial(cpp.kernel_in_rows, module)
+    begin, sums = {"lattice": Lattice, "first": int}, {"amount": numbers, "weight": numbers}
+    body, smoothed = {"x": vectors, "J": numbers}, {"x": vectors, "J_new": numbers}
+    adjoints = {"adj_J": numbers, "adj_x": vectors}
+    # Scatter V s and V.
+    spread = declare("smoothing_spread", **begin, slope=real, volume=numbers, **body, **sums)
+    # Gather the nodes' means and take J so far towards them.
+    collect = declare("smoothing_collect", **begin, slope=real, share=real, **body, **sums, J_new=numbers)
+    # Scatter the adjoints of the nodes' means; add to adj_x, turn adj_J from that of J' into that of log J'.
+    adjoint_collect = declare(
+        "smoothing_adjoint_collect", **begin, share=real, **smoothed, **sums, **adjoints, adj_mean=numbers
+    )
+    # Gather the adjoint of s; add to adj_x, turn adj_J from that of log J' into that of J.
+    body |= {**sums, "adj_mean": numbers}
+    adjoint_spread = declare(
+        "smoothing_adjoint_spread",
+        **begin,
+        slope=real,
+        share=real,
+        volume=numbers,
+        **body,
+        **numbers_of_nodes,
+        **adjoints,
+    )
     return SimpleNamespace(
         clear=clear,
         spread=spread,

@@ -8,7 +8,7 @@ Those of a CPU are in C++ (`native/transfers.h`). On a GPU the scatters are thos
 the adjoint of p2g.
 """
 
-from functools import cache
+from functools import cache, partial
 from types import SimpleNamespace
 from typing import no_type_check
 
@@ -24,62 +24,22 @@ from .stencil import adjoint_gatherers, gatherers, lattice, layout, stencil
 @no_type_check
 def transfers(name: str) -> SimpleNamespace:
     """Return the transfer kernels `p2g, g2p, adjoint_p2g, adjoint_g2p` of one precision for a CPU."""
-    types = precision(name)
-    real, vec3, vec4, mat33 = types.real, types.vec3, types.vec4, types.mat33
-    Lattice, declare = lattice(name), cpp.kernel_in_rows(f"gradscape.transfers.{name}")
-
-    @declare
-    def p2g(
-        lattice: Lattice,
-        mass: wp.array2d[real],
-        x: wp.array2d[vec3],
-        v: wp.array2d[vec3],
-        A: wp.array2d[mat33],
-        grid_m: wp.array2d[vec4],
-    ):
-        """Scatter momentum m v + A (x_i - x) and mass."""
-
-    @declare
-    def adjoint_p2g(
-        lattice: Lattice,
-        mass: wp.array2d[real],
-        x: wp.array2d[vec3],
-        v: wp.array2d[vec3],
-        A: wp.array2d[mat33],
-        adj_grid_m: wp.array2d[vec4],
-        adj_x: wp.array2d[vec3],
-        adj_v: wp.array2d[vec3],
-        adj_A: wp.array2d[mat33],
-    ):
-        """Gather the adjoints of p2g: add to adj_x, set adj_v and adj_A."""
-
-    @declare
-    def g2p(
-        lattice: Lattice,
-        dt: real,
-        x: wp.array2d[vec3],
-        grid_v: wp.array2d[vec4],
-        x_new: wp.array2d[vec3],
-        v_new: wp.array2d[vec3],
-        C_new: wp.array2d[mat33],
-        left_box: wp.array[wp.int32],
-    ):
-        """Gather v' = sum w v_i and C' = 4/dx^2 sum w v_i (x_i - x)^T; move x' = x + dt v'."""
-
-    @declare
-    def adjoint_g2p(
-        lattice: Lattice,
-        dt: real,
-        x: wp.array2d[vec3],
-        grid_v: wp.array2d[vec4],
-        adj_x_new: wp.array2d[vec3],
-        adj_v_new: wp.array2d[vec3],
-        adj_C_new: wp.array2d[mat33],
-        adj_grid_v: wp.array2d[vec4],
-        adj_x: wp.array2d[vec3],
-    ):
-        """Scatter the adjoints of g2p: add to adj_grid_v, set adj_x."""
-
+    types, Lattice = precision(name), lattice(name)
+    real, numbers, vectors = types.real, wp.array2d[types.real], wp.array2d[types.vec3]
+    nodes, matrices = wp.array2d[types.vec4], wp.array2d[types.mat33]
+    declare = partial(cpp.kernel_in_rows, f"gradscape.transfers.{name}")
+    given = {"lattice": Lattice, "mass": numbers, "x": vectors, "v": vectors, "A": matrices}
+    gathered = {"lattice": Lattice, "dt": real, "x": vectors, "grid_v": nodes}
+    new = {"adj_x_new": vectors, "adj_v_new": vectors, "adj_C_new": matrices}
+    # Scatter momentum m v + A (x_i - x) and mass.
+    p2g = declare("p2g", **given, grid_m=nodes)
+    # Gather the adjoints of p2g: add to adj_x, set adj_v and adj_A.
+    adjoint_p2g = declare("adjoint_p2g", **given, adj_grid_m=nodes, adj_x=vectors, adj_v=vectors, adj_A=matrices)
+    # Gather v' = sum w v_i and C' = 4/dx^2 sum w v_i (x_i - x)^T; move x' = x + dt v'.
+    left = wp.array[wp.int32]
+    g2p = declare("g2p", **gathered, x_new=vectors, v_new=vectors, C_new=matrices, left_box=left)
+    # Scatter the adjoints of g2p: add to adj_grid_v, set adj_x.
+    adjoint_g2p = declare("adjoint_g2p", **gathered, **new, adj_grid_v=nodes, adj_x=vectors)
     return SimpleNamespace(p2g=p2g, g2p=g2p, adjoint_p2g=adjoint_p2g, adjoint_g2p=adjoint_g2p)
 
 

@@ -1,6 +1,6 @@
 """Kernels of a viscous, weakly compressible fluid, which carries its volume ratio J."""
 
-from functools import cache
+from functools import cache, partial
 from typing import Any, no_type_check
 
 import warp as wp
@@ -108,39 +108,11 @@ def kernels(name: str) -> MaterialKernels:
 def kernels_in_rows(name: str) -> tuple[Any, Any]:
     """Return (update, adjoint) of one precision for a CPU, in C++: eight particles at a time (`native/materials.h`)."""
     types = precision(name)
-    real, mat33 = types.real, types.mat33
-    module = f"gradscape.fluid.{name}.rows"
-
-    @cpp.kernel_in_rows(module, called="fluid_update", constants=[TORN])
-    def update(
-        first: int,
-        dt: real,
-        scale: real,
-        bulk: real,
-        viscosity: real,
-        mass: wp.array2d[real],
-        volume: wp.array2d[real],
-        J: wp.array2d[real],
-        C: wp.array2d[mat33],
-        J_new: wp.array2d[real],
-        A: wp.array2d[mat33],
-    ): ...
-
-    @cpp.kernel_in_rows(module, called="fluid_adjoint", constants=[TORN])
-    def adjoint(
-        first: int,
-        dt: real,
-        scale: real,
-        bulk: real,
-        viscosity: real,
-        mass: wp.array2d[real],
-        volume: wp.array2d[real],
-        J: wp.array2d[real],
-        C: wp.array2d[mat33],
-        adj_J_new: wp.array2d[real],
-        adj_A: wp.array2d[mat33],
-        adj_J: wp.array2d[real],
-        adj_C: wp.array2d[mat33],
-    ): ...
-
+    real, numbers, matrices = types.real, wp.array2d[types.real], wp.array2d[types.mat33]
+    declare = partial(cpp.kernel_in_rows, f"gradscape.fluid.{name}.rows")
+    shared = {"first": int} | dict.fromkeys(("dt", "scale", "bulk", "viscosity"), real)
+    shared |= {"mass": numbers, "volume": numbers, "J": numbers, "C": matrices}
+    update = declare("fluid_update", TORN, **shared, J_new=numbers, A=matrices)
+    adjoints = {"adj_J_new": numbers, "adj_A": matrices, "adj_J": numbers, "adj_C": matrices}
+    adjoint = declare("fluid_adjoint", TORN, **shared, **adjoints)
     return update, adjoint

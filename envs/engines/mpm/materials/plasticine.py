@@ -383,43 +383,15 @@ def kernels_of(name: str, found: Any, module: str) -> MaterialKernels:
 def kernels_in_rows(name: str) -> tuple[Any, Any]:
     """Return (update, adjoint) of one precision for a CPU, in C++: eight particles at a time (`native/materials.h`)."""
     types = precision(name)
-    real, mat33 = types.real, types.mat33
-    module, constants = f"gradscape.plasticine.{name}.rows", [SMALLEST, ROUNDED, ROUND_OFF[name], TINY, SWEEPS]
-
-    @cpp.kernel_in_rows(module, called="plasticine_update", constants=constants)
-    def update(
-        first: int,
-        dt: real,
-        scale: real,
-        mu: real,
-        lam: real,
-        kappa: real,
-        mass: wp.array2d[real],
-        volume: wp.array2d[real],
-        F: wp.array2d[mat33],
-        C: wp.array2d[mat33],
-        F_new: wp.array2d[mat33],
-        A: wp.array2d[mat33],
-    ): ...
-
-    @cpp.kernel_in_rows(module, called="plasticine_adjoint", constants=constants)
-    def adjoint(
-        first: int,
-        dt: real,
-        scale: real,
-        mu: real,
-        lam: real,
-        kappa: real,
-        mass: wp.array2d[real],
-        volume: wp.array2d[real],
-        F: wp.array2d[mat33],
-        C: wp.array2d[mat33],
-        adj_F_new: wp.array2d[mat33],
-        adj_A: wp.array2d[mat33],
-        adj_F: wp.array2d[mat33],
-        adj_C: wp.array2d[mat33],
-    ): ...
-
+    real, numbers, matrices = types.real, wp.array2d[types.real], wp.array2d[types.mat33]
+    declare = partial(cpp.kernel_in_rows, f"gradscape.plasticine.{name}.rows")
+    constants = [SMALLEST, ROUNDED, ROUND_OFF[name], TINY, SWEEPS]
+    shared = {"first": int} | dict.fromkeys(("dt", "scale", "mu", "lam", "kappa"), real)
+    shared |= {"mass": numbers, "volume": numbers, "F": matrices, "C": matrices}
+    update = declare("plasticine_update", *constants, **shared, F_new=matrices, A=matrices)
+    adjoint = declare(
+        "plasticine_adjoint", *constants, **shared, adj_F_new=matrices, adj_A=matrices, adj_F=matrices, adj_C=matrices
+    )
     return update, adjoint
 
 
