@@ -17,7 +17,7 @@ from torch import Tensor
 from ..landscapes.identity import UNNAMED
 from ..landscapes.objective import Evaluation, SimulatorError, first_line
 from ..landscapes.space import ParameterSpace, as_tensor, as_whole
-from .base import Environment, Fidelity
+from .base import Environment, Fidelity, check_shape
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -298,16 +298,6 @@ def function_name(fn: Callable[..., object]) -> str:
     """Return what a function is called, or its type where it has no name."""
     name = str(getattr(fn, "__name__", type(fn).__name__))
     return NAMELESS if name == "<lambda>" else name
-
-
-def check_shape(got: tuple[int, ...], wanted: tuple[int, ...], what: str, name: str) -> None:
-    """Raise SimulatorError where what a function returned has another shape than it must have."""
-    if got == wanted:
-        return
-    advice = "a function of one point: vectorized=False"
-    if got == (*wanted, 1):
-        advice = "squeeze the last axis: `.squeeze(-1)`"
-    raise SimulatorError(f"{name} must return {what} of shape {wanted}; got shape {got} ({advice})")
 
 
 def _arguments(fn: Callable[..., Any]) -> dict[str, Any]:

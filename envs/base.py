@@ -546,6 +546,16 @@ class Environment(Objective):
         return cuda_available()
 
 
+def check_shape(got: tuple[int, ...], wanted: tuple[int, ...], what: str, name: str) -> None:
+    """Raise SimulatorError where what a function returned has another shape than it must have."""
+    if got == wanted:
+        return
+    advice = "a function of one point: vectorized=False"
+    if got == (*wanted, 1):
+        advice = "squeeze the last axis: `.squeeze(-1)`"
+    raise SimulatorError(f"{name} must return {what} of shape {wanted}; got shape {got} ({advice})")
+
+
 class _Bridge(torch.autograd.Function):
     """Make an environment one node of torch's graph: the gradient is computed with the loss, rows being independent."""
 

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ...landscapes.objective import SimulatorError
-from ..adapters import check_shape
+from ..base import check_shape
 from .runtime import cuda_available, precision
 
 if TYPE_CHECKING:

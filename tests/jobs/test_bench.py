@@ -147,7 +147,7 @@ def timed(request, monkeypatch):
     """Return kernels' times by the way of a ball's flight; on a CPU every look at the clock takes a second."""
     if request.param == "cpu":
         clock = Clock(tick=1.0)
-        for module in ("jobs.bench", "envs.engines.profiling"):
+        for module in ("jobs.bench", "envs.engines.launches"):
             monkeypatch.setattr(f"gradscape.{module}.time", clock)
         monkeypatch.setattr(Bounce, "threads", 1)  # a solver takes fewer rows than are worth evaluating at once
     job = BenchJob(lambda engine: Bounce(device=request.param, engine=engine), "warp", batches=[1], seconds=0.0)

@@ -185,7 +185,6 @@ def smoothing_kernels(name: str) -> SimpleNamespace:
         share=real,
         volume=numbers,
         **body,
-        **numbers_of_nodes,
         **adjoints,
     )
     return SimpleNamespace(
