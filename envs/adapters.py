@@ -140,7 +140,7 @@ class Function:
         """Whether the horizon counts time steps: times dt, it is the same time in every fidelity."""
         if not {self.horizon, "dt"} <= set(self.fidelity_arguments):
             return False
-        steps: list[Any] = [one.settings.get(self.horizon) for one in self.known_fidelities.values()]
+        steps: list[Any] = [one.settings.get(self.horizon or "") for one in self.known_fidelities.values()]
         if not all(isinstance(count, int) for count in steps):
             return False
         times = [count * one.dt for count, one in zip(steps, self.known_fidelities.values(), strict=True)]

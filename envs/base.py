@@ -94,7 +94,6 @@ def map_parts(
             raise
 
 
-T = TypeVar("T")
 FLOAT32 = torch.finfo(torch.float32).max
 PROBES = 8  # points that are tried, beside the centre, where a whole batch raised
 

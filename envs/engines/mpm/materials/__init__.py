@@ -41,10 +41,11 @@ class Fluid:
 
     def kernels(self, name: str, *, columns: bool = False) -> tuple[Any, Any]:
         """Return (update, adjoint) of one precision for a CPU, or for `columns`."""
-        if not columns:
-            return fluid.kernels_in_rows(name)
-        found = fluid.kernels(name)
-        return found.update, after_p2g(name, found, 5)
+        found: tuple[Any, Any] = fluid.kernels_in_rows(name)
+        if columns:
+            on_gpu = fluid.kernels(name)
+            found = on_gpu.update, after_p2g(name, on_gpu, 5)
+        return found
 
     def constants(self) -> tuple[float, ...]:
         """Return what the kernels take besides state and motion."""
@@ -119,10 +120,11 @@ class Plasticine(_Solid):
 
     def kernels(self, name: str, *, columns: bool = False) -> tuple[Any, Any]:
         """Return (update, adjoint) of one precision for a CPU, or for `columns`."""
-        if not columns:
-            return plasticine.kernels_in_rows(name)
-        found = (plasticine.series_kernels if name == "float32" else plasticine.kernels)(name)
-        return found.update, after_p2g(name, found, 4)
+        found: tuple[Any, Any] = plasticine.kernels_in_rows(name)
+        if columns:
+            on_gpu = (plasticine.series_kernels if name == "float32" else plasticine.kernels)(name)
+            found = on_gpu.update, after_p2g(name, on_gpu, 4)
+        return found
 
     def constants(self) -> tuple[float, ...]:
         """Return what the kernels take besides state and motion; the last is the largest deviatoric log strain."""
