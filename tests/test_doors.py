@@ -94,7 +94,7 @@ def functions(f: Any, name: str) -> dict[str, Callable[[], Any]]:
         "slice": lambda: gs.slice(f, resolution=6, out=f"{name}/slice"),
         "sample": lambda: gs.sample(f, gs.open_slice(f"{name}/slice").plane),
         "open_slice": lambda: gs.open_slice(f"{name}/slice", env=f).report(points=2),
-        "report": lambda: gs.report(f"{name}/slice", env=f, points=2, out=f"{name}/report"),
+        "report": lambda: gs.report(f"{name}/slice", env=f, points_per_axis=2, out=f"{name}/report"),
         "sweep": lambda: gs.sweep(f, (0, 1), "smoothing", frames=2, resolution=4, out=f"{name}/sweep"),
         "optimize": lambda: gs.optimize(f, "random", budget=6, out=f"{name}/run"),
         "open_run": lambda: gs.open_run(f"{name}/run"),
@@ -115,7 +115,7 @@ def commands(f: str, name: str) -> dict[str, str]:
     return {
         "envs": f"envs {f}",
         "slice": f"slice {f} --resolution 6 --out {name}/s",
-        "report": f"report {name}/s --env {f} --points 2 --out {name}/r",
+        "report": f"report {name}/s --env {f} --points-per-axis 2 --out {name}/r",
         "check": f"check {f} --points 2",
         "sweep": f"sweep {f} --dims 0 1 --over smoothing --frames 2 --resolution 4 --out {name}/w",
         "optimize": f"optimize {f} --method random --budget 6 --out {name}/o",

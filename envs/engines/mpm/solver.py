@@ -13,8 +13,6 @@ large to be kept whole in pieces. Between control steps particles are sorted (`o
 smoothed (`smoothing`).
 """
 
-from __future__ import annotations
-
 import threading
 import weakref
 from collections.abc import Callable, Iterator, Mapping
