@@ -357,7 +357,7 @@ def _check_precision(precision: Any, who: str) -> str:
 # ---- Functions of torch, NumPy, JAX and Warp, simulators with reset and step, and objects of one's own as
 # environments.
 
-LEAST_STEP = 1e-12  # of differences: losses are rounded to 1e-16 of themselves, and their difference is divided by it
+MIN_STEP = 1e-12  # of differences: losses are rounded to 1e-16 of themselves, and their difference is divided by it
 Mode = Literal["reverse", "forward"]
 Batch = Literal["vmap", "map"]
 
@@ -398,7 +398,7 @@ def from_numpy(
     single point, shape (dim,), and returns one loss, or that and its gradient. The other keywords are those of
     `FunctionKeywords`: name, loss_unit, maximize, options, fidelities, horizon, seeds, precision, rows.
 
-    Raises ValueError where `differences` is no fraction of the bounds, or lost in rounding beside them.
+    Raises ValueError where `differences` is no fraction of the bounds, or lost in rounding relative to them.
     """
     step = None if differences is None else _step(differences, space)
     return _wrap(fn, space, _NumPy(vectorized, step), said)
@@ -450,7 +450,7 @@ def from_warp(
     zero after each evaluation. The losses are made with requires_grad=True.
 
     A kernel that writes to an array which an earlier one has read makes gradients wrong without a word.
-    `check_overwrites` looks for that once, before the first gradient, and builds the function's kernels anew for it,
+    `check_overwrites` looks for that once, before the first gradient, and builds the function's kernels again for it,
     which may take long; leave it out for a simulator that is known to be right. The other keywords are those of
     `FunctionKeywords`: name, loss_unit, maximize, options, fidelities, horizon, seeds, precision, rows.
 
@@ -662,7 +662,7 @@ def _numbers(values: object, what: str) -> Tensor:
 
 
 def _copied(result: Any) -> Any:
-    """Return a copy of what a function returned: one that returns its own buffer fills it anew at the next point."""
+    """Return a copy of what a function returned: one that returns its own buffer fills it again at the next point."""
     return tuple(map(_copied, result)) if isinstance(result, tuple) else np.array(result, subok=True)  # masks stay
 
 
@@ -676,15 +676,17 @@ def _columns(found: Sequence[Any]) -> Any:
 def _step(differences: object, space: ParameterSpace) -> float:
     """Return a step, a fraction of the bounds, that is no larger than they are and not lost in rounding."""
     fraction = float(as_tensor(differences, "from_numpy's differences"))
-    if not LEAST_STEP <= fraction <= 1:
+    if not MIN_STEP <= fraction <= 1:
         raise ValueError(
-            f"from_numpy takes differences from {LEAST_STEP:g} to 1, a fraction of the bounds; got {fraction}"
+            f"from_numpy takes differences from {MIN_STEP:g} to 1, a fraction of the bounds; got {fraction}"
         )
     farthest = torch.maximum(space.lower.abs(), space.upper.abs())
     lost = (farthest + fraction * (space.upper - space.lower) == farthest).tolist()
     if any(lost):
         name = space.names[lost.index(True)]
-        raise ValueError(f"from_numpy's differences of {fraction:g} are lost in rounding beside the bounds of {name}")
+        raise ValueError(
+            f"from_numpy's differences of {fraction:g} are lost in rounding relative to the bounds of {name}"
+        )
     return fraction
 
 

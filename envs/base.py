@@ -95,7 +95,7 @@ def map_parts(
 
 
 FLOAT32 = torch.finfo(torch.float32).max
-PROBES = 8  # points that are tried, beside the centre, where a whole batch raised
+PROBES = 8  # points besides the centre that are tried where a whole batch raised
 
 
 class Environment(Objective):
@@ -339,7 +339,7 @@ class Environment(Objective):
 
     @property
     def packages(self) -> tuple[str, ...]:
-        """Packages that the environment's engine needs, beside those that all need."""
+        """Packages that the environment's engine needs in addition to those that all need."""
         return EXTRAS.get(self.capabilities.extra, ())
 
     @property
@@ -374,7 +374,7 @@ class Environment(Objective):
 
     @property
     def threads(self) -> int:  # type: ignore[override] # read only
-        """Number of threads a batch is spread over: on a CPU, if the engine's solvers run beside each other."""
+        """Number of threads a batch is spread over: on a CPU, if the engine's solvers can run in parallel."""
         return cores() if self._solvers is not None and self.device == "cpu" and self.capabilities.concurrent else 1
 
     @property
@@ -465,7 +465,7 @@ class Environment(Objective):
         """Prepare what all evaluations share; sets `space` unless the class does."""
 
     def _compile_ahead(self) -> None:
-        """Compile all kernels beside each other."""
+        """Compile all kernels in parallel."""
 
     def _prepare(self) -> None:
         """Make what else a first evaluation would make."""
@@ -486,7 +486,7 @@ class Environment(Objective):
 
     @final
     def _limit_rows(self, capacity: int) -> int:
-        """Return the rows a solver takes where one that runs beside others takes `capacity`."""
+        """Return the rows a solver takes where one that shares the cores takes `capacity`."""
         alone = self.device == "cpu" and not self.capabilities.concurrent
         return min(self._max_rows, capacity * (cores() if alone else 1))
 

@@ -43,7 +43,7 @@ BINDS_UNSEEN = re.compile(r"import\s*\(?\s*\*|\b(globals|locals|vars|setattr|exe
 def import_named(name: str) -> ModuleType:
     """Import a module by its name, or a file by its path, once; what a file raises is said with its name.
 
-    A file finds modules beside it, as a program does. Raises ImportError for a module and ValueError for a file.
+    A file finds modules of its own folder as a program does. Raises ImportError for a module and ValueError for a file.
     """
     if not name.endswith(".py"):
         return import_module(name)
@@ -66,8 +66,8 @@ def _load_file(known: str, path: str) -> ModuleType:
     assert spec is not None  # of a path that ends in .py there is one,
     assert spec.loader is not None  # which is loaded
     module = module_from_spec(spec)
-    if (beside := str(Path(path).parent)) not in sys.path:
-        sys.path.append(beside)
+    if (folder := str(Path(path).parent)) not in sys.path:
+        sys.path.append(folder)
     sys.modules[known] = module  # dataclasses look there for their own module
     try:
         spec.loader.exec_module(module)
@@ -300,7 +300,7 @@ def refuse_unknown(
     engine: str | None = None,
     dims: Sequence[str] = (),
 ) -> None:
-    """Raise ValueError for what cannot exist, as far as that is known without importing the scene or running its file.
+    """Raise ValueError for what cannot exist, where that is known without importing the scene or running its file.
 
     Whoever makes the environment refuses the rest, after an import that takes seconds. `dims` are parameters, of which
     numbers are held against how many a scene has where nothing changes that.

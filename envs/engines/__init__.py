@@ -34,7 +34,7 @@ class Engine:
 
     `solvers` maps what is simulated (mpm, springs) to the module with its solver, from this folder on. An engine that
     is `deterministic` gives the same bits every time, on a GPU too, whatever else is in a batch. Solvers of a
-    `concurrent` engine run beside each other in the threads of one process; a solver of any other has all cores to
+    `concurrent` engine run in parallel in the threads of one process; a solver of any other has all cores to
     itself. A `profiled` engine tells the time by kernel. An engine that is not always installed comes with an `extra`
     of this package. `newest_python` is the last Python that it has wheels for, where that is not the newest there is.
     """

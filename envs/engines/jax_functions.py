@@ -77,7 +77,7 @@ class JaxFunction:
         self._type = ""
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave out what was compiled: another process compiles it anew."""
+        """Leave out what was compiled: another process compiles it again."""
         return vars(self) | {"_compiled": {}}
 
     def __call__(self, x: Float[Tensor, "batch dim"], grad: bool) -> tuple[Tensor, Tensor | None, str]:

@@ -1,6 +1,6 @@
 """Kernel launches that come again: what Warp makes of their arguments is stored, and on a GPU whole graphs of them.
 
-A launch that is made anew costs Python more than most kernels take; one that is stored costs a tenth of that, and one
+A new launch costs Python more than most kernels take; one that is stored costs a tenth of that, and one
 in a CUDA graph next to nothing.
 """
 
@@ -49,7 +49,7 @@ class _Mark:
 
 
 class _Streams(dict[int, wp.Stream]):
-    """Streams of a GPU by their number, made when they are asked for, beside the present one, which is the first."""
+    """Streams of a GPU by their number, made on demand; the present one is the first."""
 
     def __init__(self, device: str) -> None:
         super().__init__()
@@ -81,7 +81,7 @@ class _Sequence:
             command.launch()
 
     def run_on(self, streams: _Streams) -> None:
-        """Launch on several streams of a GPU, so that what does not wait for each other runs beside each other."""
+        """Launch on several streams of a GPU, so that what is independent runs in parallel."""
         stream = first = streams.first()
         busy: set[int] = set()
 
@@ -181,14 +181,14 @@ class Launches:
         work()
 
     @contextmanager
-    def beside(self, stream: int) -> Iterator[None]:
-        """Let a GPU run what is launched within a with block on a stream beside what follows it, up to `join`."""
+    def on_stream(self, stream: int) -> Iterator[None]:
+        """Let a GPU run what is launched within a with block on a stream, parallel to what follows, up to `join`."""
         self._recording.launches.append(_Mark(stream))
         yield
         self._recording.launches.append(_Mark(0))
 
     def join(self) -> None:
-        """Let what follows wait for what was launched `beside`."""
+        """Let what follows wait for what was launched `on_stream`."""
         self._recording.launches.append(_Mark(None))
 
     def clear(self, concerned: Callable[[Any], bool] = lambda key: True) -> None:
@@ -213,7 +213,7 @@ class Launches:
 
 @contextmanager
 def one_by_one() -> Iterator[None]:
-    """Launch kernels one after the other within a with block, neither as graphs nor beside each other."""
+    """Launch kernels one after the other within a with block, neither as graphs nor in parallel."""
     Launches.one_by_one = True
     try:
         yield
@@ -286,7 +286,7 @@ def _time_on_cpu(times: dict[str, KernelTime]) -> Iterator[None]:
 def _time_on_cuda(times: dict[str, KernelTime]) -> Iterator[None]:
     wp.timing_begin(cuda_filter=wp.TIMING_KERNEL)
     try:
-        with one_by_one():  # a graph hides its kernels, and those beside each other take longer
+        with one_by_one():  # a graph hides its kernels, and parallel ones take longer
             yield
     finally:
         for run in wp.timing_end():

@@ -86,7 +86,7 @@ def to_torch(array: wp.array) -> torch.Tensor:
 
 
 def load(kernels: Iterable[Any], device: str) -> None:
-    """Compile kernels beside each other, or fetch them from the cache, before threads launch them.
+    """Compile kernels in parallel, or fetch them from the cache, before threads launch them.
 
     To read Warp's headers takes two seconds of any module. The compiler can keep what it has read for the next module
     of the same thread, but that takes a second more: it pays where a solver is of many.

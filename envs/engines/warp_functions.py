@@ -115,7 +115,7 @@ class WarpFunction:
     def _refuse_overwrites(self, x: Float[Tensor, "batch dim"]) -> None:
         """Raise SimulatorError where a kernel writes to what an earlier one has read."""
         points: Any = wp.array(x.numpy(), dtype=self.real, requires_grad=True)
-        with wp.Tape() as tape:  # which kernels there are: they are built anew to be looked at
+        with wp.Tape() as tape:  # which kernels there are: they are built again to be looked at
             self._losses(points)
         kernels = [launch[0] for launch in tape.launches if isinstance(launch, list)]
         with _overwrites() as said:

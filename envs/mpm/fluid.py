@@ -79,8 +79,8 @@ class Fluid(MpmScene):
     each control step J is averaged over the grid, beyond hydrostatics: uneven J would bear load as a solid does.
     That leaves an error of buoyancy, which a finer grid lessens (tests/envs/mpm/test_fluid.py). Walls are slippery
     (walls=stick: not) and reach up to a lid at 0.6 m, so that no syrup is lost; the ladle has no mass and stops
-    where it would leave the tank; the cube is as soft as that speed of sound makes it, and still stiff beside the
-    loads on it; the shell is felt over a centimetre outside it, or three quarters of a coarse grid's cell.
+    where it would leave the tank; the cube is as soft as that speed of sound makes it, and still stiff for
+    the loads on it; the shell is felt over a centimetre outside it, or three quarters of a coarse grid's cell.
     Source: task Fluid of "Rethinking Optimization with Differentiable Simulation from a Global Perspective" (CoRL
     2022), appendix A.2.1; material and geometry where it is silent are ours.
     """

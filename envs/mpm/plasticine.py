@@ -279,7 +279,7 @@ def _target(shape: Shape, frames: int) -> Part:
 
 DEMONSTRATION = "demonstration"  # the example that solves a scene
 TERMS = ("density", "sdf", "contact")
-MOST_WORK = 1e8  # particle-substeps of a demonstration that a CPU makes, so that all devices have the same target
+MAX_CPU_WORK = 1e8  # particle-substeps of a demonstration that a CPU makes, so that all devices have the same target
 REACH = 0.1  # what a policy measures lengths by [m]
 
 
@@ -454,7 +454,7 @@ class Plasticine(MpmScene):
         """Return where the target's particles are [m]."""
         if self.scene.target:
             return target(self.scene, self.model.particles)
-        device = "cpu" if self.model.particle_substeps <= MOST_WORK else self.device
+        device = "cpu" if self.model.particle_substeps <= MAX_CPU_WORK else self.device
         model = f"model {self.version_on(self.engines[0])}, {__version__}"
         content = f"{self.scene} {self.fidelity} {self.examples[DEMONSTRATION]} {model}"
         content += "" if device == "cpu" else f" {device}"

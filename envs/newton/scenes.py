@@ -45,7 +45,7 @@ class Flight(NewtonScene):
 class BallOptions(NewtonOptions):
     """Contact: stiffness `ke` [N/m], damping `kd` and viscous friction `kf` [N s/m], Coulomb's `mu`.
 
-    solver=xpbd has `restitution` in the place of the first three.
+    solver=xpbd has `restitution` instead of the first three.
     """
 
     ke: float = 1e4
@@ -104,7 +104,7 @@ class ClothThrow(NewtonScene):
     Under solver=xpbd it does not bounce: there restitution is zero, and one of 1 changes little but the gradients.
     Parameters: initial velocity x, y, z of all of it [m/s], y upwards.
     Loss: squared distance of the mean of its particles to the target (1, 0.5, 0) m at the end [m^2].
-    Source: Newton's example `diffsim_cloth`, with springs and a floor in the place of triangles and air.
+    Source: Newton's example `diffsim_cloth`, with springs and a floor instead of triangles and air.
     """
 
     name = "newton-cloth"

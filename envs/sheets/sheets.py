@@ -156,7 +156,7 @@ class SheetScene(Environment):
         return Evaluation(loss.detach(), slope, torch.full((len(x),), Status.OK, dtype=torch.int8))
 
     def _observe(self, x: Float[Tensor, "batch dim"], decision: int) -> Float[Tensor, "batch feature"]:
-        """Watch the sheet in tenths of a metre, and its surface's pose beside it."""
+        """Watch the sheet in tenths of a metre, with its surface's pose."""
         if self.decisions == 1:
             return super()._observe(x, decision)
         drive, step = self._drive(x), decision * self.steps // self.decisions

@@ -142,7 +142,7 @@ REFUSED: dict[str, tuple[Callable[[], Any], str]] = {
     **{f"differences {d!r}": (differing(differences=d), "from_numpy's differences takes") for d in ("x", True, 1j)},
     "differences that rounding swallows": (
         lambda: from_numpy(sum, ParameterSpace({"a": (0, 1), "b": (1e9, 1e9 + 1e-3)}), differences=1e-6),
-        "differences of 1e-06 are lost in rounding beside the bounds of b",
+        "differences of 1e-06 are lost in rounding relative to the bounds of b",
     ),
     "parameters no float32 holds": (
         lambda: Single().evaluate([[0, 0], [0, 1e39]]),

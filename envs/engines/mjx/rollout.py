@@ -219,7 +219,7 @@ def runge_kutta(model: Any, start: Any) -> Any:
 def _on_parameters(state: Any, x: Any) -> Any:
     """Return the same numbers, as numbers that depend on parameters.
 
-    Most come to depend on them in the course of an episode, and JAX traces each loop anew until it knows which.
+    Most come to depend on them in the course of an episode, and JAX traces each loop again until it knows which.
     """
     none = 0.0 * x[0]
     return jax.tree.map(lambda leaf: leaf + none if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf, state)

@@ -380,8 +380,8 @@ def _ladle_in_tank(name: str) -> tuple[Any, Any]:
         fraction: real,
         rate: real,
     ) -> vec3:
-        beside = scene.half_thickness + scene.band
-        rounded = real(1.001) * beside
+        shell = scene.half_thickness + scene.band
+        rounded = real(1.001) * shell
         outer, inner = scene.radius + rounded, wp.max(scene.radius - rounded, real(0.0))
         local = p - look_between(tools, e, step, fraction)
         apart = wp.dot(local, local)
@@ -389,7 +389,7 @@ def _ladle_in_tank(name: str) -> tuple[Any, Any]:
             hit = bowl_distance(p - between(tools, sums, e, lane, step, fraction), scene.radius, scene.half_thickness)
             v = slide(v, velocity(tools, sums, e, lane, step, rate), hit, scene.band, scene.friction)
         handle = scene.height > real(0.0)
-        if handle and wp.abs(local[2]) < beside and wp.abs(local[0] + scene.radius) < beside:
+        if handle and wp.abs(local[2]) < shell and wp.abs(local[0] + scene.radius) < shell:
             foot = p - between(tools, sums, e, lane, step, fraction) + vec3(scene.radius, real(0.0), real(0.0))
             hit = rod_distance(foot, scene.height, scene.half_thickness)
             v = slide(v, velocity(tools, sums, e, lane, step, rate), hit, scene.band, scene.friction)

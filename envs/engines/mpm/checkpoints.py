@@ -81,7 +81,7 @@ class Allocator:
         """A of the latest substep, for all tapes together, where sums are made by columns."""
         return self.affine_momentum()
 
-    def lists(self, room: "Room") -> Lists:
+    def lists(self, room: "Sizes") -> Lists:
         """Return lists of no particles."""
         return Lists(
             order=self.array(wp.int32, self.model.particles),
@@ -106,7 +106,7 @@ class Allocator:
         return wp.zeros((self.capacity * LANES, count), dtype=wp.int64, device=self.device)
 
 
-class Room(NamedTuple):
+class Sizes(NamedTuple):
     """How many nodes, and by columns of cells how many columns and segments, arrays have places for."""
 
     nodes: int
@@ -137,7 +137,7 @@ class Tape:
 
     def __init__(self, allocator: Allocator, cells: int = 1, pieces: int = 1) -> None:
         model, columns = allocator.model, int(allocator.columns)  # arrays of nothing are none to Warp
-        self._room = room = Room(cells, columns, columns)
+        self._room = room = Sizes(cells, columns, columns)
         self.step = -1
         held = model.piece(pieces)
         inner = [allocator.frame() for _ in range(held - 1)]
@@ -158,11 +158,11 @@ class Tape:
         lists = [array for one in self.lists for array in one.arrays()]
         return sum(array.capacity for array in (*frames, *self.smoothed.values(), *self._kept, *self._nodes, *lists))
 
-    def growth(self, needed: Room) -> int:
+    def growth(self, needed: Sizes) -> int:
         """Return the bytes that what is needed takes beyond what is there, 0 where that suffices."""
         return self._bytes_of(self._grown(needed)) - self._bytes_of(self._room)
 
-    def bytes_on(self, needed: Room) -> int:
+    def bytes_on(self, needed: Sizes) -> int:
         """Return the bytes that a tape like this takes that is made for what is needed."""
         return self.bytes + self._bytes_of(self._spare(needed)) - self._bytes_of(self._room)
 
@@ -170,13 +170,13 @@ class Tape:
         """Return the frame that the control step starts from: the checkpoint, with the states that are smoothed."""
         return replace(checkpoint, S=tuple(self.smoothed.get(b, S) for b, S in enumerate(checkpoint.S)))
 
-    def make_room(self, step: int, box: Box, needed: Room) -> None:
+    def make_room(self, step: int, box: Box, needed: Sizes) -> None:
         """Become the place of a control step that runs on a box of nodes, and needs so much room for it."""
         grown, less = self._grown(needed), self._room
         if box == self.box and grown == less:
             self.step = step
             return
-        self.step, self.box, self._room = -1, NOWHERE, Room(0, 0, 0)  # should this be interrupted
+        self.step, self.box, self._room = -1, NOWHERE, Sizes(0, 0, 0)  # should this be interrupted
         if grown.nodes > less.nodes:
             for substep in range(len(self.grids)):
                 self.grids[substep] = self._allocator.grid(0)  # the old one goes first
@@ -203,16 +203,16 @@ class Tape:
         """Every array of nodes."""
         return [*(array for grid in self.grids for array in (grid.m, grid.v)), *self.means.values()]
 
-    def _grown(self, needed: Room) -> Room:
+    def _grown(self, needed: Sizes) -> Sizes:
         """Return what there has to be room for, of which what is there may be enough."""
         each = zip(self._room, needed, self._spare(needed), strict=True)
-        return Room(*(more if less < enough else less for less, enough, more in each))
+        return Sizes(*(more if less < enough else less for less, enough, more in each))
 
-    def _spare(self, needed: Room) -> Room:
+    def _spare(self, needed: Sizes) -> Sizes:
         """Return how much room to make where so much is needed."""
-        return Room(self.room(needed.nodes), needed.columns * 3 // 2, needed.segments * 3 // 2)
+        return Sizes(self.room(needed.nodes), needed.columns * 3 // 2, needed.segments * 3 // 2)
 
-    def _bytes_of(self, room: Room) -> int:
+    def _bytes_of(self, room: Sizes) -> int:
         """Return the bytes of so much room in all its grids and lists."""
         size = int(wp.types.type_size_in_bytes(self._allocator.types.vec4))
         integers = room.nodes + room.columns + room.segments + 4 * (1 + room.nodes // 2)

@@ -42,7 +42,7 @@ def place_taker():
 def node_placer(name: str):
     """Return the function that gives the nodes of a column that are touched, and those between them, their places.
 
-    A warp's lanes call it together, for columns beside each other.
+    A warp's lanes call it together, for neighbouring columns.
     """
     Lattice, take_places = lattice(name), place_taker()
 
@@ -385,7 +385,7 @@ def cell_kernels(name: str) -> SimpleNamespace:
 # ---- How a warp of a GPU walks along the cells of its segments, and adds up what their particles give to nodes.
 #
 # Nine lanes take the particles of a segment one after the other. Each holds the sums of three of the 27 nodes around
-# the present cell, a row along z. Where the next cell begins, the lowest nine are written down, beside each other,
+# the present cell, a row along z. Where the next cell begins, the lowest nine are written down, side by side,
 # since a cache takes whole sectors much faster than parts of them, and the others become lower by one. Planes below
 # those of a stretch, which another walk leaves, are not written.
 #

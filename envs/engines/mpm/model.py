@@ -16,7 +16,7 @@ from .stencil import lattice
 
 BOX_MARGIN = 1  # cells around the particles that a control step begins with
 SPREAD = 1.5  # times the nodes that bodies touch at rest, for which memory is estimated, too
-TRAVEL = 5  # cells that bodies move beyond where they were at rest, as far as memory is estimated
+TRAVEL = 5  # cells that bodies move beyond where they were at rest, for estimates of memory
 EMPTY = 1e-8  # nodes lighter than this part of the lightest particle carry no velocity
 
 

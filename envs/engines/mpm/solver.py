@@ -31,7 +31,7 @@ from ..cpp import threads
 from ..launches import Launches
 from ..runtime import free_memory, load, precision, to_torch
 from .boundaries import settle_kernel
-from .checkpoints import Allocator, Frame, Room, Tape
+from .checkpoints import Allocator, Frame, Sizes, Tape
 from .columns import GPU_TEAM, cell_kernels, column_kernels, segments
 from .grid import velocity_on
 from .model import BOX_MARGIN, EMPTY, Box, Model, nodes_around
@@ -41,7 +41,7 @@ from .smoothing import ColumnSmoother, Smoother, smoothing_columns, smoothing_ke
 from .stencil import lattice, to_rows
 from .transfers import transfers, transfers_of_columns
 
-# ---- All kernels of a model at once: compiled beside each other, where a solver's parts ask for theirs one by one.
+# ---- All kernels of a model at once: compiled in parallel, where a solver's parts ask for theirs one by one.
 
 
 def compile_all(model: Model, device: str) -> None:
@@ -167,7 +167,7 @@ class Adjoint:
                 inputs = [*solver.scatter.where(step, substep), *given, *inputs]
             else:
                 inputs += [self.A]
-            with solver.beside_others(b):
+            with solver.parallel_to_others(b):
                 solver.launch(adjoint, solver.size(b), batch, [*inputs, old.S[b], old.C])
         solver.launches.join()
 
@@ -366,7 +366,7 @@ class Solver:
         self.boxes = [Box((0, 0, 0), model.nodes)] * model.steps
         self.margins = [BOX_MARGIN] * model.steps  # cells around the particles, as each step has needed so far
         self.touched = [model.touched] * model.steps  # nodes of which grids hold no others, by columns, likewise
-        self.most = Room(0, 0, 0)  # columns and segments of any step: boxes differ more than what is in them
+        self.most = Sizes(0, 0, 0)  # columns and segments of any step: boxes differ more than what is in them
         self.checkpoints = [self.allocator.frame() for _ in range(model.steps + 1)]
         self.orders = [Order(model, capacity, device) for _ in self.checkpoints]
         self.end = self.allocator.frame()  # of a control step, before its particles are sorted
@@ -438,8 +438,8 @@ class Solver:
         """Return where a control step is stored whole: in the last place all that have none of their own, in turn."""
         return self.tapes[min(step, len(self.tapes) - 1)]
 
-    def room(self, step: int) -> Room:
-        """Return the room that a control step needs on its box, as far as is known."""
+    def room(self, step: int) -> Sizes:
+        """Return the room that a control step needs on its box, by what is known."""
         cells = self.boxes[step].cells
         return self.most._replace(nodes=min(self.touched[step], cells) if self.columns else cells)
 
@@ -447,7 +447,7 @@ class Solver:
         """Let a control step run on a box of nodes, and note how wide the widest is."""
         self.boxes[step] = box
         if self.columns:
-            self.most = Room(0, max(self.most.columns, box.columns), max(self.most.segments, segments(box)))
+            self.most = Sizes(0, max(self.most.columns, box.columns), max(self.most.segments, segments(box)))
 
     def _advance_on_box(
         self, step: int, batch: int, low: np.ndarray, high: np.ndarray
@@ -529,7 +529,7 @@ class Solver:
         wp.synchronize_device(self.device)  # what is given back counts as free after that
 
     def _cut_smaller(self) -> None:
-        """Keep a piece of half as many substeps, in arrays that are made anew."""
+        """Keep a piece of half as many substeps, in new arrays."""
         self.pieces *= 2
         self.launches.clear()
         self.tapes.clear()
@@ -554,7 +554,7 @@ class Solver:
         """Launch substeps of a control step."""
         tape, frames = self.tape(step), self.frames(step)
         for s in substeps:
-            with self.launches.beside(1):
+            with self.launches.on_stream(1):
                 self.scatter.list_particles(step, s, frames[s], batch, counted=s != substeps.start)
             if s == 0 and self.smoothers:
                 self.launches.join()
@@ -567,7 +567,7 @@ class Solver:
 
     def _update(self, step: int, frame: Frame, new: Frame, A: wp.array, batch: int) -> None:
         for b, (update, _) in enumerate(self.materials):
-            with self.beside_others(b):
+            with self.parallel_to_others(b):
                 self.launch(update, self.size(b), batch, [*self.material_inputs(b, step, frame), new.S[b], A])
 
     def _fill_grid(self, frame: Frame, step: int, substep: int, batch: int) -> None:
@@ -608,9 +608,9 @@ class Solver:
             *self.listed,
         ]
 
-    def beside_others(self, b: int) -> AbstractContextManager[None]:
-        """Let a GPU run what is launched for a body beside what is for the others, up to the next join."""
-        return self.launches.beside(2 + b) if b < len(self.materials) - 1 else nullcontext()
+    def parallel_to_others(self, b: int) -> AbstractContextManager[None]:
+        """Let a GPU run what is launched for a body parallel to what is for the others, up to the next join."""
+        return self.launches.on_stream(2 + b) if b < len(self.materials) - 1 else nullcontext()
 
     def size(self, b: int) -> int:
         """Return the number of particles of group b."""

@@ -13,7 +13,7 @@ from ..runtime import precision
 # ---- How arrays lie in memory, and how they are read and written: wide reads on a GPU, Warp's own on a CPU.
 #
 # A matrix of each particle lies as Warp has it on a CPU. On a GPU an environment's row holds the first numbers of all
-# matrices, then the second ones, and so on: threads beside each other then read what lies side by side, where the
+# matrices, then the second ones, and so on: neighbouring threads then read what lies side by side, where the
 # numbers of a matrix would be read 36 bytes apart. `to_rows` brings a tensor of matrices into that order. The four
 # numbers of a node are read and written as one. `native/layout.h` does so.
 

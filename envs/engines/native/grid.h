@@ -66,9 +66,9 @@ template <typename Real, typename Data> struct TankWalls : Reach<Real> {
     Quad<Real> ladle, lower, upper;
 
     TankWalls(const Data& data, const wp::array_t<Vec3<Real>>& tools, int e, int step, Real fraction) : data(data) {
-        const Real beside = data.half_thickness + data.band;
-        near_bowl = this->rounded * (data.radius + beside);
-        near_rod = this->rounded * beside;
+        const Real shell = data.half_thickness + data.band;
+        near_bowl = this->rounded * (data.radius + shell);
+        near_rod = this->rounded * shell;
         edge = data.half_width - Real(1e-6);
         slip = data.slip;
         ladle = this->find_place(tools, e, step, fraction, 0);

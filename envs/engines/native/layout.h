@@ -1,7 +1,7 @@
 // Reads and writes of elements: wide ones on a GPU, Warp's own on a CPU.
 //
 // A matrix of each particle lies as Warp has it on a CPU. On a GPU an environment's row holds the first numbers of all
-// matrices, then the second ones, and so on: threads beside each other read what lies side by side. The four numbers
+// matrices, then the second ones, and so on: neighbouring threads read what lies side by side. The four numbers
 // of a node are read and written as one. Indices are not looked at for whether they count from the end, as Warp does.
 #pragma once
 #include "builtin.h"

@@ -97,7 +97,7 @@ inline CUDA_CALLABLE Ints<2> find_touched(const Lattice& lattice, const IntRows&
     return high ? Ints<2>(highest - above, high) : Ints<2>(0, 0);
 }
 
-// Lanes of a warp have columns beside each other, whose nodes have places one after the other. They write all of these
+// Lanes of a warp have neighbouring columns, whose nodes have places one after the other. They write all of these
 // together, a place each, and find out to whose column it belongs.
 inline CUDA_CALLABLE void name_nodes(
     const IntRows& nodes, int e, int column, int depth, int low, int count, int start) {

@@ -199,9 +199,9 @@ inline void decompose(const V* F, V* U, Triple<V>& sizes, V* W, int sweeps, Elem
     Triple<V> u1 = over(rest, size1);
     if (any(thin)) {
         const auto steep = __builtin_elementwise_abs(u0.x) < Real(0.6);
-        const Triple<V> beside =
+        const Triple<V> normal =
             choose(steep, cross(u0, Triple<V>{one, zero, zero}), cross(u0, Triple<V>{zero, one, zero}));
-        u1 = choose(thin, over(beside, length(beside)), u1);
+        u1 = choose(thin, over(normal, length(normal)), u1);
     }
     const Triple<V> u2 = cross(u0, u1);
     sizes = {dot(u0, f0), dot(u1, f1), dot(u2, apply(F, v2))};

@@ -1,7 +1,7 @@
 // How a warp of a GPU walks along the cells of a segment, and adds up what its particles give to nodes.
 //
 // Nine lanes take the particles of a segment one after the other. Each holds the sums of three of the 27 nodes around
-// the present cell, a row along z. Where the next cell begins, the lowest nine are written down, beside each other, and
+// the present cell, a row along z. Where the next cell begins, the lowest nine are written down, side by side, and
 // the others become lower by one. A `span` is the lowest plane of nodes that a walk leaves, 256 times the one beyond
 // the highest, and 65536 times the cell where it begins.
 #pragma once

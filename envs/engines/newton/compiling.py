@@ -30,8 +30,8 @@ def import_newton() -> Any:
     Where Warp's cache has the kernel `nothing`, they are not read.
     """
     wp.init()
-    with ThreadPoolExecutor(1) as beside:
-        importing = beside.submit(import_module, "newton")
+    with ThreadPoolExecutor(1) as executor:
+        importing = executor.submit(import_module, "newton")
         wp.force_load("cpu", [nothing.module])
         return importing.result()
 

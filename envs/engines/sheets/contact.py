@@ -165,7 +165,7 @@ def _pan(name: str) -> tuple[Any, Any]:
     def edge(pan: Dish, out: real, height: real) -> vec3:
         """Return the normal (outwards, up) and the distance in a plane through the axis, `out` beyond the bottom."""
         up = pan.bend - height
-        if wp.atan2(out, up) > pan.sweep:  # beside the rim there is nothing
+        if wp.atan2(out, up) > pan.sweep:  # beyond the rim there is nothing
             return vec3(real(0.0), real(1.0), pan.bend)
         reach = wp.sqrt(out * out + up * up)
         return vec3(-out / reach, up / reach, pan.bend - reach)
@@ -338,7 +338,7 @@ def sum_kernels(name: str) -> tuple[Any, Any]:
     """Return two kernels that sum over a row's vertices in one order on every device, without atomic adds.
 
     The first takes [row, part] to the sum of every vertex whose number is `part` by the count of parts, the second adds
-    a row's parts to what is there. A row's sum does not depend on the rows beside it.
+    a row's parts to what is there. A row's sum does not depend on other rows.
     """
     vec3 = precision(name).vec3
     module = f"gradscape.contact.sums.{name}"

@@ -12,7 +12,7 @@ Before a control step a fluid's volume ratios are smoothed, by torch.
 
 Arrays are torch's, [substep, environment, particle] or [environment, node], and kernels work on their memory. Particles
 are kept at the ends of control steps, and for all substeps of one: the backward pass simulates each control step once
-more, and fills its one grid anew for each substep. Threads add in any order, so the last digits of results may differ.
+more, and fills its one grid again for each substep. Threads add in any order, so the last digits of results may differ.
 """
 
 import threading

@@ -348,7 +348,7 @@ def _pan(ti: Any, R: Any, pan: Pan) -> Any:
             reach = ti.sqrt(out * out + down * down)
             n = (down * up - (out / r) * (along * right + p[2] * front)) / reach
             depth = reach - R(pan.bend)
-            if ti.atan2(out, down) > R(pan.sweep):  # nothing is beside the rim
+            if ti.atan2(out, down) > R(pan.sweep):  # nothing is beyond the rim
                 depth = -R(pan.bend)
         if depth > R(pan.thickness):  # what is under the pan has left it
             depth = -R(pan.thickness)

@@ -45,7 +45,7 @@ def test_what_comes_after_an_interrupted_run_waits_for_what_that_has_begun(monke
     launches = Launches("cuda")
 
     def work():
-        with launches.beside(1):
+        with launches.on_stream(1):
             launches._recording.launches.append(Command())
         launches._recording.launches.append(Command())
         launches.join()
@@ -129,7 +129,7 @@ def test_a_gpu_runs_beside_each_other_what_does_not_wait_for_each_other(monkeypa
 
     def work():
         for number in (1, 2, 1):
-            with launches.beside(number):
+            with launches.on_stream(number):
                 launch(f"beside {number}")
         launch("meanwhile")
         launches.join()

@@ -2,7 +2,7 @@
 
 Alone, a kernel reads that from memory; on a GPU it follows on what particles gather of the adjoints of g2p and p2g, in
 one kernel, and needs no memory.
-`turn_back` takes what both take, but the matrix `adj_a` in the place of the array `adj_A`, the particle's `strain` if
+`turn_back` takes what both take, but the matrix `adj_a` instead of the array `adj_A`, the particle's `strain` if
 the material knows one, and the environment and the particle last.
 """
 
@@ -100,7 +100,7 @@ def _kernel(
     module: str = "",
     **options: Any,
 ) -> Any:
-    """Return the kernel of these lines, beside `turn_back`; the function holds what Warp finds by its name."""
+    """Return the kernel of these lines in the module of `turn_back`; the function holds what Warp finds by its name."""
     return wp.Kernel(
         cpp.with_arguments(function, kinds),
         key=f"kernels__locals__adjoint{called}",

@@ -64,7 +64,7 @@ def svd(name: str) -> Any:
         return v / length
 
     @wp.func(module=module)
-    def beside(u: vec3) -> vec3:
+    def normal_to(u: vec3) -> vec3:
         """Return a unit vector at a right angle to u."""
         if wp.abs(u[0]) < real(0.6):
             return wp.normalize(wp.cross(u, vec3(real(1.0), real(0.0), real(0.0))))
@@ -129,7 +129,7 @@ def svd(name: str) -> Any:
             v1 = -v
         u0 = unit(F * v0, real(TINY), vec3(real(1.0), real(0.0), real(0.0)))
         u1 = F * v1
-        u1 = unit(u1 - wp.dot(u0, u1) * u0, round_off * wp.dot(u0, F * v0), beside(u0))
+        u1 = unit(u1 - wp.dot(u0, u1) * u0, round_off * wp.dot(u0, F * v0), normal_to(u0))
         u2 = wp.cross(u0, u1)
         s = vec3(wp.dot(u0, F * v0), wp.dot(u1, F * v1), wp.dot(u2, F * v2))
         return wp.matrix_from_cols(u0, u1, u2), s, wp.matrix_from_cols(v0, v1, v2)
