@@ -7,12 +7,13 @@ reads where it is with one that is summed exactly (`exact`), in the `sums` of it
 so that scenes with the same kind of boundary share its compiled kernel.
 """
 
+import abc
 import math
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import cache, partial
 from types import SimpleNamespace
-from typing import Any, ClassVar, Protocol, no_type_check
+from typing import Any, ClassVar, no_type_check
 
 import numpy as np
 import warp as wp
@@ -210,7 +211,7 @@ def settle_kernel(name: str):
     return settle
 
 
-class Boundary(Protocol):
+class Boundary(abc.ABC):
     """What a solver asks of a boundary; `walls` are what the headers call them."""
 
     walls: ClassVar[str]
@@ -218,19 +219,21 @@ class Boundary(Protocol):
     @property
     def slots(self) -> int:
         """Number of vectors per environment and control step in `tools`."""
+        return 1
 
+    @abc.abstractmethod
     def function(self, name: str) -> tuple[Any, Any]:
         """Return the Warp function of one precision, and the struct its data is in."""
 
     def data(self, name: str, device: str) -> Any:
         """Return the function's data."""
+        return fill_struct(self.function(name)[1](), self)
 
 
 @dataclass(frozen=True)
-class Open:
+class Open(Boundary):
     """No boundary at all."""
 
-    slots: ClassVar[int] = 1
     walls: ClassVar[str] = "OpenWalls"
 
     def function(self, name: str) -> tuple[Any, Any]:
@@ -238,13 +241,9 @@ class Open:
         boundary, Data = _open(name)
         return boundary, Data
 
-    def data(self, name: str, device: str) -> Any:
-        """Return the function's data."""
-        return self.function(name)[1]()
-
 
 @dataclass(frozen=True)
-class LadleInTank:
+class LadleInTank(Boundary):
     """A square tank, centred on x = z = 0, with its floor at y = 0, and a ladle that moves in it.
 
     Lengths in m: half the tank's width, the height of a `lid` that stops what flies highest, the bowl's mid-surface
@@ -261,17 +260,12 @@ class LadleInTank:
     band: float
     friction: float
     slip: float = 1.0
-    slots: ClassVar[int] = 1
     walls: ClassVar[str] = "TankWalls"
 
     def function(self, name: str) -> tuple[Any, Any]:
         """Return the boundary's Warp function and its struct."""
         boundary, Data = _ladle_in_tank(name)
         return boundary, Data
-
-    def data(self, name: str, device: str) -> Any:
-        """Return the function's data."""
-        return fill_struct(self.function(name)[1](), self)
 
 
 @cache
@@ -465,7 +459,7 @@ class Tool:
 
 
 @dataclass(frozen=True)
-class ToolsInRoom:
+class ToolsInRoom(Boundary):
     """Tools in a room with slippery walls and a floor.
 
     `lower`, `upper` [m]: walls stand there; nodes at or below `floor` [m] belong to the floor, whose Coulomb `friction`

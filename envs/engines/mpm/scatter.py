@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import abc
 import weakref
 from functools import partial
-from typing import Any, Protocol
+from typing import Any
 
 import warp as wp
 
@@ -27,27 +28,37 @@ from .columns import (
 from .model import Box
 
 
-class Scatter(Protocol):
+class Scatter(abc.ABC):
     """The scatters of a solver, each as launches of the control step under way."""
+
+    def __init__(self, solver: Any) -> None:
+        self.solver = weakref.proxy(solver)  # which holds this
 
     def make_room(self, box: Box) -> bool:
         """Make room for a box of nodes, and say whether arrays were replaced."""
+        return False
 
-    def begin(self) -> None:
+    def begin(self) -> None:  # noqa: B027 -- in place there is nothing to forget,
         """Forget what a run that was interrupted has left."""
 
-    def list_particles(self, step: int, substep: int, frame: Frame, batch: int, *, counted: bool) -> None:
+    def list_particles(  # noqa: B027 -- nor to list
+        self, step: int, substep: int, frame: Frame, batch: int, *, counted: bool
+    ) -> None:
         """Find out where particles are, before a substep; g2p may have `counted` them already."""
 
     def where(self, step: int, substep: int) -> list[Any]:
         """Return what says where nodes are in grids, as kernels that gather take it."""
+        return [self.solver.tape(step).lattice]
 
     def counting(self, counted: bool) -> list[Any]:
         """Return what g2p takes so as to count particles where it moves them to."""
+        return []
 
+    @abc.abstractmethod
     def p2g(self, step: int, substep: int, frame: Frame, batch: int) -> None:
         """Fill the substep's grid with momentum and mass, but for what nodes have to add up themselves."""
 
+    @abc.abstractmethod
     def adjoint_g2p(
         self, step: int, substep: int, frame: Frame, new: Frame, grid_v: wp.array, adj_x: wp.array, batch: int
     ) -> None:
@@ -58,31 +69,11 @@ class Scatter(Protocol):
 
     def to_add_up(self, step: int, substep: int) -> list[wp.array]:
         """Return what nodes add up themselves, as their kernel takes it."""
-
-
-class InPlace:
-    """Every particle adds to its nodes, in the order of particles."""
-
-    def __init__(self, solver: Any) -> None:
-        self.solver = weakref.proxy(solver)
-
-    def make_room(self, box: Box) -> bool:
-        """Make room for a box of nodes, and say whether arrays were replaced."""
-        return False
-
-    def begin(self) -> None:
-        """Forget what a run that was interrupted has left."""
-
-    def list_particles(self, step: int, substep: int, frame: Frame, batch: int, *, counted: bool) -> None:
-        """Find out where particles are, before a substep; g2p may have `counted` them already."""
-
-    def where(self, step: int, substep: int) -> list[Any]:
-        """Return what says where nodes are in grids, as kernels that gather take it."""
-        return [self.solver.tape(step).lattice]
-
-    def counting(self, counted: bool) -> list[Any]:
-        """Return what g2p takes so as to count particles where it moves them to."""
         return []
+
+
+class InPlace(Scatter):
+    """Every particle adds to its nodes, in the order of particles."""
 
     def p2g(self, step: int, substep: int, frame: Frame, batch: int) -> None:
         """Fill the substep's grid with momentum and mass."""
@@ -101,22 +92,18 @@ class InPlace:
         inputs = [tape.lattice, solver.model.dt, frame.x, tape.grids[substep].v, new.x, new.v, new.C, grid_v, adj_x]
         solver.launch(solver.kernels.adjoint_g2p, solver.model.particles, batch, inputs)
 
-    def to_add_up(self, step: int, substep: int) -> list[wp.array]:
-        """Return what nodes add up themselves, as their kernel takes it."""
-        return []
-
     def _clear(self, grid: wp.array, step: int, batch: int) -> None:
         """Zero what a control step uses of a grid, by numpy: torch would spread it over threads that others want."""
         solver, values = self.solver, grid.numpy()[:batch]
         solver.launches.call(lambda: values[:, : solver.boxes[step].cells].fill(0.0))
 
 
-class ByColumns:
+class ByColumns(Scatter):
     """Warps walk columns of cells, and nodes add up what columns give them: one order of sums, whatever the batch."""
 
     def __init__(self, solver: Any) -> None:
+        super().__init__(solver)
         model, device, allocator = solver.model, solver.device, solver.allocator
-        self.solver = weakref.proxy(solver)
         self.team = CPU_TEAM if device == "cpu" else GPU_TEAM
         self.kernels = column_kernels(model.precision, self.team)
         self.listing = cell_kernels(model.precision)

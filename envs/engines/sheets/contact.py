@@ -11,10 +11,11 @@ goes no deeper. So where vertices end is continuous in where they begin. The rul
 vertices that are inside when a step starts, by when each is as deep as it happened to come.
 """
 
+import abc
 import math
 from dataclasses import dataclass
 from functools import cache, partial
-from typing import Any, ClassVar, Literal, Protocol, no_type_check
+from typing import Any, ClassVar, Literal, no_type_check
 
 import warp as wp
 
@@ -24,23 +25,26 @@ from ..runtime import fill_struct, precision
 Rule = Literal["end", "start"]
 
 
-class Surface(Protocol):
+class Surface(abc.ABC):
     """What a solver asks of a surface."""
 
     moves: ClassVar[bool]
 
+    @abc.abstractmethod
     def function(self, name: str) -> tuple[Any, Any]:
         """Return the Warp function of one precision, and the struct its data is in."""
 
     def data(self, name: str) -> Any:
         """Return the function's data."""
+        return fill_struct(self.function(name)[1](), self)
 
+    @abc.abstractmethod
     def stop(self, name: str, rule: Rule) -> Any:
         """Return the Warp function (data, position, velocity, pose, next pose, dt) -> velocity that contact leaves."""
 
 
 @dataclass(frozen=True)
-class Floor:
+class Floor(Surface):
     """The half-space below `height` [m], which does not move: its poses are zeros.
 
     `friction` is Coulomb's coefficient: of the velocity along the floor this share of what goes into it is taken.
@@ -55,17 +59,13 @@ class Floor:
         distance, Data = _floor(name)
         return distance, Data
 
-    def data(self, name: str) -> Any:
-        """Return the function's data."""
-        return fill_struct(self.function(name)[1](), self)
-
     def stop(self, name: str, rule: Rule) -> Any:
         """Return the Warp function that takes velocities into the floor."""
         return _stop_still(name, rule)
 
 
 @dataclass(frozen=True)
-class Pan:
+class Pan(Surface):
     """A round pan: a flat bottom whose edge bends up smoothly, along an arc.
 
     `flat` is the radius of the bottom, `bend` that of the arc, `thickness` how deep below its surface the pan still is
@@ -90,17 +90,13 @@ class Pan:
         distance, Data = _pan(name)
         return distance, Data
 
-    def data(self, name: str) -> Any:
-        """Return the function's data."""
-        return fill_struct(self.function(name)[1](), self)
-
     def stop(self, name: str, rule: Rule) -> Any:
         """Return the Warp function that takes velocities into the pan."""
         return _stop(name, rule, *self.function(name))
 
 
 @dataclass(frozen=True)
-class PanOverFloor:
+class PanOverFloor(Surface):
     """A pan that moves above a floor that does not: the pan stops vertices first, then the floor."""
 
     pan: Pan
