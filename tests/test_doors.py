@@ -125,7 +125,7 @@ def commands(f: str, name: str) -> dict[str, str]:
         "compare": f"compare {name}/s {f} --out {name}/c",
         "surface": f"surface {name}/s --out {name}/u",
         "export": f"export {name}/s",
-        "plan": f"plan {f} --dims 0 1 --resolution 6",
+        "plan": f"plan slice {f} --dims 0 1 --resolution 6",
         "pairs": f"pairs {f} --samples 2 --out {name}/p",
         "census": f"census {f} --slices 2 --resolution 6 --out {name}/n",
         "replay": f"replay {f}",
