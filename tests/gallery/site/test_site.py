@@ -12,7 +12,7 @@ import pytest
 
 from gradscape.gallery.league import read_standings
 from gradscape.gallery.paper import read_paper
-from gradscape.gallery.runs import open_run
+from gradscape.gallery.records import open_run
 from gradscape.gallery.site.build import HERE, build_site
 from gradscape.landscapes.identity import stored_identity
 from gradscape.landscapes.storage.store import open_slice
@@ -214,7 +214,7 @@ def test_a_search_lies_where_its_parameters_say(site: Path, data: Path) -> None:
 
 
 def test_a_search_of_other_options_is_not_laid_over_a_slice(data: Path) -> None:
-    from gradscape.gallery.site.trajectories import lay_runs, read_runs
+    from gradscape.gallery.site.page_data import lay_runs, read_runs
 
     tables, dataset = read_runs(data), open_slice(data / "full/slice.zarr")
     assert len(tables) == 4
