@@ -11,13 +11,28 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
+import torch
 
+from ..envs.base import Environment
+from ..envs.points import point
 from ..envs.registry import entries, environment_class, make
+from ..jobs.race import RaceJob, lockstep_seconds
+from ..jobs.report import digest_of
 from ..jobs.scene import SceneSpec
+from ..jobs.slice import SliceJob
+from ..jobs.sweep import SweepJob
 from ..jobs.watch import Watch
 from ..landscapes.convert import to_json
-from ..landscapes.identity import gradient_stride
+from ..landscapes.cost import episode_cost
+from ..landscapes.identity import gradient_stride, plane_of, stored_identity
+from ..landscapes.objective import Evaluation, Status, evaluate
+from ..landscapes.plane import Plane
+from ..landscapes.storage.arrays import FILES
+from ..landscapes.storage.ownership import has_lost_root
+from ..landscapes.storage.paths import is_slice
 from ..landscapes.storage.records import read_json, write_record
+from ..landscapes.storage.store import SliceStore, open_slice
+from ..optim.registry import optimizer_class
 from .figures import Figure
 from .files import (
     COMPANION_PICTURE,
@@ -53,10 +68,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from torch import Tensor
 
-    from ..envs.base import Environment
-    from ..jobs.slice import SliceJob
-    from ..jobs.sweep import SweepJob
-    from ..landscapes.plane import Plane
 
 FILM_CRF = 28  # constant rate factor of films
 COMPANION_RESOLUTION = 24  # points along each axis of a companion's plane; a line has the figure's own
@@ -142,8 +153,6 @@ class FigurePart(abc.ABC):
 
     def seconds_each(self) -> float:
         """Estimate what one of them takes, by default an episode without gradient."""
-        from ..landscapes.cost import episode_cost
-
         return episode_cost(self.scene().make(), grad=False).forward
 
     @abc.abstractmethod
@@ -171,11 +180,6 @@ class SlicePart(FigurePart):
 
     def state(self) -> State:
         """Look at the data without making an environment; who sampled it, and on what device, does not matter."""
-        from ..landscapes.storage.arrays import FILES
-        from ..landscapes.storage.ownership import has_lost_root
-        from ..landscapes.storage.paths import is_slice
-        from ..landscapes.storage.store import SliceStore
-
         points, store = self.figure.resolution ** len(self.figure.dims), self.folder / STORE
         if not is_slice(store) and not has_lost_root(store, FILES):
             return State(points, 0)
@@ -197,8 +201,6 @@ class SlicePart(FigurePart):
         return outcome
 
     def _open(self) -> SliceJob:
-        from ..jobs.slice import SliceJob
-        from ..landscapes.storage.paths import is_slice
 
         env = self.scene().make()
         return SliceJob.of(
@@ -233,7 +235,6 @@ class CompanionPart(FigurePart):
         from ..landscapes.draw.figures.companions import CompanionSlice, companions_figure
         from ..landscapes.draw.figures.page import save
         from ..landscapes.draw.film import lighten
-        from ..landscapes.storage.store import open_slice
 
         dataset, env = open_slice(self.folder / STORE), self.scene().make()
         cuts, found = [CompanionSlice(self.figure.through, dataset["loss"].to_numpy())], list[Companion]()
@@ -261,10 +262,6 @@ class CompanionPart(FigurePart):
 
     def _key(self) -> dict[str, Any] | None:
         """Return what decides these slices and their picture; None where the figure has no slice yet."""
-        from ..jobs.report import digest_of
-        from ..landscapes.storage.paths import is_slice
-        from ..landscapes.storage.store import open_slice
-
         store = self.folder / STORE
         if not is_slice(store):
             return None
@@ -311,7 +308,6 @@ class SweepPart(FigurePart):
         return SweepRecord(self.figure.over, SWEEP_FIDELITY, SWEEP_FRAMES, shape, label, low, high, command)
 
     def _open(self) -> SweepJob:
-        from ..jobs.sweep import SweepJob
 
         env = self.scene(SWEEP_FIDELITY).make()
         plane, over = self.figure.plane(env, SWEEP_RESOLUTION), self.figure.over
@@ -328,8 +324,6 @@ class EpisodePart(FigurePart):
 
     def count_left(self) -> int:
         """Count the nodes without a film, none in an environment that has no episodes to draw."""
-        from ..envs.base import Environment
-
         drawn = environment_class(self.figure.env).episode is not Environment.episode
         return len(self._nodes) - len(self._find_films()) if drawn else 0
 
@@ -339,8 +333,6 @@ class EpisodePart(FigurePart):
 
     def make(self, watch: Watch) -> str:
         """Film every episode that is not there, and clear away those of other nodes."""
-        from ..landscapes.identity import plane_of
-
         env, plane, filmed = self.scene().make(), plane_of(self._dataset), self._find_films()
         for node in self._nodes:
             if node not in filmed:
@@ -355,7 +347,6 @@ class EpisodePart(FigurePart):
         return f"{len(self._nodes)} episodes"
 
     def _film(self, env: Environment, plane: Plane, node: Node) -> None:
-        import torch
 
         from ..landscapes.draw.film import save_film, save_still
         from ..landscapes.draw.render import replay
@@ -371,13 +362,11 @@ class EpisodePart(FigurePart):
 
     @cached_property
     def _dataset(self) -> xr.Dataset:
-        from ..landscapes.storage.store import open_slice
 
         return open_slice(self.folder / STORE)
 
     @cached_property
     def _nodes(self) -> list[Node]:
-        from ..envs.points import point
 
         return choose_nodes(self._dataset, point(make(self.figure.env, device="cpu"), self.figure.through))
 
@@ -408,17 +397,12 @@ class SearchPart(FigurePart):
 
     def seconds_each(self) -> float:
         """Share what simulating all of them in lockstep takes; what methods take themselves comes on top."""
-        from ..jobs.race import lockstep_seconds
-        from ..optim.registry import optimizer_class
-
         asking = sum(optimizer_class(method).needs_grad for method in METHODS)
         left = {0: BUDGET * (len(METHODS) - asking), 1: BUDGET * asking}
         return lockstep_seconds(self.scene().make(), left, len(METHODS)) / len(METHODS)
 
     def make(self, watch: Watch) -> str:
         """Race the methods, in a folder under out/, and keep the runs that are missing."""
-        from ..jobs.race import RaceJob
-
         job = RaceJob.of(self.scene().make(), METHODS, budget=BUDGET, seeds=1, command=self.label(), watch=watch)
         runs = replace(job, executor=self.executor).run(watch).race.runs
         for method in self._missing():
@@ -434,10 +418,6 @@ class SearchPart(FigurePart):
 
     def _missing(self) -> list[str]:
         """Return the methods without a run at the figure's fidelity that its slice's page would show."""
-        from ..landscapes.identity import stored_identity
-        from ..landscapes.storage.paths import is_slice
-        from ..landscapes.storage.store import SliceStore
-
         fidelity, store = self.scene().fidelity, self.folder / STORE
         cut = SliceStore.open(store).identity if is_slice(store) else None
 
@@ -496,10 +476,6 @@ def points_beside(figure: Figure) -> list[str]:
 
 def _sample_losses(env: Environment, plane: Plane) -> NDArray[np.float32]:
     """Return the losses on a plane or a line, indexed (v, u) or (u), NaN where an episode failed."""
-    import torch
-
-    from ..landscapes.objective import Evaluation, evaluate
-
     grid = plane.grid()
     batches = torch.split(grid.reshape(-1, plane.dim), env.preferred_batch)
     found = Evaluation.join((evaluate(env, x, grad=False) for x in batches), dim=plane.dim, grad=False)
@@ -511,9 +487,6 @@ def choose_nodes(dataset: xr.Dataset, through: Float[Tensor, " dim"]) -> list[No
 
     Of a node that is chosen twice the first reason counts; the nodes of a line are in row 0.
     """
-    from ..landscapes.identity import plane_of
-    from ..landscapes.objective import Status
-
     loss, status = np.atleast_2d(dataset["loss"].to_numpy()), np.atleast_2d(dataset["status"].to_numpy())
     finite = np.argsort(loss, axis=None, kind="stable")[: int(np.isfinite(loss).sum())]
     ranked = {"lowest loss": finite[:1], "median loss": finite[len(finite) // 2 :][:1], "highest loss": finite[-1:]}
