@@ -35,7 +35,7 @@ class StudyEntry:
     file: str
     alt: str
     says: Sequence[str]
-    record: StudyRecord
+    found: StudyRecord
     front: Sequence[str] = ()
 
 
