@@ -20,8 +20,7 @@ from ..landscapes.storage.disk import full, is_full
 from ..landscapes.storage.files import tidy
 from .figures import Figure
 from .league import LeaguePart, LeagueSlicePart
-from .measures import FidelityPart, ReportPart
-from .parts import CompanionPart, EpisodePart, FigurePart, SearchPart, SlicePart, SweepPart
+from .parts import CompanionPart, EpisodePart, FidelityPart, FigurePart, ReportPart, SearchPart, SlicePart, SweepPart
 
 T = TypeVar("T")
 PARTS: dict[str, type[FigurePart]] = {

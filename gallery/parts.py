@@ -1,9 +1,10 @@
-"""What the gallery makes of a figure: its slice, the same slice elsewhere, its sweep, episodes and searches."""
+"""What the gallery makes of a figure: slices, a sweep, episodes, searches, a report, the study of fidelities."""
 
 from __future__ import annotations
 
 import abc
 import shlex
+import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -17,36 +18,48 @@ from ..envs.base import Environment
 from ..envs.points import point
 from ..envs.registry import entries, environment_class, make
 from ..jobs.race import RaceJob, lockstep_seconds
-from ..jobs.report import digest_of
+from ..jobs.report import ReportedSlice, ReportJob, digest_of, estimate_seconds
 from ..jobs.scene import SceneSpec
 from ..jobs.slice import SliceJob
+from ..jobs.study import StudyJob
 from ..jobs.sweep import SweepJob
 from ..jobs.watch import Watch
 from ..landscapes.convert import to_json
 from ..landscapes.cost import episode_cost
 from ..landscapes.identity import gradient_stride, plane_of, stored_identity
+from ..landscapes.measures.profile import effort
 from ..landscapes.objective import Evaluation, Status, evaluate
 from ..landscapes.plane import Plane
 from ..landscapes.storage.arrays import FILES
+from ..landscapes.storage.files import make_folder
 from ..landscapes.storage.ownership import has_lost_root
 from ..landscapes.storage.paths import is_slice
 from ..landscapes.storage.records import read_json, write_record
 from ..landscapes.storage.store import SliceStore, open_slice
 from ..optim.registry import optimizer_class
+from ..studies.fidelity import SETTINGS
+from ..studies.variants import StudyOptions
 from .figures import Figure
 from .files import (
     COMPANION_PICTURE,
     COMPANIONS,
+    DEVICES,
     EPISODE_KINDS,
     EPISODES,
+    MEASURES,
     PICTURE,
+    QUALITY,
+    QUALITY_ARRAYS,
+    REPORT,
     RUN_SUFFIX,
     RUNS,
     STORE,
     SWEEP_FILM,
     SWEEP_RECORD,
+    StudyFiles,
     is_of_episode,
 )
+from .paper import read_paper
 from .records import (
     Companion,
     Node,
@@ -68,7 +81,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from torch import Tensor
 
-
 FILM_CRF = 28  # constant rate factor of films
 COMPANION_RESOLUTION = 24  # points along each axis of a companion's plane; a line has the figure's own
 SWEEP_FIDELITY = "draft"  # as there are many episodes; of functions their only one
@@ -77,6 +89,9 @@ SWEEP_DPI = 80
 EPISODE_HEIGHT, EPISODE_FRAMES = 480, 60  # of a film: pixels and most frames
 SECONDS_PER_FRAME = 0.15  # of drawing an episode, about
 METHODS, BUDGET = ("random", "cma-es", "descents", "bo", "bo-leap"), 100  # of searches
+SEED = 0
+REPORT_POINTS, STUDY_POINTS = 6, 64  # those of `landscape report` and `landscape study fidelity`
+CHANGED = tuple(one for one in SETTINGS if one not in ("engine", "device"))  # those take hours on another device
 
 
 @dataclass(frozen=True)
@@ -427,6 +442,86 @@ class SearchPart(FigurePart):
 
         runs = {method: read_if_sound(open_run, self._file(method)) for method in METHODS}
         return [method for method, run in runs.items() if run is None or not fits(run)]
+
+
+class ReportPart(FigurePart):
+    """What the slice is like, beside it."""
+
+    def label(self) -> str:
+        """Return the command that measures it elsewhere, which names no folder above this one: its record is kept."""
+        folder, here = self.folder.resolve(), Path.cwd()
+        said = folder.relative_to(here) if folder.is_relative_to(here) else self.folder
+        return f"landscape report {said} --device {self.device}"
+
+    def count_left(self) -> int:
+        """Return 1 where there is no report of this slice."""
+        record, store = read_if_sound(read_json, self.folder / REPORT), self.folder / STORE
+        if record is None or read_if_sound(read_json, self.folder / MEASURES) is None or not is_slice(store):
+            return 1
+        key = record.get("key")
+        return int(not isinstance(key, dict) or key.get("slice") != digest_of(open_slice(store)))
+
+    def seconds_each(self) -> float:
+        """Estimate a report by the first episodes."""
+        rank = len(self.figure.dims)
+        shape = (self.figure.resolution,) * rank
+        return estimate_seconds(self.scene().make(), *effort(rank, REPORT_POINTS, shape))
+
+    def make(self, watch: Watch) -> str:
+        """Measure the slice, in the place of a report of another one."""
+        from ..landscapes.draw.film import lighten
+
+        for name in (REPORT, MEASURES, QUALITY, QUALITY_ARRAYS):
+            (self.folder / name).unlink(missing_ok=True)
+        subject, words = ReportedSlice(self.figure.id, self.folder / STORE), read_paper().words
+        job = ReportJob([subject], self.folder, True, REPORT_POINTS, SEED, self.device, words, command=self.label())
+        report = job.report(subject, watch)
+        lighten(self.folder / QUALITY)
+        return ", ".join(report.words)
+
+
+class FidelityPart(FigurePart):
+    """Accuracy against time of the figure's environment, which its other figures share."""
+
+    of_environment = True
+
+    def label(self) -> str:
+        """Return the command that measures it elsewhere."""
+        return f"landscape study fidelity {self.figure.env} --device {self.device} --settings {','.join(CHANGED)}"
+
+    def count_left(self) -> int:
+        """Return 1 where there is none, of an environment that has fidelities to compare."""
+        some = len(environment_class(self.figure.env).fidelities) > 1
+        devices = DEVICES if self.device == "auto" else (self.device,)
+        return int(some and not any(map(self._sound, devices)))
+
+    def seconds_each(self) -> float:
+        """Estimate all variants by the work of their episodes."""
+        return sum(self._open().seconds().values())
+
+    def make(self, watch: Watch) -> str:
+        """Measure every variant; those that are measured stay in a folder of their own under out/ until the last is."""
+        from ..landscapes.draw.film import lighten
+
+        job = self._open()
+        found = job.run(watch)
+        files = StudyFiles.of(self.root, self.figure.env, found.device, found.kind)
+        make_folder(files.record.parent)
+        shutil.copyfile(job.folder / job.results.picture, files.picture)
+        lighten(files.picture)
+        write_record(files.record, to_json(found))
+        return f"{len(found.table())} variants at {found.points} points"
+
+    def _sound(self, device: str) -> bool:
+        """Whether there is one of a device."""
+        files = StudyFiles.of(self.root, self.figure.env, device, "fidelity")
+        return bool(read_if_sound(read_json, files.record)) and files.picture.is_file()
+
+    def _open(self) -> StudyJob:
+
+        scene = SceneSpec(self.figure.env, device=self.device)
+        options = StudyOptions(points=STUDY_POINTS, seed=SEED, settings=CHANGED)
+        return StudyJob.open("fidelity", scene, options, command=self.label())
 
 
 def _same(figure: Figure, identity: Mapping[str, Any]) -> bool:

@@ -103,14 +103,41 @@ class FigureEntry:
     python: str
     identity: Mapping[str, Any]
     provenance: Mapping[str, Any]
-    files: Sequence[str]
-    episodes: Sequence[EpisodeEntry]
     sweep: SweepRecord | None
-    companions: Sequence[Companion]
     changed: Mapping[str, Sequence[Any]]
-    runs: Sequence[Search]
     measures: Mapping[str, str | float]
-    report: ReportEntry | None
+    files: Sequence[str] = ()
+    episodes: Sequence[EpisodeEntry] = ()
+    companions: Sequence[Companion] = ()
+    runs: Sequence[Search] = ()
+    report: ReportEntry | None = None
+
+    @classmethod
+    def of(cls, figure: Figure, dataset: xr.Dataset, source: Path) -> FigureEntry:
+        """Return what is said of a slice without its other files."""
+        identity, provenance = stored_identity(dataset), stored_provenance(dataset)
+        device = identity.get("device", "auto")
+        return cls(
+            id=figure.id,
+            env=figure.env,
+            paper_figure=figure.caption.number,
+            page=f"{figure.id}/index.html",
+            dims=figure.dims,
+            labels=identity["plane"]["labels"],
+            through=figure.through,
+            says=figure.caption.says,
+            searched=figure.searched,
+            resolution=identity["plane"]["resolution"],
+            loss_unit=provenance.get("loss_unit", ""),
+            numbers=count_numbers(dataset),
+            command=provenance.get("command") or figure.command(device),
+            python=figure.python(device),
+            identity={name: value for name, value in identity.items() if name != "plane"},
+            provenance=provenance,
+            sweep=read_sweep(source),
+            changed=changes_since(identity),
+            measures=read_measures(source),
+        )
 
     @property
     def dim(self) -> int:
@@ -236,8 +263,6 @@ class _Site:
         """Write a slice's page and all it shows, and return its entry in the manifest."""
         source, folder = self.data / figure.id, self.folder / figure.id
         dataset = open_slice(source / STORE)
-        identity, provenance = stored_identity(dataset), stored_provenance(dataset)
-        device = identity.get("device", "auto")
         episodes, runs = read_episodes(source, dataset), lay_runs(dataset, self.tables)
         nodes = read_off_nodes(dataset, episodes, runs)
         (folder / NODES).write_text(f"const SLICE = {json.dumps(to_json(nodes), separators=(',', ':'))};\n")
@@ -248,30 +273,12 @@ class _Site:
         if (source / QUALITY).exists() and report is not None:
             tables[QUALITY_TABLE] = quality_rows(report.profile)
         taken = self._place(dataset, source, folder, given, {name: rows for name, rows in tables.items() if rows})
-        entry = FigureEntry(
-            id=figure.id,
-            env=figure.env,
-            paper_figure=figure.caption.number,
-            page=f"{figure.id}/index.html",
-            dims=figure.dims,
-            labels=identity["plane"]["labels"],
-            through=figure.through,
-            says=figure.caption.says,
-            searched=figure.searched,
-            resolution=identity["plane"]["resolution"],
-            loss_unit=provenance.get("loss_unit", ""),
-            numbers=count_numbers(dataset),
-            command=provenance.get("command") or figure.command(device),
-            python=figure.python(device),
-            identity={name: value for name, value in identity.items() if name != "plane"},
-            provenance=provenance,
+        entry = replace(
+            FigureEntry.of(figure, dataset, source),
             files=[NODES, "index.html", *taken],
             episodes=episodes,
-            sweep=read_sweep(source),
             companions=companions,
-            changed=changes_since(identity),
             runs=[run.search() for run in runs],
-            measures=read_measures(source),
             report=enter_report(report) if report is not None else None,
         )
         self.write_page(

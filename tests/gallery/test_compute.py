@@ -10,7 +10,6 @@ import pytest
 from gradscape.cli import main
 from gradscape.envs.bounce import Bounce
 from gradscape.gallery import league as gallery_league
-from gradscape.gallery import measures as gallery_measures
 from gradscape.gallery import parts as gallery_parts
 from gradscape.gallery.compute import IF_NAMED, PARTS
 from gradscape.gallery.figures import Figure
@@ -31,7 +30,7 @@ def small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     for module, values in (
         (gallery_parts, {"SWEEP_FRAMES": 2, "SWEEP_RESOLUTION": 5, "SWEEP_DPI": 40, "COMPANION_RESOLUTION": 4}),
         (gallery_parts, {"EPISODE_HEIGHT": 60, "EPISODE_FRAMES": 2, "METHODS": ("random", "cma-es"), "BUDGET": 9}),
-        (gallery_measures, {"REPORT_POINTS": 2, "TRADEOFF_POINTS": 4, "TURNED": ["precision"]}),
+        (gallery_parts, {"REPORT_POINTS": 2, "STUDY_POINTS": 4, "CHANGED": ("precision",)}),
         (gallery_league, {"METHODS": ("random", "descents"), "BUDGET": 12, "SEEDS": 3}),
     ):
         for name, value in values.items():
