@@ -33,10 +33,10 @@ from torch import Tensor
 
 from gradscape.envs.base import Environment
 from gradscape.envs.registry import environment_class
-from gradscape.gallery.companions import points_beside
 from gradscape.gallery.figures import Figure, choose_figures, read_figures
 from gradscape.gallery.files import FIGURES
 from gradscape.gallery.paper import read_paper
+from gradscape.gallery.parts import points_beside
 from gradscape.landscapes.objective import Evaluation, Status, evaluate
 from gradscape.landscapes.storage.records import read_json, write_record
 

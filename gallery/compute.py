@@ -10,20 +10,17 @@ from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
-from ..jobs.watch import Stopped, Watch, Work
+from ..jobs.plan import Work
+from ..jobs.watch import Stopped, Watch
 from ..jobs.workers import workers
 from ..landscapes.capacity import require
 from ..landscapes.cost import duration
 from ..landscapes.lattice import count_gradients
 from ..landscapes.storage.disk import full, is_full
 from ..landscapes.storage.files import tidy
-from .companions import CompanionPart
-from .episodes import EpisodePart
 from .figures import Figure
-from .league import LeaguePart
-from .league_slices import LeagueSlicePart
-from .measures import FidelityPart, ReportPart
-from .parts import FigurePart, SearchPart, SlicePart, SweepPart
+from .league import LeaguePart, LeagueSlicePart
+from .parts import CompanionPart, EpisodePart, FidelityPart, FigurePart, ReportPart, SearchPart, SlicePart, SweepPart
 
 T = TypeVar("T")
 PARTS: dict[str, type[FigurePart]] = {

@@ -5,11 +5,12 @@ from __future__ import annotations
 import shlex
 import tomllib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..jobs.scene import SceneSpec
+from ..landscapes.convert import from_json
 from .files import FIGURES
 from .paper import PaperCaption, read_paper
 
@@ -17,10 +18,6 @@ if TYPE_CHECKING:
     from ..envs.base import Environment
     from ..landscapes.plane import Plane
 
-KINDS: dict[str, type] = {  # of a figure's fields in TOML
-    **dict.fromkeys(("id", "env", "through", "fidelity", "over"), str),
-    **{"dims": list, "resolution": int, "gradients": int, "options": dict, "searched": dict},
-}
 SCENE_OPTIONS = {"fidelity", "device", "engine", "deterministic"}  # of a SceneSpec, so none of a scene's own
 
 
@@ -98,8 +95,7 @@ class Figure:
 
 def read_figures(path: Path = FIGURES) -> list[Figure]:
     """Read a list of figures. Raises ValueError, naming the file, where it is none."""
-    with path.open("rb") as file:
-        tables = tomllib.load(file).get("figure", [])
+    tables = tomllib.loads(path.read_text()).get("figure", [])
     if not isinstance(tables, list) or not all(isinstance(table, dict) for table in tables):
         raise ValueError(f"{path} needs figures, each a table [[figure]]")
     figures = [_figure(path, table) for table in tables]
@@ -127,12 +123,12 @@ def _figure(path: Path, table: dict[str, Any]) -> Figure:
         raise ValueError(
             f"{path}: figure {table.get('id', '?')} has unknown {sorted(unknown)} and lacks {sorted(missing)}"
         )
-    for name, kind in KINDS.items():
-        if not isinstance(value := table.get(name, kind()), kind):
-            raise ValueError(f"{path}: figure {table['id']} has {name} {value!r}, which is no {kind.__name__}")
-    if taken := SCENE_OPTIONS & set(table.get("options", {})):
-        raise ValueError(f"{path}: figure {table['id']} has options {', '.join(sorted(taken))}, which no scene has")
-    if len(table["dims"]) not in (1, 2):
-        raise ValueError(f"{path}: figure {table['id']} needs one dimension or two; got {table['dims']}")
-    how = table | {"dims": tuple(table["dims"]), "caption": read_paper().caption_of(table["id"])}
-    return Figure(**how)
+    try:
+        figure = from_json(Figure, table)
+    except (AttributeError, TypeError, ValueError) as error:
+        raise ValueError(f"{path}: figure {table['id']} is not of this form: {error}") from error
+    if taken := SCENE_OPTIONS & set(figure.options):
+        raise ValueError(f"{path}: figure {figure.id} has options {', '.join(sorted(taken))}, which no scene has")
+    if len(figure.dims) not in (1, 2):
+        raise ValueError(f"{path}: figure {figure.id} needs one dimension or two; got {table['dims']}")
+    return replace(figure, caption=read_paper().caption_of(figure.id))

@@ -71,61 +71,59 @@ def is_of_episode(file: Path) -> bool:
 
 
 @dataclass(frozen=True)
-class StudyFiles:
-    """Name the files of a study: the record, the picture, and what the record holds as a table, in the site alone."""
+class RecordFiles:
+    """A record, and the files of the same name beside it."""
 
     record: Path
-    picture: Path
-    table: Path
+
+    @property
+    def picture(self) -> Path:
+        """The picture of what it holds."""
+        return self.record.with_suffix(".png")
+
+    @property
+    def dark(self) -> Path:
+        """The same picture for dark pages."""
+        return self.picture.with_name(dark_name(self.picture.name))
+
+    @property
+    def table(self) -> Path:
+        """What it holds as a table, in the site alone."""
+        return self.record.with_suffix(".csv")
+
+    def there(self) -> bool:
+        """Say whether record and picture are there."""
+        return self.record.is_file() and self.picture.is_file()
+
+    @classmethod
+    def of_census(cls, root: Path, env: str, device: str) -> RecordFiles:
+        """Return where the census of an environment on a device is, in the gallery's data or in its site."""
+        return cls(root / CENSUSES / f"{env}-{device}.json")
+
+
+class StudyFiles(RecordFiles):
+    """The files of a study."""
 
     @classmethod
     def of(cls, root: Path, env: str, device: str, kind: str) -> StudyFiles:
         """Return where a kind of study of an environment on a device is, in the gallery's data or in its site."""
-        record = root / STUDIES / file_name(env, device, kind)
-        return cls(record, record.with_suffix(".png"), record.with_suffix(".csv"))
-
-    def there(self) -> bool:
-        """Say whether record and picture are there."""
-        return self.record.exists() and self.picture.exists()
+        return cls(root / STUDIES / file_name(env, device, kind))
 
 
-@dataclass(frozen=True)
-class LeagueFiles:
-    """Name the files of an environment's race in the league: record, pictures, and what is kept of its runs."""
-
-    record: Path
-    picture: Path
-    dark: Path  # the picture for a dark page
-    runs: Path
+class LeagueFiles(RecordFiles):
+    """The files of an environment's race in the league."""
 
     @classmethod
     def of(cls, root: Path, env: str) -> LeagueFiles:
         """Return where the race in an environment is, in the gallery's data or in its site."""
-        record = root / LEAGUE / f"{env}.json"
-        picture = record.with_suffix(".png")
-        return cls(record, picture, picture.with_name(dark_name(picture.name)), record.with_suffix(".npz"))
+        return cls(root / LEAGUE / f"{env}.json")
 
-    def there(self) -> bool:
-        """Say whether all are there."""
-        return all(one.is_file() for one in (self.record, self.picture, self.dark, self.runs))
+    @property
+    def runs(self) -> Path:
+        """What is kept of its runs."""
+        return self.record.with_suffix(".npz")
 
-
-@dataclass(frozen=True)
-class LeagueSliceFiles:
-    """Name the files of the slice through the best point of a league's race: its folder, record and pictures."""
-
-    folder: Path
-    record: Path
-    picture: Path
-    dark: Path  # the picture for a dark page
-
-    @classmethod
-    def of(cls, root: Path, env: str) -> LeagueSliceFiles:
-        """Return where that of an environment is, in the gallery's data or in its site."""
-        folder = root / LEAGUE / env
-        picture = folder / "medians.png"
-        return cls(folder, folder / "medians.json", picture, folder / dark_name(picture.name))
-
-    def there(self) -> bool:
-        """Say whether all are there."""
-        return all(one.is_file() for one in (self.record, self.picture, self.dark)) and (self.folder / STORE).is_dir()
+    @property
+    def slice(self) -> RecordFiles:
+        """The files of the slice through its best point, in the folder of that slice."""
+        return RecordFiles(self.record.with_suffix("") / "medians.json")

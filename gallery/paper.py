@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
-from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, NotRequired, TypedDict
+from typing import TYPE_CHECKING
 
+from ..landscapes.convert import from_json
 from .files import PAPER
 
 if TYPE_CHECKING:
@@ -63,74 +63,22 @@ class Paper:
         return self.captions.get(slice_, PaperCaption())
 
 
-class _Words(TypedDict):
-    words: list[str]
-    where: str
-    losses: NotRequired[tuple[float, float]]
-
-
-class _Claim(TypedDict):
-    environments: list[str]
-    first: list[str]
-    second: list[str]
-    source: str
-    alike: NotRequired[bool]
-
-
-class _Silence(TypedDict):
-    environments: list[str]
-    why: str
-
-
-class _Caption(TypedDict):
-    slices: list[str]
-    says: str
-    number: NotRequired[int]
-
-
 @cache
 def read_paper(path: Path = PAPER) -> Paper:
     """Read what the paper says. Raises ValueError where it says a word that landscapes are not described in."""
-    with path.open("rb") as file:
-        tables = tomllib.load(file)
-    return Paper(
-        _words(tables["environment"], path),
-        _claims(tables["claim"]),
-        _silences(tables["silence"]),
-        _captions(tables["caption"]),
-    )
-
-
-def _words(tables: Mapping[str, _Words], path: Path) -> dict[str, PaperWords]:
     from ..landscapes.measures.classify import WORDS
-
-    for name, table in tables.items():
-        if unknown := set(table["words"]) - set(WORDS):
-            raise ValueError(f"{path}: {name} has words {sorted(unknown)}; the words are {', '.join(WORDS)}")
-    return {name: _words_of(table) for name, table in tables.items()}
-
-
-def _words_of(table: _Words) -> PaperWords:
-    losses = table.get("losses")
-    return PaperWords(tuple(table["words"]), table["where"], (losses[0], losses[1]) if losses else None)
-
-
-def _claims(tables: Sequence[_Claim]) -> dict[str, tuple[Claim, ...]]:
     from ..optim.claims import Claim
 
+    tables = tomllib.loads(path.read_text())
+    words = from_json(dict[str, PaperWords], tables["environment"])
+    for name, said in words.items():
+        if unknown := set(said.words) - set(WORDS):
+            raise ValueError(f"{path}: {name} has words {sorted(unknown)}; the words are {', '.join(WORDS)}")
     claims: dict[str, tuple[Claim, ...]] = {}
-    for table in tables:
-        pairs = product(table["first"], table["second"])
-        alike = table.get("alike", False)
-        own = tuple(Claim(first, second, table["source"], alike) for first, second in pairs)
+    for table in tables["claim"]:
+        pairs = [{"first": first, "second": second} for first in table["first"] for second in table["second"]]
         for env in table["environments"]:
-            claims[env] = claims.get(env, ()) + own
-    return claims
-
-
-def _silences(tables: Sequence[_Silence]) -> dict[str, str]:
-    return {env: table["why"] for table in tables for env in table["environments"]}
-
-
-def _captions(tables: Sequence[_Caption]) -> dict[str, PaperCaption]:
-    return {name: PaperCaption(table["says"], table.get("number")) for table in tables for name in table["slices"]}
+            claims[env] = claims.get(env, ()) + tuple(from_json(Claim, table | pair) for pair in pairs)
+    silences = {env: str(table["why"]) for table in tables["silence"] for env in table["environments"]}
+    captions = {name: from_json(PaperCaption, table) for table in tables["caption"] for name in table["slices"]}
+    return Paper(words, claims, silences, captions)

@@ -1,36 +1,97 @@
-"""What the gallery makes of a figure: its slice, its sweep, searches of its environment."""
+"""What the gallery makes of a figure: slices, a sweep, episodes, searches, a report, the study of fidelities."""
 
 from __future__ import annotations
 
 import abc
 import shlex
+import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
-from ..envs.registry import entries, environment_class
+import numpy as np
+import torch
+
+from ..envs.base import Environment
+from ..envs.points import point
+from ..envs.registry import entries, environment_class, make
+from ..jobs.race import RaceJob, lockstep_seconds
+from ..jobs.report import ReportedSlice, ReportJob, digest_of, estimate_seconds
+from ..jobs.scene import SceneSpec
+from ..jobs.slice import SliceJob
+from ..jobs.study import StudyJob
+from ..jobs.sweep import SweepJob
 from ..jobs.watch import Watch
 from ..landscapes.convert import to_json
-from ..landscapes.identity import gradient_stride
+from ..landscapes.cost import episode_cost
+from ..landscapes.identity import gradient_stride, plane_of, stored_identity
+from ..landscapes.measures.profile import effort
+from ..landscapes.objective import Evaluation, Status, evaluate
+from ..landscapes.plane import Plane
+from ..landscapes.storage.arrays import FILES
+from ..landscapes.storage.files import make_folder
+from ..landscapes.storage.ownership import has_lost_root
+from ..landscapes.storage.paths import is_slice
+from ..landscapes.storage.records import read_json, write_record
+from ..landscapes.storage.store import SliceStore, open_slice
+from ..optim.registry import optimizer_class
+from ..studies.fidelity import SETTINGS
+from ..studies.variants import StudyOptions
 from .figures import Figure
-from .files import PICTURE, RUN_SUFFIX, RUNS, STORE, SWEEP_FILM, SWEEP_RECORD
-from .records import SweepRecord, read_if_sound
+from .files import (
+    COMPANION_PICTURE,
+    COMPANIONS,
+    DEVICES,
+    EPISODE_KINDS,
+    EPISODES,
+    MEASURES,
+    PICTURE,
+    QUALITY,
+    QUALITY_ARRAYS,
+    REPORT,
+    RUN_SUFFIX,
+    RUNS,
+    STORE,
+    SWEEP_FILM,
+    SWEEP_RECORD,
+    StudyFiles,
+    is_of_episode,
+)
+from .paper import read_paper
+from .records import (
+    Companion,
+    Node,
+    SweepRecord,
+    open_run,
+    read_if_sound,
+    read_nodes,
+    read_sweep,
+    save_run,
+    searched,
+    write_nodes,
+)
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
 
     import xarray as xr
+    from jaxtyping import Float
+    from numpy.typing import NDArray
+    from torch import Tensor
 
-    from ..envs.base import Environment
-    from ..jobs.scene import SceneSpec
-    from ..jobs.slice import SliceJob
-    from ..jobs.sweep import SweepJob
-
-DRAFT = "draft"  # fidelity of sweeps, of which there are many episodes; of functions their only one
-FRAMES, COARSE, APART = 12, 48, 4  # of a sweep: frames, points along each axis, and how far apart its gradients are
-DPI, LOSS = 80, 28  # of its film
+FILM_CRF = 28  # constant rate factor of films
+COMPANION_RESOLUTION = 24  # points along each axis of a companion's plane; a line has the figure's own
+SWEEP_FIDELITY = "draft"  # as there are many episodes; of functions their only one
+SWEEP_FRAMES, SWEEP_RESOLUTION, SWEEP_GRADIENTS = 12, 48, 4
+SWEEP_DPI = 80
+EPISODE_HEIGHT, EPISODE_FRAMES = 480, 60  # of a film: pixels and most frames
+SECONDS_PER_FRAME = 0.15  # of drawing an episode, about
 METHODS, BUDGET = ("random", "cma-es", "descents", "bo", "bo-leap"), 100  # of searches
+SEED = 0
+REPORT_POINTS, STUDY_POINTS = 6, 64  # those of `landscape report` and `landscape study fidelity`
+CHANGED = tuple(one for one in SETTINGS if one not in ("engine", "device"))  # those take hours on another device
 
 
 @dataclass(frozen=True)
@@ -72,8 +133,12 @@ class FigureList:
 
 @dataclass(frozen=True)
 class FigurePart(abc.ABC):
-    """Something to make of a figure, in the gallery's data at `root`."""
+    """Something to make of a figure, in the gallery's data at `root`.
 
+    What is `of_environment` is made once for all figures of an environment.
+    """
+
+    of_environment: ClassVar[bool] = False
     figure: Figure
     root: Path
     device: str
@@ -86,12 +151,12 @@ class FigurePart(abc.ABC):
 
     @property
     def shared(self) -> str:
-        """What figures have in common that share what is made: by default nothing but themselves."""
-        return self.figure.id
+        """What figures have in common that share what is made."""
+        return self.figure.env if self.of_environment else self.figure.id
 
     @abc.abstractmethod
     def label(self) -> str:
-        """Say what is made."""
+        """Describe what is made, by its command where there is one."""
 
     def there(self) -> bool:
         """Say whether nothing is left to make."""
@@ -99,11 +164,11 @@ class FigurePart(abc.ABC):
 
     @abc.abstractmethod
     def count_left(self) -> int:
-        """Count what is left to make: points, films or runs."""
+        """Count what is left to make: points, episodes, films or runs."""
 
-    @abc.abstractmethod
     def seconds_each(self) -> float:
-        """Estimate what one of them takes, from a first episode or more."""
+        """Estimate what one of them takes, by default an episode without gradient."""
+        return episode_cost(self.scene().make(), grad=False).forward
 
     @abc.abstractmethod
     def make(self, watch: Watch) -> str:
@@ -130,11 +195,6 @@ class SlicePart(FigurePart):
 
     def state(self) -> State:
         """Look at the data without making an environment; who sampled it, and on what device, does not matter."""
-        from ..landscapes.storage.arrays import FILES
-        from ..landscapes.storage.ownership import has_lost_root
-        from ..landscapes.storage.paths import is_slice
-        from ..landscapes.storage.store import SliceStore
-
         points, store = self.figure.resolution ** len(self.figure.dims), self.folder / STORE
         if not is_slice(store) and not has_lost_root(store, FILES):
             return State(points, 0)
@@ -156,15 +216,13 @@ class SlicePart(FigurePart):
         return outcome
 
     def _open(self) -> SliceJob:
-        from ..jobs.slice import SliceJob
-        from ..landscapes.storage.paths import is_slice
 
         env = self.scene().make()
         return SliceJob.of(
             env,
             self.figure.plane(env),
             gradients=self.figure.gradients,
-            command=self.figure.command(self.device),
+            command=self.label(),
             out=self.folder,
             # nothing is lost of a store made by another model or for another device
             force=is_slice(self.folder / STORE) and self.state().done == 0,
@@ -172,22 +230,79 @@ class SlicePart(FigurePart):
         )
 
 
+class CompanionPart(FigurePart):
+    """The losses of the same cut through other points, at the figure's fidelity, and a picture on one scale."""
+
+    def label(self) -> str:
+        """Say what is sampled."""
+        return f"the same dims through {' and '.join(points_beside(self.figure))}, losses"
+
+    def count_left(self) -> int:
+        """Count the episodes where there are no such slices of these settings, of this slice."""
+        names, key = points_beside(self.figure), self._key()
+        if not names or key is None:
+            return 0
+        there = kept_key(self.folder / COMPANIONS) == key and (self.folder / COMPANION_PICTURE).exists()
+        return 0 if there else len(names) * self._resolution ** len(self.figure.dims)
+
+    def make(self, watch: Watch) -> str:
+        """Sample them, draw them beside the slice, and keep what they are."""
+        from ..landscapes.draw.figures.companions import CompanionSlice, companions_figure
+        from ..landscapes.draw.figures.page import save
+        from ..landscapes.draw.film import lighten
+
+        dataset, env = open_slice(self.folder / STORE), self.scene().make()
+        cuts, found = [CompanionSlice(self.figure.through, dataset["loss"].to_numpy())], list[Companion]()
+        with watch.progress(self.count_left(), "episodes") as advance:
+            for name in points_beside(self.figure):
+                loss = _sample_losses(env, replace(self.figure, through=name).plane(env, self._resolution))
+                finite = loss[np.isfinite(loss)]
+                ends = (float(finite.min()), float(finite.max())) if finite.size else (None, None)
+                cuts.append(CompanionSlice(name, loss))
+                found.append(Companion(name, *ends, 1 - finite.size / loss.size))
+                advance(len(found) * loss.size, "")
+        save(companions_figure(cuts, dataset), self.folder / COMPANION_PICTURE)
+        lighten(self.folder / COMPANION_PICTURE)
+        record = {"key": self._key(), "device": env.device, "slices": to_json(found)}
+        write_record(self.folder / COMPANIONS, record)
+        said = (
+            "all failed" if one.lowest is None else f"losses from {one.lowest:.4g} to {one.highest:.4g}"
+            for one in found
+        )
+        return "; ".join(f"through {one.through}: {losses}" for one, losses in zip(found, said, strict=True))
+
+    @property
+    def _resolution(self) -> int:
+        return COMPANION_RESOLUTION if len(self.figure.dims) == 2 else self.figure.resolution
+
+    def _key(self) -> dict[str, Any] | None:
+        """Return what decides these slices and their picture; None where the figure has no slice yet."""
+        store = self.folder / STORE
+        if not is_slice(store):
+            return None
+        settings = {"fidelity": self.figure.fidelity, "resolution": self._resolution}
+        return {"slice": digest_of(open_slice(store)), **settings, "through": points_beside(self.figure)}
+
+
 class SweepPart(FigurePart):
     """The slice as something else moves: a film, of slices that stay in the sweep's own folder under out/."""
 
     def label(self) -> str:
         """Return the command that makes it."""
-        how = {"frames": FRAMES, "resolution": COARSE, "gradients": APART}
-        return self.figure.sweep_command(**how, fidelity=DRAFT, device=self.device)
+        return self.figure.sweep_command(
+            frames=SWEEP_FRAMES,
+            resolution=SWEEP_RESOLUTION,
+            gradients=SWEEP_GRADIENTS,
+            fidelity=SWEEP_FIDELITY,
+            device=self.device,
+        )
 
     def count_left(self) -> int:
         """Return 1 where there is no film of these settings yet."""
         if not self.figure.over or len(self.figure.dims) != 2:
             return 0
-        record = read_if_sound(SweepRecord.read, self.folder / SWEEP_RECORD)
-        if record is None or not (self.folder / SWEEP_FILM).exists():
-            return 1
-        return int(record != self._record(record.label, record.low, record.high, record.command))
+        record = read_if_sound(read_sweep, self.folder)
+        return int(record is None or record != self._record(record.label, record.low, record.high, record.command))
 
     def seconds_each(self) -> float:
         """Time the film by its last slice."""
@@ -198,21 +313,85 @@ class SweepPart(FigurePart):
         from ..landscapes.draw.figures.sweep import save_films
 
         drawn = self._open().sample(watch)
-        save_films(drawn, self.folder / SWEEP_FILM, None, dpi=DPI, loss=LOSS)
+        save_films(drawn, self.folder / SWEEP_FILM, None, dpi=SWEEP_DPI, loss=FILM_CRF)
         record = self._record(drawn.label, drawn.values[0], drawn.values[-1], self.label())
-        record.write(self.folder / SWEEP_RECORD)
-        return f"{FRAMES} frames of {COARSE} x {COARSE} points over {drawn.label}"
+        write_record(self.folder / SWEEP_RECORD, to_json(record))
+        return f"{SWEEP_FRAMES} frames of {SWEEP_RESOLUTION} x {SWEEP_RESOLUTION} points over {drawn.label}"
 
     def _record(self, label: str, low: float, high: float, command: str) -> SweepRecord:
-        return SweepRecord(self.figure.over, DRAFT, FRAMES, [COARSE, COARSE], label, low, high, command)
+        shape = (SWEEP_RESOLUTION, SWEEP_RESOLUTION)
+        return SweepRecord(self.figure.over, SWEEP_FIDELITY, SWEEP_FRAMES, shape, label, low, high, command)
 
     def _open(self) -> SweepJob:
-        from ..jobs.sweep import SweepJob
 
-        env = self.scene(DRAFT).make()
-        plane, over = self.figure.plane(env, COARSE), self.figure.over
-        job = SweepJob.of(env, plane, over, FRAMES, gradients=APART, command=self.label())
+        env = self.scene(SWEEP_FIDELITY).make()
+        plane, over = self.figure.plane(env, SWEEP_RESOLUTION), self.figure.over
+        job = SweepJob.of(env, plane, over, SWEEP_FRAMES, gradients=SWEEP_GRADIENTS, command=self.label())
         return replace(job, executor=self.executor)
+
+
+class EpisodePart(FigurePart):
+    """Films of the episodes at a few nodes, at the figure's fidelity."""
+
+    def label(self) -> str:
+        """Count the nodes."""
+        return f"the episodes at {len(self._nodes)} nodes"
+
+    def count_left(self) -> int:
+        """Count the nodes without a film, none in an environment that has no episodes to draw."""
+        drawn = environment_class(self.figure.env).episode is not Environment.episode
+        return len(self._nodes) - len(self._find_films()) if drawn else 0
+
+    def seconds_each(self) -> float:
+        """Time an episode, and assume what drawing it takes."""
+        return super().seconds_each() + EPISODE_FRAMES * SECONDS_PER_FRAME
+
+    def make(self, watch: Watch) -> str:
+        """Film every episode that is not there, and clear away those of other nodes."""
+        env, plane, filmed = self.scene().make(), plane_of(self._dataset), self._find_films()
+        for node in self._nodes:
+            if node not in filmed:
+                with watch.busy(f"{self.figure.id}: the episode of {node.why}"):
+                    self._film(env, plane, node)
+                filmed.append(node)
+                write_nodes(self.folder / EPISODES, filmed)
+        for file in self.folder.glob("episode-*"):
+            if is_of_episode(file) and file.stem not in {node.name for node in self._nodes}:
+                file.unlink()
+        write_nodes(self.folder / EPISODES, self._nodes)
+        return f"{len(self._nodes)} episodes"
+
+    def _film(self, env: Environment, plane: Plane, node: Node) -> None:
+
+        from ..landscapes.draw.film import save_film, save_still
+        from ..landscapes.draw.render import replay
+
+        axes = [axis.tolist() for axis in plane.axes()]
+        place = [axis[at] for axis, at in zip(axes, (node.column, node.row), strict=False)]
+        episode = env.episode(plane.lift(torch.tensor([place], dtype=torch.float64))[0])
+        count = min(EPISODE_FRAMES, len(episode.time))
+        shown = np.linspace(0, len(episode.time) - 1, count).round().astype(int).tolist()
+        pictures = list(replay.frames(episode, shown, height=EPISODE_HEIGHT))
+        save_still(pictures[-1], self.folder / f"{node.name}.webp")
+        save_film(pictures, self.folder / f"{node.name}.mp4", None, count=count, rate=replay.RATE, loss=FILM_CRF)
+
+    @cached_property
+    def _dataset(self) -> xr.Dataset:
+
+        return open_slice(self.folder / STORE)
+
+    @cached_property
+    def _nodes(self) -> list[Node]:
+
+        return choose_nodes(self._dataset, point(make(self.figure.env, device="cpu"), self.figure.through))
+
+    def _find_films(self) -> list[Node]:
+        """Return the nodes whose films are there."""
+        listed = read_if_sound(read_nodes, self.folder / EPISODES) or []
+        return [
+            node for node in self._nodes
+            if node in listed and all((self.folder / f"{node.name}.{kind}").exists() for kind in EPISODE_KINDS)
+        ]  # fmt: skip
 
 
 class SearchPart(FigurePart):
@@ -233,19 +412,12 @@ class SearchPart(FigurePart):
 
     def seconds_each(self) -> float:
         """Share what simulating all of them in lockstep takes; what methods take themselves comes on top."""
-        from ..jobs.race import lockstep_seconds
-        from ..optim.registry import optimizer_class
-
-        env = self.scene().make()
         asking = sum(optimizer_class(method).needs_grad for method in METHODS)
         left = {0: BUDGET * (len(METHODS) - asking), 1: BUDGET * asking}
-        return lockstep_seconds(env, left, len(METHODS)) / len(METHODS)
+        return lockstep_seconds(self.scene().make(), left, len(METHODS)) / len(METHODS)
 
     def make(self, watch: Watch) -> str:
         """Race the methods, in a folder under out/, and keep the runs that are missing."""
-        from ..jobs.race import RaceJob
-        from .runs import save_run
-
         job = RaceJob.of(self.scene().make(), METHODS, budget=BUDGET, seeds=1, command=self.label(), watch=watch)
         runs = replace(job, executor=self.executor).run(watch).race.runs
         for method in self._missing():
@@ -261,11 +433,6 @@ class SearchPart(FigurePart):
 
     def _missing(self) -> list[str]:
         """Return the methods without a run at the figure's fidelity that its slice's page would show."""
-        from ..landscapes.identity import stored_identity
-        from ..landscapes.storage.paths import is_slice
-        from ..landscapes.storage.store import SliceStore
-        from .runs import open_run, searched
-
         fidelity, store = self.scene().fidelity, self.folder / STORE
         cut = SliceStore.open(store).identity if is_slice(store) else None
 
@@ -275,6 +442,86 @@ class SearchPart(FigurePart):
 
         runs = {method: read_if_sound(open_run, self._file(method)) for method in METHODS}
         return [method for method, run in runs.items() if run is None or not fits(run)]
+
+
+class ReportPart(FigurePart):
+    """What the slice is like, beside it."""
+
+    def label(self) -> str:
+        """Return the command that measures it elsewhere, which names no folder above this one: its record is kept."""
+        folder, here = self.folder.resolve(), Path.cwd()
+        said = folder.relative_to(here) if folder.is_relative_to(here) else self.folder
+        return f"landscape report {said} --device {self.device}"
+
+    def count_left(self) -> int:
+        """Return 1 where there is no report of this slice."""
+        record, store = read_if_sound(read_json, self.folder / REPORT), self.folder / STORE
+        if record is None or read_if_sound(read_json, self.folder / MEASURES) is None or not is_slice(store):
+            return 1
+        key = record.get("key")
+        return int(not isinstance(key, dict) or key.get("slice") != digest_of(open_slice(store)))
+
+    def seconds_each(self) -> float:
+        """Estimate a report by the first episodes."""
+        rank = len(self.figure.dims)
+        shape = (self.figure.resolution,) * rank
+        return estimate_seconds(self.scene().make(), *effort(rank, REPORT_POINTS, shape))
+
+    def make(self, watch: Watch) -> str:
+        """Measure the slice, in the place of a report of another one."""
+        from ..landscapes.draw.film import lighten
+
+        for name in (REPORT, MEASURES, QUALITY, QUALITY_ARRAYS):
+            (self.folder / name).unlink(missing_ok=True)
+        subject, words = ReportedSlice(self.figure.id, self.folder / STORE), read_paper().words
+        job = ReportJob([subject], self.folder, True, REPORT_POINTS, SEED, self.device, words, command=self.label())
+        report = job.report(subject, watch)
+        lighten(self.folder / QUALITY)
+        return ", ".join(report.words)
+
+
+class FidelityPart(FigurePart):
+    """Accuracy against time of the figure's environment, which its other figures share."""
+
+    of_environment = True
+
+    def label(self) -> str:
+        """Return the command that measures it elsewhere."""
+        return f"landscape study fidelity {self.figure.env} --device {self.device} --settings {','.join(CHANGED)}"
+
+    def count_left(self) -> int:
+        """Return 1 where there is none, of an environment that has fidelities to compare."""
+        some = len(environment_class(self.figure.env).fidelities) > 1
+        devices = DEVICES if self.device == "auto" else (self.device,)
+        return int(some and not any(map(self._sound, devices)))
+
+    def seconds_each(self) -> float:
+        """Estimate all variants by the work of their episodes."""
+        return sum(self._open().seconds().values())
+
+    def make(self, watch: Watch) -> str:
+        """Measure every variant; those that are measured stay in a folder of their own under out/ until the last is."""
+        from ..landscapes.draw.film import lighten
+
+        job = self._open()
+        found = job.run(watch)
+        files = StudyFiles.of(self.root, self.figure.env, found.device, found.kind)
+        make_folder(files.record.parent)
+        shutil.copyfile(job.folder / job.results.picture, files.picture)
+        lighten(files.picture)
+        write_record(files.record, to_json(found))
+        return f"{len(found.table())} variants at {found.points} points"
+
+    def _sound(self, device: str) -> bool:
+        """Whether there is one of a device."""
+        files = StudyFiles.of(self.root, self.figure.env, device, "fidelity")
+        return bool(read_if_sound(read_json, files.record)) and files.picture.is_file()
+
+    def _open(self) -> StudyJob:
+
+        scene = SceneSpec(self.figure.env, device=self.device)
+        options = StudyOptions(points=STUDY_POINTS, seed=SEED, settings=CHANGED)
+        return StudyJob.open("fidelity", scene, options, command=self.label())
 
 
 def _same(figure: Figure, identity: Mapping[str, Any]) -> bool:
@@ -304,8 +551,49 @@ def _through(provenance: Mapping[str, Any]) -> str:
     return words[words.index("--through") + 1] if "--through" in words else "center"
 
 
-def seconds_of_one(env: Environment) -> float:
-    """Return the seconds of an episode without gradient."""
-    from ..landscapes.cost import episode_cost
+def kept_key(path: Path) -> Any:
+    """Return the `key` of a record, what it was made of; None where there is no sound record or it has none."""
+    return (read_if_sound(read_json, path) or {}).get("key")
 
-    return episode_cost(env, grad=False).forward
+
+def points_beside(figure: Figure) -> list[str]:
+    """Return the points that a figure's dimensions are also cut through: the centre and the scene's first example.
+
+    A figure that varies all parameters has the same slice everywhere, so there are none.
+    """
+    kind = environment_class(figure.env)
+    space = getattr(kind, "space", None) or SceneSpec(figure.env, device="cpu", options=figure.options).make().space
+    if space.dim == len(figure.dims):
+        return []
+    examples = [f"example:{name}" for name in kind.examples][:1]
+    return [name for name in ("center", *examples) if name != figure.through]
+
+
+def _sample_losses(env: Environment, plane: Plane) -> NDArray[np.float32]:
+    """Return the losses on a plane or a line, indexed (v, u) or (u), NaN where an episode failed."""
+    grid = plane.grid()
+    batches = torch.split(grid.reshape(-1, plane.dim), env.preferred_batch)
+    found = Evaluation.join((evaluate(env, x, grad=False) for x in batches), dim=plane.dim, grad=False)
+    return found.loss.reshape(grid.shape[:-1]).to(torch.float32).numpy()
+
+
+def choose_nodes(dataset: xr.Dataset, through: Float[Tensor, " dim"]) -> list[Node]:
+    """Choose the nodes of least, median and largest loss, and the one nearest the point the slice goes through.
+
+    Of a node that is chosen twice the first reason counts; the nodes of a line are in row 0.
+    """
+    loss, status = np.atleast_2d(dataset["loss"].to_numpy()), np.atleast_2d(dataset["status"].to_numpy())
+    finite = np.argsort(loss, axis=None, kind="stable")[: int(np.isfinite(loss).sum())]
+    ranked = {"lowest loss": finite[:1], "median loss": finite[len(finite) // 2 :][:1], "highest loss": finite[-1:]}
+    places = {why: int(at[0]) for why, at in ranked.items() if len(at)}
+    plane = plane_of(dataset)
+    here = plane.project(through[None])[0].tolist()
+    nearest = [int(abs(axis - at).argmin()) for axis, at in zip(plane.axes(), here, strict=True)]  # u, then v
+    places["through the slice's point"] = int(np.ravel_multi_index(tuple(nearest[::-1]), dataset["loss"].shape))
+    nodes: dict[int, Node] = {}
+    for why, place in places.items():
+        row, column = divmod(place, loss.shape[1])
+        value = float(loss[row, column])
+        name = Status(int(status[row, column])).name
+        nodes.setdefault(place, Node(row, column, why, value if np.isfinite(value) else None, name))
+    return list(nodes.values())

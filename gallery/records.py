@@ -1,18 +1,25 @@
-"""The records that are computed for a figure and shown on its page: which film is of what."""
+"""The records that are computed for a figure and shown on its page, and the searches laid over its slice."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
+from zipfile import ZipFile
 
+import xarray as xr
+from zarr.storage import ZipStore
+
+from ..landscapes.convert import from_json, to_json
 from ..landscapes.objective import Status
-from ..landscapes.plain import number, optional, text
-from ..landscapes.storage.files import write_json
-from ..landscapes.storage.records import read_json, reading, sign, verify, write_record
-from .files import REMAKE, episode_name
+from ..landscapes.storage.files import replacing, write_json
+from ..landscapes.storage.layout import COMPACT_CODECS
+from ..landscapes.storage.records import read_json, reading, sign, verify
+from ..optim.runs.arrays import COLUMNS
+from .files import COMPANION_PICTURE, COMPANIONS, REMAKE, SWEEP_FILM, SWEEP_RECORD, episode_name
 
 T = TypeVar("T")
 
@@ -24,33 +31,46 @@ class SweepRecord:
     over: str
     fidelity: str
     frames: int
-    resolution: Sequence[int]
+    resolution: tuple[int, ...]
     label: str
     low: float
     high: float
     command: str
 
-    @classmethod
-    def read(cls, path: Path) -> SweepRecord:
-        """Read a record. Raises ValueError, naming the file, where it is not what `write` wrote."""
-        with reading(path, REMAKE.format("sweeps")):
-            found = read_json(path)
-            if not text(found["label"]):
-                raise ValueError("its label is empty")
-            return cls(
-                over=text(found["over"]),
-                fidelity=text(found["fidelity"]),
-                frames=int(number(found["frames"])),
-                resolution=[int(number(side)) for side in found["resolution"]],
-                label=found["label"],
-                low=number(found["low"]),
-                high=number(found["high"]),
-                command=text(found["command"]),
-            )
+    def __post_init__(self) -> None:
+        if not self.label:
+            raise ValueError("its label is empty")
 
-    def write(self, path: Path) -> None:
-        """Write what `read` reads."""
-        write_record(path, asdict(self))
+
+def read_sweep(folder: Path) -> SweepRecord | None:
+    """Return what the film of a sweep shows, None where there is no film or nothing is said of it."""
+    path = folder / SWEEP_RECORD
+    if not path.exists() or not (folder / SWEEP_FILM).exists():
+        return None
+    with reading(path, REMAKE.format("sweeps")):
+        return from_json(SweepRecord, read_json(path))
+
+
+@dataclass(frozen=True)
+class Companion:
+    """A slice beside a figure's: the point it goes through, the ends of its losses, the share of episodes that failed.
+
+    The ends are None where all failed.
+    """
+
+    through: str
+    lowest: float | None
+    highest: float | None
+    failed: float
+
+
+def read_companions(folder: Path) -> list[Companion]:
+    """Return the slices beside a figure's, none where none are made."""
+    path = folder / COMPANIONS
+    if not path.exists() or not (folder / COMPANION_PICTURE).exists():
+        return []
+    with reading(path, REMAKE.format("companions")):
+        return from_json(list[Companion], read_json(path)["slices"])
 
 
 @dataclass(frozen=True)
@@ -63,6 +83,11 @@ class Node:
     loss: float | None
     status: str
 
+    def __post_init__(self) -> None:
+        if min(self.row, self.column) < 0:
+            raise ValueError(f"a place is counted from 0; got {min(self.row, self.column)}")
+        Status[self.status]  # a KeyError where there is no such status
+
     @property
     def name(self) -> str:
         """The name of its files, without their ending."""
@@ -71,7 +96,7 @@ class Node:
 
 def write_nodes(path: Path, nodes: Sequence[Node]) -> None:
     """Write which nodes' episodes are shown."""
-    write_json(path, [sign(asdict(node)) for node in nodes])
+    write_json(path, [sign(to_json(node)) for node in nodes])
 
 
 def read_nodes(path: Path) -> list[Node]:
@@ -80,15 +105,38 @@ def read_nodes(path: Path) -> list[Node]:
     Raises ValueError, naming the file, where it is not what `write_nodes` wrote.
     """
     with reading(path, REMAKE.format("episodes")):
-        return [_node(one) for one in json.loads(path.read_text())]
+        return [from_json(Node, verify(one)) for one in json.loads(path.read_text())]
 
 
-def _node(found: object) -> Node:
-    record = verify(found)
-    row, column = int(record["row"]), int(record["column"])
-    if min(row, column) < 0:
-        raise ValueError(f"a place is counted from 0; got {min(row, column)}")
-    return Node(row, column, text(record["why"]), optional(number, record["loss"]), Status[record["status"]].name)
+def save_run(table: xr.Dataset, path: Path) -> None:
+    """Write a run's table as one file, whole or not at all."""
+    numbers = [str(name) for name, column in table.variables.items() if column.dtype.kind in "fi"]
+    encoding = {name: {"compressors": COMPACT_CODECS, "chunks": table[name].shape} for name in numbers}
+    with replacing(path) as partial, ZipStore(partial, mode="w") as store, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # zarr's specification has no strings yet
+        table.to_zarr(store, encoding=encoding, zarr_format=3, consolidated=False)
+
+
+def open_run(path: Path) -> xr.Dataset:
+    """Read a run's table. Raises ValueError, naming the file, where it is not what `save_run` wrote."""
+    with reading(path, REMAKE.format("searches")):
+        with ZipFile(path) as packed:
+            if torn := packed.testzip():  # a chunk that is not found would be one of nothing but its fill value
+                raise ValueError(f"{torn} in it is torn")
+        with ZipStore(path, mode="r") as store:
+            table = xr.open_zarr(store, zarr_format=3, consolidated=False, mask_and_scale=False, decode_times=False)
+            table.load()
+        if lost := COLUMNS.keys() - table.variables.keys():
+            raise ValueError(f"it lacks {', '.join(sorted(lost))}")
+    return table
+
+
+def searched(run: Mapping[str, Any], slice_: Mapping[str, Any]) -> bool:
+    """Whether a run searched a slice's scene; an option that one of them was made without does not tell them apart."""
+    ours, theirs = run.get("options", {}), slice_.get("options", {})
+    shared = set(ours) & set(theirs)
+    same = run["objective"] == slice_["objective"] and run["parameters"] == slice_["parameters"]
+    return same and all(ours[name] == theirs[name] for name in shared)
 
 
 def read_if_sound(read: Callable[[Path], T], path: Path) -> T | None:

@@ -121,20 +121,18 @@ def quicken(put: Callable[[object, str, Any], object]) -> None:
 
     `put` is setattr, or what does the same for a while.
     """
-    from gradscape.gallery import episodes as gallery_episodes
-    from gradscape.gallery import measures as gallery_measures
     from gradscape.gallery import parts as gallery_parts
     from gradscape.landscapes import cost
-    from gradscape.landscapes.measures import fidelity
     from gradscape.optim.runs import store
+    from gradscape.studies import samples
 
     for place, values in (
-        (fidelity, {"REPETITION": 0.002, "LARGEST": 0.002}),
+        (samples, {"REPETITION": 0.002, "LARGEST": 0.002}),
         (cost, {"MOMENT": 0.0, "ENOUGH": 0.0, "WARM_UP": 0.0}),
         (store, {"PAUSE": 0.0, "SHARE": math.inf}),  # writes after every proposal
-        (gallery_parts, {"METHODS": ("random",), "BUDGET": 8, "FRAMES": 2, "COARSE": 5}),
-        (gallery_episodes, {"LONGEST": 2, "HEIGHT": 48}),
-        (gallery_measures, {"TRADEOFF_POINTS": 2, "REPORT_POINTS": 2, "TURNED": ["precision"]}),
+        (gallery_parts, {"METHODS": ("random",), "BUDGET": 8, "SWEEP_FRAMES": 2, "SWEEP_RESOLUTION": 5}),
+        (gallery_parts, {"EPISODE_FRAMES": 2, "EPISODE_HEIGHT": 48}),
+        (gallery_parts, {"STUDY_POINTS": 2, "REPORT_POINTS": 2, "CHANGED": ("precision",)}),
     ):
         for name, value in values.items():
             put(place, name, value)
@@ -270,7 +268,7 @@ def _store(path: Path) -> Numbers:
 
 
 def _zipped(path: Path) -> Numbers:
-    from gradscape.gallery.runs import open_run
+    from gradscape.gallery.records import open_run
 
     return _of_dataset(open_run(path).drop_vars(["seconds", "forwards"], errors="ignore"))
 

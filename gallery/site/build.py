@@ -13,8 +13,9 @@ import json
 import re
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import partial
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -23,15 +24,16 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from ... import __version__
 from ...envs.registry import entries
+from ...landscapes.convert import to_json
 from ...landscapes.identity import plane_of, stored_identity, stored_provenance
 from ...landscapes.measures.card import Card
+from ...landscapes.measures.classify import WORDS
 from ...landscapes.storage.arrays import parameters_of
 from ...landscapes.storage.files import placing, resolve
 from ...landscapes.storage.ownership import check_ours
 from ...landscapes.storage.paths import is_slice
 from ...landscapes.storage.records import reading
 from ...landscapes.storage.store import SliceStore, open_slice
-from ..companions import Companion, read_companions
 from ..figures import Figure
 from ..files import (
     COMPANION_PICTURE,
@@ -50,21 +52,116 @@ from ..files import (
 )
 from ..paper import read_paper
 from ..parts import changes_since
-from .card import place_card
+from ..records import Companion, SweepRecord, read_companions, read_sweep
 from .downloads import save_slice, save_table
-from .front import Front
-from .league import LeaguePage, place_league
-from .manifest import SCHEMA, FidelityEntry, FigureEntry, Manifest, ModelEntry, as_json
-from .measured import place_fidelities, quality_rows, read_report
-from .models import place_models
-from .page_data import count_numbers, read_episodes, read_measures, read_off_nodes, read_sweep
+from .league import LeaguePage, place_league, rank_style
+from .page_data import (
+    EpisodeEntry,
+    Numbers,
+    ReportEntry,
+    Search,
+    count_numbers,
+    enter_report,
+    lay_runs,
+    quality_rows,
+    read_episodes,
+    read_measures,
+    read_off_nodes,
+    read_report,
+    read_runs,
+)
+from .studies import StudyEntry, place_studies
 from .studio import Studio, draws
-from .trajectories import lay_runs, read_runs
-from .wall import draw_wall, hang
+from .wall import GRADIENTS, SIZES, Tile, draw_wall, make_tiles, place_card, size_class
 
 HERE = Path(__file__).parent
 MANIFEST, NODES = "manifest.json", "nodes.js"
 CARD_PAGE, LEAGUE_PAGE = "card.html", "league.html"
+SCHEMA = 3  # counts up whenever the meaning of a name in the manifest changes
+
+
+@dataclass(frozen=True)
+class FigureEntry:
+    """A slice of the gallery, and all that its page shows.
+
+    `changed` holds the settings of its fidelity that changed since it was sampled: what they were, and what they are.
+    """
+
+    id: str
+    env: str
+    paper_figure: int | None
+    page: str
+    dims: Sequence[int]
+    labels: Sequence[str]
+    through: str
+    says: str
+    searched: Mapping[str, Any]
+    resolution: Sequence[int]
+    loss_unit: str
+    numbers: Numbers
+    command: str
+    python: str
+    identity: Mapping[str, Any]
+    provenance: Mapping[str, Any]
+    sweep: SweepRecord | None
+    changed: Mapping[str, Sequence[Any]]
+    measures: Mapping[str, str | float]
+    files: Sequence[str] = ()
+    episodes: Sequence[EpisodeEntry] = ()
+    companions: Sequence[Companion] = ()
+    runs: Sequence[Search] = ()
+    report: ReportEntry | None = None
+
+    @classmethod
+    def of(cls, figure: Figure, dataset: xr.Dataset, source: Path) -> FigureEntry:
+        """Return what is said of a slice without its other files."""
+        identity, provenance = stored_identity(dataset), stored_provenance(dataset)
+        device = identity.get("device", "auto")
+        return cls(
+            id=figure.id,
+            env=figure.env,
+            paper_figure=figure.caption.number,
+            page=f"{figure.id}/index.html",
+            dims=figure.dims,
+            labels=identity["plane"]["labels"],
+            through=figure.through,
+            says=figure.caption.says,
+            searched=figure.searched,
+            resolution=identity["plane"]["resolution"],
+            loss_unit=provenance.get("loss_unit", ""),
+            numbers=count_numbers(dataset),
+            command=provenance.get("command") or figure.command(device),
+            python=figure.python(device),
+            identity={name: value for name, value in identity.items() if name != "plane"},
+            provenance=provenance,
+            sweep=read_sweep(source),
+            changed=changes_since(identity),
+            measures=read_measures(source),
+        )
+
+    @property
+    def dim(self) -> int:
+        """How many parameters its environment has."""
+        named = entries().get(self.env)
+        return int(named.dim) if named and named.dim.isdigit() else len(self.identity.get("parameters", self.dims))
+
+    @property
+    def words(self) -> list[str]:
+        """The words that were measured of it."""
+        return [one.word for one in self.report.words if one.measured] if self.report is not None else []
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """All of a site: its environments, its slices and studies, slices that are not sampled yet, and its files."""
+
+    schema: int
+    gradscape: str
+    wall: Sequence[Tile]
+    figures: Sequence[FigureEntry]
+    studies: Mapping[str, Sequence[StudyEntry]]
+    missing: Sequence[str]
+    files: Sequence[str]
 
 
 def build_site(
@@ -89,13 +186,18 @@ def build_site(
         for _, folder in places:
             folder.mkdir()
         with Studio(places) as studio:
-            site = _Site.begin(new, data, [figure.env for figure in there], tables, studio)
-            shown = [site.write_page(figure, data / figure.id) for figure in there]
-            site.write_card(card := place_card(data, new, studio))
-            site.write_league(league := place_league(data, new, read_paper()))
-            tiles = hang(shown, data, new, studio)
+            envs = [figure.env for figure in there]
+            studies = place_studies(data, new, envs, studio)
+            site = _Site(new, data, _templates(), studio, tables, studies)
+            shown = [site.write_slice(figure) for figure in there]
+            card, league = place_card(data, new, studio), place_league(data, new, read_paper())
+            tiles = make_tiles(shown, data, new, studio)
             draw_wall(tiles, data, new)
-        return site.write_index(Front(shown, tiles, card, league), [one.id for one in figures if one not in there])
+        if card is not None:
+            site.write_page(CARD_PAGE, card=card)
+        if league is not None:
+            site.write_page(LEAGUE_PAGE, page=league)
+        return site.write_index(shown, [one.id for one in figures if one not in there], tiles, card, league)
 
 
 def _check(out: Path) -> None:
@@ -123,7 +225,9 @@ def _templates() -> Environment:
     )  # fmt: skip
     pages.filters["number"] = _number
     pages.filters["dark"] = dark_name
-    pages.filters["beside"] = _beside
+    pages.filters["beside"] = _describe_companion
+    pages.filters["size"] = size_class
+    pages.filters["rank_style"] = rank_style
     pages.filters["times"] = lambda text: re.sub(r"(?<=\d) x (?=[\d(])", " \N{MULTIPLICATION SIGN} ", text)
     return pages
 
@@ -133,7 +237,7 @@ def _number(value: Any, digits: int = 4) -> str:
     return f"{value:z.{digits}g}".replace("-", "\N{MINUS SIGN}") if isinstance(value, int | float) else str(value)
 
 
-def _beside(one: Companion, unit: str) -> str:
+def _describe_companion(one: Companion, unit: str) -> str:
     """Say what the losses of a slice beside a page's own range over."""
     if one.lowest is None or one.highest is None:
         return f"through {one.through} all failed"
@@ -141,148 +245,118 @@ def _beside(one: Companion, unit: str) -> str:
 
 
 @dataclass(frozen=True)
-class Held:
-    """A parameter that a slice holds, and at what value."""
-
-    name: str
-    value: float
-    unit: str
-
-
-@dataclass(frozen=True)
 class _Site:
     """A site under way in `folder`, with what its pages share."""
 
     folder: Path
+    data: Path
     pages: Environment
-    tables: Sequence[xr.Dataset]
-    fidelities: Mapping[str, Sequence[FidelityEntry]]
-    models: Mapping[str, Sequence[ModelEntry]]
     studio: Studio
+    tables: Sequence[xr.Dataset]
+    studies: Mapping[str, Sequence[StudyEntry]]
 
-    @classmethod
-    def begin(
-        cls, folder: Path, data: Path, envs: Sequence[str], tables: Sequence[xr.Dataset], studio: Studio
-    ) -> _Site:
-        """Place what the pages of these environments share."""
-        studies = place_fidelities(data, folder, envs, studio), place_models(data, folder, envs, studio)
-        return cls(folder, _templates(), tables, *studies, studio)
+    def write_page(self, name: str, template: str = "", **shown: Any) -> None:
+        """Write a page from a template, by default the one of its name."""
+        (self.folder / name).write_text(self.pages.get_template(template or name).render(**shown))
 
-    def write_page(self, figure: Figure, source: Path) -> FigureEntry:
+    def write_slice(self, figure: Figure) -> FigureEntry:
         """Write a slice's page and all it shows, and return its entry in the manifest."""
-        folder = self.folder / figure.id
+        source, folder = self.data / figure.id, self.folder / figure.id
         dataset = open_slice(source / STORE)
         episodes, runs = read_episodes(source, dataset), lay_runs(dataset, self.tables)
         nodes = read_off_nodes(dataset, episodes, runs)
-        (folder / NODES).write_text(f"const SLICE = {json.dumps(as_json(nodes), separators=(',', ':'))};\n")
-        given = [name for name in (*SURFACES, SWEEP_FILM) if (source / name).exists()]
-        given += [name for episode in episodes for name in episode.files]
-        given += [name for name in (REPORT, MEASURES, QUALITY) if (source / name).exists()]
-        entry = _entry(figure, dataset, source)
-        given += [COMPANION_PICTURE] if entry.companions else []
-        taken = [*save_slice(dataset, source / STORE, folder), *_save_tables(entry, source, folder)]
+        (folder / NODES).write_text(f"const SLICE = {json.dumps(to_json(nodes), separators=(',', ':'))};\n")
+        companions, report = read_companions(source), read_report(source)
+        given = [name for episode in episodes for name in episode.files]
+        given += [COMPANION_PICTURE] if companions else []
+        tables: dict[str, Sequence[Mapping[str, Any]]] = {COMPANION_TABLE: to_json(companions)}
+        if (source / QUALITY).exists() and report is not None:
+            tables[QUALITY_TABLE] = quality_rows(report.profile)
+        taken = self._place(dataset, source, folder, given, {name: rows for name, rows in tables.items() if rows})
         entry = replace(
-            entry,
-            files=[
-                NODES,
-                "index.html",
-                *taken,
-                *_place(given, draws(source, len(dataset["loss"].dims)), source, folder, self.studio),
-            ],
+            FigureEntry.of(figure, dataset, source),
+            files=[NODES, "index.html", *taken],
             episodes=episodes,
+            companions=companions,
             runs=[run.search() for run in runs],
-            fidelities=self.fidelities.get(figure.env, []),
-            models=self.models.get(figure.env, []),
+            report=enter_report(report) if report is not None else None,
         )
-        about = {"entry": entry, "held": list(_held_parameters(dataset)), "scene": entries().get(figure.env)}
-        about["finer"] = nodes.finer is not None
-        (folder / "index.html").write_text(self.pages.get_template("slice.html").render(**about))
+        self.write_page(
+            entry.page,
+            "slice.html",
+            entry=entry,
+            studies=self.studies[figure.env],
+            held=list(_held_parameters(dataset)),
+            scene=entries().get(figure.env),
+            finer=nodes.finer is not None,
+        )
         return entry
 
-    def write_card(self, card: Card | None) -> None:
-        """Write the page of the report card of gradients, where there is one."""
-        if card is not None:
-            (self.folder / CARD_PAGE).write_text(self.pages.get_template(CARD_PAGE).render(card=card))
+    def _place(
+        self,
+        dataset: xr.Dataset,
+        source: Path,
+        folder: Path,
+        given: Sequence[str],
+        tables: Mapping[str, Sequence[Mapping[str, Any]]],
+    ) -> list[str]:
+        """Write a slice and tables, copy the files that are `given` and others that are there; return all names.
 
-    def write_league(self, page: LeaguePage | None) -> None:
-        """Write the page of the league, where there is one."""
-        if page is not None:
-            (self.folder / LEAGUE_PAGE).write_text(self.pages.get_template(LEAGUE_PAGE).render(page=page))
+        Those of pictures come with those of their dark variants; what is drawn has its own.
+        """
+        for name, rows in tables.items():
+            save_table(rows, folder / name)
+        given = [
+            *(name for name in (*SURFACES, SWEEP_FILM, REPORT, MEASURES, QUALITY) if (source / name).exists()),
+            *given,
+        ]
+        for name in given:
+            shutil.copyfile(source / name, folder / name)
+        drawn = draws(source, len(dataset["loss"].dims))
+        pictures = [name for name in dict.fromkeys([PICTURE, THUMBNAIL, *given]) if name.endswith(".png")]
+        for name in pictures:
+            if name not in drawn:
+                within = partial(reading, source / name, REMAKE.format("slices"))
+                self.studio.develop(source / name, folder / name, within)
+        copied = [name for name in given if name not in pictures]
+        taken = [*save_slice(dataset, source / STORE, folder), *tables, *copied]
+        return [*taken, *(name for one in pictures for name in (one, dark_name(one)))]
 
-    def write_index(self, front: Front, missing: Sequence[str]) -> Manifest:
+    def write_index(
+        self,
+        shown: Sequence[FigureEntry],
+        missing: Sequence[str],
+        tiles: Sequence[Tile],
+        card: Card | None,
+        league: LeaguePage | None,
+    ) -> Manifest:
         """Write the front page and the manifest, and return that."""
-        manifest = Manifest(SCHEMA, __version__, front.tiles, front.shown, missing, [])
-        index = self.pages.get_template("index.html").render(front=front, manifest=manifest, scenes=entries())
-        (self.folder / "index.html").write_text(index)
+        manifest = Manifest(SCHEMA, __version__, tiles, shown, self.studies, missing, [])
+        said = {word for tile in tiles for word in tile.fitting()} | {word for entry in shown for word in entry.words}
+        sizes = {size_class(tile.dim) for tile in tiles}
+        self.write_page(
+            "index.html",
+            manifest=manifest,
+            tiles=tiles,
+            card=card,
+            league=league,
+            scenes=entries(),
+            groups=[(env, list(group)) for env, group in groupby(shown, key=lambda entry: entry.env)],
+            words=[word for word in WORDS if word in said],
+            gradients=GRADIENTS,
+            engines=sorted({tile.engine for tile in tiles if tile.engine}),
+            sizes={name: words for name, words in SIZES.items() if name in sizes},
+        )
         files = [file.relative_to(self.folder).as_posix() for file in self.folder.rglob("*") if file.is_file()]
         manifest = replace(manifest, files=sorted([*files, MANIFEST]))
-        (self.folder / MANIFEST).write_text(json.dumps(as_json(manifest), indent=1) + "\n")
+        (self.folder / MANIFEST).write_text(json.dumps(to_json(manifest), indent=1) + "\n")
         return manifest
 
 
-def _place(given: Sequence[str], drawn: Sequence[str], source: Path, folder: Path, studio: Studio) -> list[str]:
-    """Copy files of a figure's data, and return their names, those of pictures with those of their dark variants.
-
-    What is `drawn` has its own.
-    """
-    for name in given:
-        shutil.copyfile(source / name, folder / name)
-    pictures = [name for name in dict.fromkeys([PICTURE, THUMBNAIL, *given]) if name.endswith(".png")]
-    for name in pictures:
-        if name not in drawn:
-            studio.develop(source / name, folder / name, partial(reading, source / name, REMAKE.format("slices")))
-    copied = [name for name in given if name not in pictures]
-    return [*copied, *(name for one in pictures for name in (one, dark_name(one)))]
-
-
-def _save_tables(entry: FigureEntry, source: Path, folder: Path) -> list[str]:
-    """Write what a figure's other pictures show as tables, and return their names."""
-    tables: dict[str, Sequence[Mapping[str, Any]]] = {COMPANION_TABLE: [asdict(one) for one in entry.companions]}
-    if (source / QUALITY).exists() and entry.report is not None:
-        tables[QUALITY_TABLE] = quality_rows(source)
-    there = {name: rows for name, rows in tables.items() if rows}
-    for name, rows in there.items():
-        save_table(rows, folder / name)
-    return list(there)
-
-
-def _entry(figure: Figure, dataset: xr.Dataset, source: Path) -> FigureEntry:
-    """Return what the manifest says of a slice, but for what other files of the site it goes with."""
-    identity, provenance = stored_identity(dataset), stored_provenance(dataset)
-    return FigureEntry(
-        id=figure.id,
-        env=figure.env,
-        paper_figure=figure.caption.number,
-        page=f"{figure.id}/index.html",
-        dims=figure.dims,
-        labels=identity["plane"]["labels"],
-        through=figure.through,
-        says=figure.caption.says,
-        searched=figure.searched,
-        resolution=identity["plane"]["resolution"],
-        loss_unit=provenance.get("loss_unit", ""),
-        numbers=count_numbers(dataset),
-        command=provenance.get("command") or figure.command(identity.get("device", "auto")),
-        python=figure.python(identity.get("device", "auto")),
-        identity={name: value for name, value in identity.items() if name != "plane"},
-        provenance=provenance,
-        files=[],
-        episodes=[],
-        sweep=read_sweep(source),
-        companions=read_companions(source),
-        changed=changes_since(identity),
-        runs=[],
-        measures=read_measures(source),
-        report=read_report(source),
-        fidelities=[],
-        models=[],
-    )
-
-
-def _held_parameters(dataset: xr.Dataset) -> Iterator[Held]:
-    """Yield the parameters that the slice holds."""
+def _held_parameters(dataset: xr.Dataset) -> Iterator[tuple[str, float, str]]:
+    """Yield the parameters that the slice holds: name, value and unit."""
     plane = plane_of(dataset)
     varied = plane.basis.any(dim=0).tolist()
     for (name, unit), value, varies in zip(parameters_of(dataset), plane.origin.tolist(), varied, strict=True):
         if not varies:
-            yield Held(name, value, unit)
+            yield name, value, unit

@@ -14,8 +14,8 @@ from ...landscapes.plain import text
 from ...landscapes.storage.records import read_json, reading, write_record
 from ...landscapes.storage.store import open_slice
 from ...optim.claims import ClaimFinding, ClaimVerdict
-from ...optim.league import League, OverallRank, SceneStandings, Standing
-from ..files import LEAGUE, LEAGUE_PICTURE, LEAGUE_RECORD, REMAKE, STORE, LeagueFiles, LeagueSliceFiles
+from ...optim.league import League, SceneStandings, Standing
+from ..files import LEAGUE, LEAGUE_PICTURE, LEAGUE_RECORD, REMAKE, STORE, LeagueFiles
 from ..league import read_league, save_both
 from ..paper import Paper
 from .downloads import save_slice, save_table
@@ -30,76 +30,29 @@ VERDICTS = {
 
 
 @dataclass(frozen=True)
-class RankCell:
-    """A mean rank with its interval, NaN where there is none, and the colours of its cell."""
-
-    method: str
-    rank: float
-    low: float
-    high: float
-    ground: str
-    ink: str
-
-    @property
-    def known(self) -> bool:
-        """Whether there is an interval."""
-        return self.low == self.low
-
-
-@dataclass(frozen=True)
-class RankRow:
-    """A scene's mean ranks in the order of the methods, None where one did not run; `anchor` is its place below."""
-
-    name: str
-    anchor: str
-    fidelity: str
-    cells: Sequence[RankCell | None]
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """A claim of the paper in a scene, and what the league makes of it."""
-
-    env: str
-    fidelity: str
-    finding: ClaimFinding
-
-    @property
-    def word(self) -> str:
-        """What the league makes of it."""
-        return VERDICTS[self.finding.verdict]
-
-
-@dataclass(frozen=True)
 class LeaguePage:
     """All that the page says: ranks, verdicts on claims, why others are none, and the races themselves.
 
-    `slices` says by scene which command samples the slice through its best point, of those that have one.
+    `verdicts` are claims of the paper in a scene with what the league makes of them, and in a word. `slices` says by
+    scene which command samples the slice through its best point, of those that have one.
     """
 
     league: League
-    rows: Sequence[RankRow]
-    verdicts: Sequence[Verdict]
+    verdicts: Sequence[tuple[str, ClaimFinding, str]]
     silences: Sequence[tuple[str, str]]
     slices: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
     def of(cls, league: League, paper: Paper, slices: Mapping[str, str]) -> LeaguePage:
         """Return what is to be said of a league beside the paper."""
-        count = len(league.methods)
-        rows = [_row(scene, league.methods, count) for scene in league.scenes]
-        overall = RankRow("all scenes", "", "", [_cell(one, count) for one in league.overall])
         found = [(scene, paper.claims_about(scene.env)) for scene in league.scenes]
-        verdicts = [
-            Verdict(scene.env, scene.fidelity, one) for scene, claims in found for one in scene.findings(claims)
-        ]
-        silences = [(scene.env, claims.silence) for scene, claims in found if claims.silence]
-        return cls(league, [*rows, overall], verdicts, silences, slices)
+        verdicts = [(scene.env, one, VERDICTS[one.verdict]) for scene, said in found for one in scene.findings(said)]
+        return cls(league, verdicts, [(scene.env, said.silence) for scene, said in found if said.silence], slices)
 
     @property
     def counts(self) -> str:
         """How many claims are confirmed, refuted, and so on, in words."""
-        found = Counter(one.word for one in self.verdicts)
+        found = Counter(word for _, _, word in self.verdicts)
         return ", ".join(f"{found[word]} {word}" for word in VERDICTS.values() if found[word])
 
     @property
@@ -134,12 +87,13 @@ def place_league(data: Path, out: Path, paper: Paper) -> LeaguePage | None:
         return None
     folder = out / LEAGUE
     folder.mkdir()
-    for source, target in ((LeagueFiles.of(data, one.env), LeagueFiles.of(out, one.env)) for one in league.scenes):
-        for name in ("record", "picture", "dark"):
-            shutil.copyfile(getattr(source, name), getattr(target, name))
+    for source in (LeagueFiles.of(data, one.env) for one in league.scenes):
+        for file in (source.record, source.picture, source.dark):
+            shutil.copyfile(file, folder / file.name)
     write_record(folder / LEAGUE_RECORD, to_json(league))
     save_both(league.plot(), folder / LEAGUE_PICTURE)
-    save_table([_rank(one) for one in league.overall], folder / LEAGUE_TABLE)
+    ranks = [{"method": one.method, "mean rank": one.rank, "low": one.low, "high": one.high} for one in league.overall]
+    save_table(ranks, folder / LEAGUE_TABLE)
     for scene in league.scenes:
         save_table([_came_off(scene, one) for one in scene.standings], folder / f"{scene.env}.csv")
     slices = {one.env: place_slice(data, out, one.env) for one in league.scenes}
@@ -148,36 +102,27 @@ def place_league(data: Path, out: Path, paper: Paper) -> LeaguePage | None:
 
 def place_slice(data: Path, out: Path, env: str) -> str | None:
     """Put the slice through a scene's best point into the site, and return its command; None where there is none."""
-    source, target = (LeagueSliceFiles.of(root, env) for root in (data, out))
-    if not source.there():
+    source, target = (LeagueFiles.of(root, env).slice for root in (data, out))
+    store = source.record.parent / STORE
+    if not (source.there() and source.dark.is_file() and store.is_dir()):
         return None
     with reading(source.record, REMAKE.format("league-slices")):
         command = text(read_json(source.record)["command"])
-    target.folder.mkdir()
-    for name in ("picture", "dark"):
-        shutil.copyfile(getattr(source, name), getattr(target, name))
-    save_slice(open_slice(source.folder / STORE), source.folder / STORE, target.folder)
+    folder = target.record.parent
+    folder.mkdir()
+    for file in (source.picture, source.dark):
+        shutil.copyfile(file, folder / file.name)
+    save_slice(open_slice(store), store, folder)
     return command
 
 
-def _row(scene: SceneStandings, methods: Sequence[str], count: int) -> RankRow:
-    by = {one.method: one for one in scene.standings}
-    cells = [_cell(by[method], count) if method in by else None for method in methods]
-    return RankRow(scene.env, scene.env, scene.fidelity, cells)
-
-
-def _cell(one: Standing | OverallRank, count: int) -> RankCell:
-    """Return the cell of a mean rank among so many methods, in the colours of the league's picture."""
+def rank_style(rank: float, methods: int) -> str:
+    """Return the style of the cell of a mean rank among so many methods, in the colours of the league's picture."""
     from ...landscapes.draw.style import RANK_MAP, text_on
 
-    low, high = (one.rank_low, one.rank_high) if isinstance(one, Standing) else (one.low, one.high)
-    colour = RANK_MAP((one.rank - 1) / max(count - 1, 1))
-    ground = "#" + bytes(round(255 * part) for part in colour[:3]).hex()
-    return RankCell(one.method, one.rank, low, high, ground, text_on(colour))
-
-
-def _rank(one: OverallRank) -> Mapping[str, Any]:
-    return {"method": one.method, "mean rank": one.rank, "low": one.low, "high": one.high}
+    colour = RANK_MAP((rank - 1) / max(methods - 1, 1))
+    ground = bytes(round(255 * part) for part in colour[:3]).hex()
+    return f"background: #{ground}; color: {text_on(colour)}"
 
 
 def _came_off(scene: SceneStandings, one: Standing) -> Mapping[str, Any]:

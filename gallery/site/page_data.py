@@ -1,10 +1,11 @@
-"""What a page needs of a slice: its numbers, its nodes for the map to hover over, and its films."""
+"""What a page needs of a slice: its numbers, its nodes for the map to hover over, its films, and its searches."""
 
 from __future__ import annotations
 
 import base64
-from collections.abc import Sequence
-from dataclasses import replace
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,21 +13,170 @@ import numpy as np
 import torch
 import xarray as xr
 
+from ...jobs.report import Report
 from ...jobs.slice import count_statuses, flat_points
-from ...landscapes.convert import to_json
-from ...landscapes.identity import plane_of
+from ...landscapes.convert import from_json, to_json
+from ...landscapes.identity import plane_of, stored_identity, stored_provenance
 from ...landscapes.lattice import own_cells
+from ...landscapes.measures.classify import WORDS
+from ...landscapes.measures.profile import Profile
 from ...landscapes.measures.undersampled import Undersampled, contradicted_cells
-from ...landscapes.objective import NOT_EVALUATED, Status
+from ...landscapes.objective import NOT_EVALUATED, Status, failed
+from ...landscapes.overlay import improvements, lay
 from ...landscapes.plain import number
 from ...landscapes.plane import Plane
 from ...landscapes.space import LOG10
 from ...landscapes.storage.records import read_json, reading
-from ..files import EPISODE_KINDS, EPISODES, MEASURES, REMAKE, SWEEP_FILM, SWEEP_RECORD
-from ..records import Node, SweepRecord, read_nodes
-from .manifest import Axis, ColourScale, EpisodeEntry, Nodes, Numbers, Trajectory
+from ..files import EPISODE_KINDS, EPISODES, MEASURES, REMAKE, REPORT, RUN_SUFFIX, RUNS
+from ..records import Node, open_run, read_nodes, searched
 
 LINEAR, LOGARITHMIC = "linear", "logarithmic"
+Column = Sequence[float | None]  # of numbers, None for what is not finite
+
+
+@dataclass(frozen=True)
+class Numbers:
+    """Say how a slice's points ended, the ends of their losses, and at what share of them the gradient is zero.
+
+    `undersampled` is the share of its cells whose loss its samples do not show, with its interval, where it is known.
+    """
+
+    points: int
+    status: Mapping[str, int]
+    lowest: float | None
+    highest: float | None
+    flat: float | None
+    undersampled: Mapping[str, float | None] | None = None
+
+
+@dataclass(frozen=True)
+class EpisodeEntry(Node):
+    """A node whose episode is shown, `at` which parameters it lies, and the files that there are of it."""
+
+    at: Mapping[str, float]
+    mp4: str | None = None
+    webp: str | None = None
+
+    @property
+    def files(self) -> list[str]:
+        """The files that there are of it."""
+        return [name for name in (self.mp4, self.webp) if name]
+
+
+@dataclass(frozen=True)
+class Search:
+    """A run that is laid over a slice: how it was made, and what became of it.
+
+    `outside` counts the episodes beyond the map, `distance` is from the slice, the least and the most.
+    """
+
+    method: str
+    seed: int
+    label: str
+    fidelity: str
+    colour: str
+    budget: int
+    episodes: int
+    best: float | None
+    outside: int
+    failed: int
+    distance: tuple[float, float]
+    command: str
+
+
+@dataclass(frozen=True)
+class Trajectory(Search):
+    """A run with its points, in the order of evaluation, for the map alone.
+
+    Of every point: where it falls, its own loss, and how large its mark is [pixels] (the smaller, the farther off the
+    slice). `path` holds the points that were the best so far, `hidden` those beyond the map.
+    """
+
+    u: Column
+    v: Column | None
+    loss: Column
+    radius: Sequence[float]
+    path: Sequence[int]
+    hidden: Sequence[int]
+
+    def search(self) -> Search:
+        """Return it without its points."""
+        return Search(**{one.name: getattr(self, one.name) for one in fields(Search)})
+
+
+@dataclass(frozen=True)
+class Axis:
+    """An axis of a map: its label, the coordinates of its nodes, and where it is labelled.
+
+    Coordinates along a `logarithmic` one are decimal logarithms of values.
+    """
+
+    label: str
+    values: Sequence[float]
+    ticks: Sequence[float]
+    logarithmic: bool = False
+
+
+@dataclass(frozen=True)
+class ColourScale:
+    """The scale of a map's colours, or of a line's height."""
+
+    low: float
+    high: float
+    logarithmic: bool
+    extend: str
+    ticks: Sequence[float]
+
+
+@dataclass(frozen=True)
+class Nodes:
+    """A slice as the map draws it, row by row from the lowest v; `page_data.pack` packs its arrays.
+
+    `loss` [unit] is packed float32, NaN where there is none, and `status` packed uint8, by the numbers of `statuses`.
+    `cells` and `looks` are the same as they are drawn, where a refined slice was not sampled everywhere. `slope` is the
+    gradient along the axes, `gradient` its length in all dimensions, packed float32 both. `finer` are packed flags of
+    the cells between four samples whose gradients contradict their losses. `scales` are those that the map can have,
+    by name, `scale` that which it begins with. `azimuth` is where the surface is seen from at first [degrees].
+    """
+
+    axes: Sequence[Axis]
+    unit: str
+    loss: str
+    status: str
+    statuses: Mapping[int, str]
+    scale: str
+    scales: Mapping[str, ColourScale]
+    palette: Sequence[str]
+    episodes: Sequence[EpisodeEntry]
+    runs: Sequence[Trajectory]
+    azimuth: float | None = None
+    slope: Sequence[str] | None = None
+    gradient: str | None = None
+    cells: str | None = None
+    looks: str | None = None
+    finer: str | None = None
+
+
+@dataclass(frozen=True)
+class Word:
+    """A word that was measured, or that the paper says: `agree` is None where the paper is silent."""
+
+    word: str
+    measured: bool
+    reason: str
+    agree: bool | None
+
+
+@dataclass(frozen=True)
+class ReportEntry:
+    """What `landscape report` found of a slice; `picture` says what the picture of gradient quality shows."""
+
+    words: Sequence[Word]
+    where: str
+    device: str
+    fidelity: str
+    picture: str
+    file: str
 
 
 def count_numbers(dataset: xr.Dataset) -> Numbers:
@@ -140,10 +290,54 @@ def _episode(node: Node, folder: Path, plane: Plane) -> EpisodeEntry:
     return EpisodeEntry(node.row, node.column, node.why, node.loss, node.status, at, **there)
 
 
-def read_sweep(folder: Path) -> SweepRecord | None:
-    """Return what the film of a sweep shows, None where there is no film or nothing is said of it."""
-    there = (folder / SWEEP_FILM).exists() and (folder / SWEEP_RECORD).exists()
-    return SweepRecord.read(folder / SWEEP_RECORD) if there else None
+def read_report(folder: Path) -> Report | None:
+    """Return what `landscape report` found of a slice, None where there is no report."""
+    if not (folder / REPORT).exists():
+        return None
+    with reading(folder / REPORT, REMAKE.format("reports")):
+        return from_json(Report, read_json(folder / REPORT))
+
+
+def enter_report(report: Report) -> ReportEntry:
+    """Return what a page shows of a report."""
+    where = report.paper.where if report.paper else ""
+    return ReportEntry(_words(report), where, report.device, report.fidelity, _describe_quality(report.profile), REPORT)
+
+
+def _words(report: Report) -> list[Word]:
+    """Return every word that was measured or that the paper says."""
+    reasons = report.profile.verdict.reasons
+    paper = [one.word for one in report.paper.words] if report.paper else []
+    return [
+        Word(word, word in reasons, reasons.get(word, ""), word in reasons if word in paper else None)
+        for word in WORDS
+        if word in reasons or word in paper
+    ]
+
+
+def _describe_quality(profile: Profile) -> str:
+    """Say what the picture of gradient quality shows."""
+    smallest = next((row for row in profile.differences if row.points >= row.of / 2), None)
+    parts = [
+        f"mean cosine of gradient and difference {_format_signed(row.cosine.value)} over {row.scale:.2g} of the box"
+        for row in [smallest, *profile.differences_of_samples]
+        if row and math.isfinite(row.cosine.value)
+    ]
+    for row in profile.smoothing:
+        if math.isfinite(row.biased.value):
+            biased = round(row.biased.value * row.points)
+            parts.append(f"smoothed over {row.width:.0%} of it, first order is biased at {biased} of {row.points}")
+    return "Gradient quality over the slice: " + ("; ".join(parts) or "no slope above the noise")
+
+
+def quality_rows(profile: Profile) -> list[dict[str, Any]]:
+    """Return what the picture of gradient quality shows by scale, a row for each scale of each of its three parts."""
+    parts = ("differences", "differences_of_samples", "smoothing")
+    return [{"part": part.replace("_", " "), **to_json(row)} for part in parts for row in getattr(profile, part)]
+
+
+def _format_signed(value: float) -> str:
+    return f"{value:z.2f}".replace("-", "\N{MINUS SIGN}")
 
 
 def read_measures(folder: Path) -> dict[str, str | float]:
@@ -152,10 +346,53 @@ def read_measures(folder: Path) -> dict[str, str | float]:
     if not path.exists():
         return {}
     with reading(path, REMAKE.format("reports")):
-        found = read_json(path)
-        return {name: value if isinstance(value, str) else number(value) for name, value in found.items()}
+        return {name: value if isinstance(value, str) else number(value) for name, value in read_json(path).items()}
 
 
 def round_off(values: np.ndarray[Any, Any]) -> list[float | None]:
     """Return numbers to six digits, None for what is not finite."""
     return [float(f"{value:.6g}") if np.isfinite(value) else None for value in values.tolist()]
+
+
+def read_runs(data: Path) -> list[xr.Dataset]:
+    """Return every run that `save_run` left in the gallery's data and that has an episode."""
+    tables = [open_run(file) for file in sorted((data / RUNS).glob(f"*/*{RUN_SUFFIX}"))]
+    return [table for table in tables if table.sizes["evaluation"]]
+
+
+def lay_runs(dataset: xr.Dataset, tables: Sequence[xr.Dataset]) -> list[Trajectory]:
+    """Lay the runs of a slice's environment and options over it, the least loss first."""
+    from ...landscapes.draw.figures.overlay import farthest_distance
+
+    own = [table for table in tables if searched(stored_identity(table), stored_identity(dataset))]
+    runs = [lay(dataset, table, f"{table.attrs['method']}, seed {table.attrs['seed']}") for table in own]
+    reach = farthest_distance(runs)
+    points = sum(run.sizes["evaluation"] for run in runs)
+    top = math.inf if "v" in dataset.dims else float(dataset["loss"].max())  # of what a line's map shows
+    laid = [_trajectory(run, reach, points, top) for run in runs]
+    return sorted(laid, key=lambda run: math.inf if run.best is None else run.best)
+
+
+def _trajectory(run: xr.Dataset, reach: float, points: int, top: float) -> Trajectory:
+    from ...landscapes.draw.style import method, point_areas
+
+    loss, distance = run["loss"].to_numpy(), run["distance"].to_numpy()
+    outside = run["outside"].to_numpy() | (loss > top)
+    lost = failed(run["status"].to_numpy())
+    radius = np.sqrt(point_areas(distance, reach, points) / np.pi) * 4 / 3  # a point is 4/3 of a pixel
+    return Trajectory(
+        **{name: run.attrs[name] for name in ("method", "seed", "label", "fidelity", "budget")},
+        colour=method(run)["color"],
+        episodes=run.sizes["evaluation"],
+        best=float(np.nanmin(loss)) if np.isfinite(loss).any() else None,
+        outside=int(outside.sum()),
+        failed=int(lost.sum()),
+        distance=(float(distance.min()), float(distance.max())),
+        command=stored_provenance(run).get("command", ""),
+        u=round_off(run["u"].to_numpy()),
+        v=round_off(run["v"].to_numpy()) if "v" in run else None,
+        loss=round_off(loss),
+        radius=[round(float(size), 1) for size in radius],
+        path=improvements(run).tolist(),
+        hidden=np.flatnonzero(outside).tolist(),
+    )

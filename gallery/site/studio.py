@@ -20,10 +20,10 @@ from types import TracebackType
 from typing import Any
 
 from ...landscapes.storage.store import open_slice
-from ..files import PICTURE, STORE, THUMBNAIL, dark_name
+from ..files import PICTURE, STORE, THUMBNAIL, RecordFiles, dark_name
 
-FEW = 4  # slices that are drawn here: a process takes as long to start
-MOST = 4  # processes
+MAX_DRAWN_HERE = 4  # slices: a process takes as long to start
+MAX_PROCESSES = 4
 Reading = Callable[[], AbstractContextManager[Any]]
 
 
@@ -33,7 +33,7 @@ class Studio:
     def __init__(self, places: Sequence[tuple[Path, Path]]) -> None:
         self._thread = ThreadPoolExecutor(1)  # what recolours lets go of Python
         self._begun: list[Future[None]] = []
-        self._drawers = _start(places) if len(places) > FEW else []
+        self._drawers = _start(places) if len(places) > MAX_DRAWN_HERE else []
         if not self._drawers:
             for source, folder in places:
                 draw_slice(source, folder)
@@ -57,12 +57,19 @@ class Studio:
         """Make the dark variant of a picture beside where that goes, within what names the file of a failure."""
         self._begun.append(self._thread.submit(_develop, source, target, within))
 
+    def place(self, source: RecordFiles, target: RecordFiles) -> None:
+        """Copy a record with its picture into the site, and make the dark variant of that."""
+        target.record.parent.mkdir(exist_ok=True)
+        shutil.copyfile(source.record, target.record)
+        shutil.copyfile(source.picture, target.picture)
+        self.develop(source.picture, target.picture)
+
 
 def _start(places: Sequence[tuple[Path, Path]]) -> list[subprocess.Popen[bytes]]:
     """Start processes that draw the slices, as many as there are cores; none where there is one."""
     from ...envs.engines.runtime import cores
 
-    count = min(cores(), MOST) if cores() > 1 else 0
+    count = min(cores(), MAX_PROCESSES) if cores() > 1 else 0
     shares = [[str(path) for place in places[k::count] for path in place] for k in range(count)]
     command = [sys.executable, "-m", __name__]
     return [subprocess.Popen([*command, *share], stdout=subprocess.PIPE) for share in shares]

@@ -1,32 +1,96 @@
-"""The wall of landscapes: a slice of every environment, with what many slices of it are like by its census."""
+"""The front page: a slice of every environment with what its census says of many, and the report card of engines."""
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from itertools import groupby
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from ...envs.registry import entries
 from ...landscapes.convert import from_json
+from ...landscapes.measures.card import Card
 from ...landscapes.measures.census import Census
 from ...landscapes.measures.classify import GOOD, MISSING, NOISY, OPPOSITE, WORDS, ZERO
 from ...landscapes.storage.records import read_json, reading
 from ...landscapes.storage.store import open_slice
-from ..files import CENSUSES, DEVICES, STORE, WALL_PICTURE, WALL_TABLE
+from ..files import CARD, CARD_RECORD, DEVICES, STORE, WALL_PICTURE, WALL_TABLE, RecordFiles
 from ..league import save_both
 from .downloads import save_table
-from .manifest import FigureEntry, Tile, WordShare
 from .studio import Studio
+
+if TYPE_CHECKING:
+    from .build import FigureEntry
 
 GRADIENTS = (GOOD, NOISY, OPPOSITE, ZERO, MISSING)
 SHAPES = tuple(word for word in WORDS if word not in GRADIENTS)
-FITS = 1 / 3  # of the slices: from this share on a word is said of an environment
-REMAKE = "delete it, and `landscape census {} --device {}` measures it anew"
+MIN_SHARE = 1 / 3  # of the slices: from this share on a word is said of an environment
+SHOWN_WORDS = 3  # of how smooth an environment is
+REMAKE_CENSUS = "delete it, and `landscape census {} --device {}` measures it anew"
+REMAKE_CARD = "delete it, and `landscape card --out {}` measures it anew"
+SIZES = {"1-3": "1 to 3", "4-16": "4 to 16", "17-": "17 or more"}  # numbers of parameters, by the name in a link
 
 
-def hang(shown: Sequence[FigureEntry], data: Path, out: Path, studio: Studio) -> list[Tile]:
+@dataclass(frozen=True)
+class WordShare:
+    """A word, the share of an environment's slices that it fits, and its interval, None where there is none."""
+
+    word: str
+    share: float
+    low: float | None = None
+    high: float | None = None
+
+    def __str__(self) -> str:
+        return f"{self.word} {self.share:.0%}".replace("%", "\N{NO-BREAK SPACE}%")
+
+
+@dataclass(frozen=True)
+class Tile:
+    """An environment on the wall: the slice that is shown, and which words fit which share of how many slices.
+
+    They are those of its `census`, with the command, the picture and the table of that, or of the gallery's own slices.
+    """
+
+    env: str
+    figure: str
+    page: str
+    labels: Sequence[str]
+    dim: int
+    engine: str
+    slices: int
+    census: bool
+    words: Sequence[WordShare]
+    picture: str = ""
+    table: str = ""
+    command: str = ""
+
+    def fitting(self, least: float = MIN_SHARE) -> list[str]:
+        """Return the words that fit such a share of the slices, or more."""
+        return [one.word for one in self.words if one.share >= least]
+
+    @property
+    def shape(self) -> list[WordShare]:
+        """How smooth it is: the words that fit most slices, the most frequent first, none that fits none."""
+        found = [one for one in self.words if one.word in SHAPES and one.share > 0]
+        return sorted(found, key=lambda one: -one.share)[:SHOWN_WORDS]
+
+    def __str__(self) -> str:
+        if not self.slices:
+            return "not measured yet"
+        said = ", ".join(map(str, self.shape)) or "none of the words"
+        return f"{said} of {self.slices} slice{'s' if self.slices > 1 else ''}{'' if self.census else ' here'}"
+
+    def share(self, word: str) -> WordShare | None:
+        """Return the share of a word, None where nothing is known of it."""
+        return next((one for one in self.words if one.word == word), None)
+
+
+def size_class(dim: int) -> str:
+    """Return the name of the class of a number of parameters, of `SIZES`."""
+    return "1-3" if dim <= 3 else "4-16" if dim <= 16 else "17-"
+
+
+def make_tiles(shown: Sequence[FigureEntry], data: Path, out: Path, studio: Studio) -> list[Tile]:
     """Copy the censuses of these figures' environments into the site, and return a tile for each environment."""
     groups = [(env, list(group)) for env, group in groupby(shown, key=lambda entry: entry.env)]
     return [_tile(env, group, data, out, studio) for env, group in groups]
@@ -34,53 +98,33 @@ def hang(shown: Sequence[FigureEntry], data: Path, out: Path, studio: Studio) ->
 
 def _tile(env: str, group: Sequence[FigureEntry], data: Path, out: Path, studio: Studio) -> Tile:
     best = next((one for one in group if len(one.labels) == 2), group[0])
-    about: dict[str, Any] = {
-        "env": env,
-        "figure": best.id,
-        "page": best.page,
-        "labels": best.labels,
-        "dim": dimension(best),
-        "engine": str(best.identity.get("engine", "")),
-    }
+    about = (env, best.id, best.page, best.labels, best.dim, str(best.identity.get("engine", "")))
     if found := _place_census(env, data, out, studio):
-        census, table, picture = found
+        census, files = found
         words = [WordShare(word, one.value, one.low, one.high) for word, one in census.words.items()]
-        about |= {"picture": picture, "table": table, "command": census.command}
-        return Tile(**about, slices=len(census.slices), census=True, words=words)
-    reported = [entry.report for entry in group if entry.report is not None]
-    said = [{one.word for one in report.words if one.measured} for report in reported]
+        paths = [path.relative_to(out).as_posix() for path in (files.picture, files.table)]
+        return Tile(*about, len(census.slices), True, words, *paths, census.command)
+    said = [set(entry.words) for entry in group if entry.report is not None]
     words = [WordShare(word, sum(word in one for one in said) / len(said)) for word in WORDS] if said else []
-    return Tile(**about, slices=len(said), census=False, words=words)
+    return Tile(*about, len(said), False, words)
 
 
-def dimension(entry: FigureEntry) -> int:
-    """Return how many parameters the environment of a slice has."""
-    named = entries().get(entry.env)
-    return int(named.dim) if named and named.dim.isdigit() else len(entry.identity.get("parameters", entry.dims))
-
-
-def _place_census(env: str, data: Path, out: Path, studio: Studio) -> tuple[Census, str, str] | None:
-    """Copy a census into the site with the table of its slices; return it with where they are, None where none is."""
+def _place_census(env: str, data: Path, out: Path, studio: Studio) -> tuple[Census, RecordFiles] | None:
+    """Copy a census into the site with the table of its slices; return it with where it is, None where none is."""
     for device in DEVICES:
-        record = data / CENSUSES / f"{env}-{device}.json"
-        picture = record.with_suffix(".png")
-        if not record.exists() or not picture.exists():
+        source, target = (RecordFiles.of_census(root, env, device) for root in (data, out))
+        if not source.there():
             continue
-        with reading(record, REMAKE.format(env, device)):
-            census = from_json(Census, read_json(record))
-            rows = list(_rows(census))
-        folder = out / CENSUSES
-        folder.mkdir(exist_ok=True)
-        for one in (record, picture):
-            shutil.copyfile(one, folder / one.name)
-        studio.develop(picture, folder / picture.name)
-        table = f"{env}-{device}.csv"
-        save_table(rows, folder / table)
-        return census, f"{CENSUSES}/{table}", f"{CENSUSES}/{picture.name}"
+        with reading(source.record, REMAKE_CENSUS.format(env, device)):
+            census = from_json(Census, read_json(source.record))
+            rows = list(_census_rows(census))
+        studio.place(source, target)
+        save_table(rows, target.table)
+        return census, target
     return None
 
 
-def _rows(census: Census) -> Iterator[Mapping[str, Any]]:
+def _census_rows(census: Census) -> Iterator[Mapping[str, Any]]:
     """Yield what is known of each slice of a census."""
     unit = f" [{census.loss_unit}]" if census.loss_unit else ""
     for one in census.slices:
@@ -95,12 +139,23 @@ def draw_wall(tiles: Sequence[Tile], data: Path, out: Path) -> None:
     """Draw the wall, and write its table."""
     from ...landscapes.draw.figures.wall import Landscape, wall_figure
 
-    hung = [Landscape(tile.env, tile.sentence(SHAPES), open_slice(data / tile.figure / STORE)) for tile in tiles]
+    hung = [Landscape(tile.env, str(tile), open_slice(data / tile.figure / STORE)) for tile in tiles]
     save_both(wall_figure(hung), out / WALL_PICTURE)
-    save_table([_row(tile, one) for tile in tiles for one in tile.words], out / WALL_TABLE)
+    rows = []
+    for tile in tiles:
+        source = "census" if tile.census else "gallery"
+        about = {"environment": tile.env, "parameters": tile.dim, "engine": tile.engine, "slices": tile.slices}
+        rows += [{**about, "source": source, **asdict(one)} for one in tile.words]
+    save_table(rows, out / WALL_TABLE)
 
 
-def _row(tile: Tile, one: WordShare) -> Mapping[str, Any]:
-    source = "census" if tile.census else "gallery"
-    about = {"environment": tile.env, "parameters": tile.dim, "engine": tile.engine, "slices": tile.slices}
-    return {**about, "source": source, "word": one.word, "share": one.share, "low": one.low, "high": one.high}
+def place_card(data: Path, out: Path, studio: Studio) -> Card | None:
+    """Copy the report card of the figures' data into the site, and return it; None where there is none."""
+    source, target = (RecordFiles(root / CARD / CARD_RECORD) for root in (data, out))
+    if not source.there():
+        return None
+    with reading(source.record, REMAKE_CARD.format(data / CARD)):
+        card = from_json(Card, read_json(source.record))
+    studio.place(source, target)
+    save_table([asdict(one) for one in card.grades], target.table)
+    return card

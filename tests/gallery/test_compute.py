@@ -9,15 +9,12 @@ import pytest
 
 from gradscape.cli import main
 from gradscape.envs.bounce import Bounce
-from gradscape.gallery import companions as gallery_companions
-from gradscape.gallery import episodes as gallery_episodes
 from gradscape.gallery import league as gallery_league
-from gradscape.gallery import measures as gallery_measures
 from gradscape.gallery import parts as gallery_parts
 from gradscape.gallery.compute import IF_NAMED, PARTS
 from gradscape.gallery.figures import Figure
 from gradscape.gallery.paper import PaperCaption
-from gradscape.gallery.runs import open_run, save_run
+from gradscape.gallery.records import open_run, save_run
 
 FIGURES = [
     Figure("ball", "bounce", (0, 1), PaperCaption("It jumps."), through="example:aim", resolution=8, fidelity="draft"),
@@ -30,15 +27,14 @@ FIGURES = [
 def small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     """Let all there is to make be little, and steps of time long."""
     monkeypatch.setattr("gradscape.gallery.figures.read_figures", lambda: list(FIGURES))
-    for name, value in (("FRAMES", 2), ("COARSE", 5), ("DPI", 40), ("METHODS", ("random", "cma-es")), ("BUDGET", 9)):
-        monkeypatch.setattr(gallery_parts, name, value)
-    monkeypatch.setattr(gallery_companions, "RESOLUTION", 4)
-    for name, value in (("HEIGHT", 60), ("LONGEST", 2)):
-        monkeypatch.setattr(gallery_episodes, name, value)
-    for name, value in (("REPORT_POINTS", 2), ("TRADEOFF_POINTS", 4), ("TURNED", ["precision"])):
-        monkeypatch.setattr(gallery_measures, name, value)
-    for name, value in (("METHODS", ("random", "descents")), ("BUDGET", 12), ("SEEDS", 3)):
-        monkeypatch.setattr(gallery_league, name, value)
+    for module, values in (
+        (gallery_parts, {"SWEEP_FRAMES": 2, "SWEEP_RESOLUTION": 5, "SWEEP_DPI": 40, "COMPANION_RESOLUTION": 4}),
+        (gallery_parts, {"EPISODE_HEIGHT": 60, "EPISODE_FRAMES": 2, "METHODS": ("random", "cma-es"), "BUDGET": 9}),
+        (gallery_parts, {"REPORT_POINTS": 2, "STUDY_POINTS": 4, "CHANGED": ("precision",)}),
+        (gallery_league, {"METHODS": ("random", "descents"), "BUDGET": 12, "SEEDS": 3}),
+    ):
+        for name, value in values.items():
+            monkeypatch.setattr(module, name, value)
     for name in ("REPETITION", "LARGEST"):
         monkeypatch.setattr(f"gradscape.studies.samples.{name}", 0.01)
     longer = {name: replace(one, dt=4 * one.dt) for name, one in Bounce.fidelities.items()}

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from gradscape.envs.adapters import from_numpy
-from gradscape.gallery.episodes import choose_nodes
+from gradscape.gallery.parts import choose_nodes
 from gradscape.gallery.records import Node
 from gradscape.landscapes.plane import Plane
 from gradscape.landscapes.sampling.fill import sample

@@ -13,9 +13,8 @@ from gradscape.envs.registry import make
 from gradscape.gallery import league as gallery_league
 from gradscape.gallery.compute import PARTS
 from gradscape.gallery.figures import Figure
-from gradscape.gallery.files import LeagueSliceFiles
-from gradscape.gallery.league import LeaguePart, read_league, read_standings
-from gradscape.gallery.league_runs import PLACES, KeptRun, KeptRuns
+from gradscape.gallery.files import LeagueFiles
+from gradscape.gallery.league import PLACES, KeptRun, KeptRuns, LeaguePart, read_league, read_standings
 from gradscape.jobs import scene
 from gradscape.jobs.race import RaceJob
 from gradscape.jobs.scene import point_of
@@ -39,7 +38,7 @@ FIGURES = [
 
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
-    for place in ("figures", "league_slices"):
+    for place in ("figures", "league"):
         monkeypatch.setattr(f"gradscape.gallery.{place}.read_figures", lambda: list(FIGURES))
     for name, value in (("METHODS", ("random", "descents")), ("BUDGET", 12), ("SEEDS", 3)):
         monkeypatch.setattr(gallery_league, name, value)
@@ -85,19 +84,17 @@ def test_its_races_are_those_of_the_verb_and_neither_repeats_the_other(
     with pytest.raises(SystemExit):
         main(
             [
-                *[
-                    "league",
-                    "branin",
-                    "--methods",
-                    "random,descents",
-                    "--budget",
-                    "12",
-                    "--seeds",
-                    "3",
-                    "--device",
-                    "cpu",
-                    "--json",
-                ]
+                "league",
+                "branin",
+                "--methods",
+                "random,descents",
+                "--budget",
+                "12",
+                "--seeds",
+                "3",
+                "--device",
+                "cpu",
+                "--json",
             ]
         )
     theirs = json.loads(capsys.readouterr().out)["scenes"][0]
@@ -163,7 +160,7 @@ def test_a_run_without_success_has_no_improvement(race: Race, tmp_path: Path) ->
     failed = KeptRun.of(type(run)(run.data.assign(loss=run.data["loss"] * np.nan)), race.budget)
     assert (len(failed.loss), failed.episodes) == (0, 20)
     assert np.isnan(failed.best).all()
-    KeptRuns([failed], {"random": KeptRuns.of(race).medians["random"]}).write(tmp_path / "one.npz")
+    KeptRuns([failed], {"random": KeptRuns.of(race).packed["random"]}).write(tmp_path / "one.npz")
     assert len(KeptRuns.read(tmp_path / "one.npz").runs[0].loss) == 0
 
 
@@ -223,11 +220,11 @@ def test_median_runs_are_laid_over_the_slice_through_the_best_point(
     assert compute(small, "--only", "branin") == 0
     capsys.readouterr()
     assert "league-slices: 1 of 3 are there already" in slices()
-    standings, files = read_standings(small / "league/branin.json"), LeagueSliceFiles.of(small, "branin")
-    assert {path.name for path in files.folder.iterdir()} == {
+    standings, files = read_standings(small / "league/branin.json"), LeagueFiles.of(small, "branin").slice
+    assert {path.name for path in files.record.parent.iterdir()} == {
         "slice.zarr", "medians.json", "medians.png", "medians-dark.png"
     }  # fmt: skip
-    dataset = open_slice(files.folder / "slice.zarr")
+    dataset = open_slice(files.record.parent / "slice.zarr")
     assert standings.best is not None
     plane, best = plane_of(dataset), torch.tensor(standings.best.x, dtype=torch.float64)
     assert float(plane.distance(best[None])) < 1e-9

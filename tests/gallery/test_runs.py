@@ -5,7 +5,7 @@ from pathlib import Path
 import xarray as xr
 
 from gradscape.envs.adapters import from_numpy
-from gradscape.gallery.runs import open_run, save_run
+from gradscape.gallery.records import open_run, save_run
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.optim.search import search
 

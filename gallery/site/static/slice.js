@@ -3,7 +3,7 @@
 
 // Arrays are packed as base64 so that a page needs no request, and are decoded here, once.
 function unpacked(text, Kind) {
-  if (text === undefined) return null;
+  if (text === undefined || text === null) return null;
   const bytes = atob(text);
   const held = new Uint8Array(bytes.length);
   for (let at = 0; at < bytes.length; at++) held[at] = bytes.charCodeAt(at);

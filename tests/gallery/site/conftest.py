@@ -12,9 +12,9 @@ import torch
 
 from gradscape.envs.records import Fidelity
 from gradscape.gallery.figures import Figure
-from gradscape.gallery.files import DATA, RUN_SUFFIX, RUNS, LeagueFiles, LeagueSliceFiles
+from gradscape.gallery.files import DATA, RUN_SUFFIX, RUNS, LeagueFiles
 from gradscape.gallery.paper import PaperCaption
-from gradscape.gallery.runs import save_run
+from gradscape.gallery.records import save_run
 from gradscape.gallery.site.build import build_site
 from gradscape.jobs.report import PaperWords, Report
 from gradscape.landscapes.convert import to_json
@@ -185,9 +185,9 @@ def league(folder: Path) -> None:
         write_record(files.record, to_json(scene_standings(env, left_out)))
         picture(files.picture)
         picture(files.dark)
-    sliced = LeagueSliceFiles.of(folder, "fluid")
-    keep(FIGURES[1], sliced.folder.parent)
-    (sliced.folder.parent / FIGURES[1].id).rename(sliced.folder)
+    sliced = LeagueFiles.of(folder, "fluid").slice
+    keep(FIGURES[1], folder / "league")
+    (folder / "league" / FIGURES[1].id).rename(sliced.record.parent)
     picture(sliced.picture)
     picture(sliced.dark)
     write_record(sliced.record, {"key": {}, "command": "landscape slice fluid --dims 0 1 --through best"})

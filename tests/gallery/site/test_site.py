@@ -12,7 +12,7 @@ import pytest
 
 from gradscape.gallery.league import read_standings
 from gradscape.gallery.paper import read_paper
-from gradscape.gallery.runs import open_run
+from gradscape.gallery.records import open_run
 from gradscape.gallery.site.build import HERE, build_site
 from gradscape.landscapes.identity import stored_identity
 from gradscape.landscapes.storage.store import open_slice
@@ -68,7 +68,7 @@ def test_no_file_of_the_site_names_an_address(site: Path) -> None:
 
 def test_the_manifest_lists_everything_of_a_page(site: Path, data: Path) -> None:
     manifest = json.loads((site / "manifest.json").read_text())
-    assert manifest["schema"] == 2
+    assert manifest["schema"] == 3
     assert manifest["missing"] == ["later"]
     assert [entry["id"] for entry in manifest["figures"]] == [figure.id for figure in FIGURES]
     for entry in manifest["figures"]:
@@ -91,15 +91,17 @@ def test_the_manifest_lists_everything_of_a_page(site: Path, data: Path) -> None
 
 
 def test_a_page_shows_what_each_part_of_the_model_is_for(site: Path) -> None:
-    bare, full = json.loads((site / "manifest.json").read_text())["figures"][1:]
-    assert bare["models"] == []
-    (study,) = full["models"]
-    assert (study["device"], study["fidelity"], study["file"]) == ("cuda", "draft", "studies/fluid-cuda.model.json")
-    assert [(row["name"], row["missing"]) for row in study["parts"]] == [("drag", False), ("wall", True)]
-    drag = study["parts"][0]
-    assert drag["error"]["value"] == pytest.approx(1 / study["spread"])
-    assert drag["verdict"] == "changes losses, not their order; saves time"
-    assert study["refused"] == [{"name": "tank", "why": "fluid needs its tank"}]
+    manifest = json.loads((site / "manifest.json").read_text())
+    assert manifest["studies"]["bounce"] == []
+    (study,) = (one for one in manifest["studies"]["fluid"] if one["kind"] == "model")
+    found = study["found"]
+    assert (study["device"], found["fidelity"], study["file"]) == ("cuda", "draft", "studies/fluid-cuda.model.json")
+    assert [(row["name"], row["missing"]) for row in found["parts"]] == [("drag", False), ("wall", True)]
+    drag = found["parts"][0]
+    assert drag["comparison"]["loss_error"]["p95_relative"]["value"] == pytest.approx(1 / found["spread"])
+    assert (drag["effect"], drag["price"]) == ("changes losses, not their order", "saves time")
+    assert found["refused"] == [{"name": "tank", "why": "fluid needs its tank"}]
+    full = manifest["figures"][-1]
     page = (site / full["page"]).read_text()
     assert all(said in page for said in ("What each part of the model is for", "wall (missing)", "no drag"))
 
@@ -168,8 +170,9 @@ def test_without_races_there_is_no_league(data: Path, tmp_path: Path) -> None:
 
 
 def test_words_are_beside_the_papers_and_a_trade_off_is_ranked(site: Path) -> None:
-    bare, full = json.loads((site / "manifest.json").read_text())["figures"][1:]
-    assert (bare["report"], bare["fidelities"]) == (None, [])
+    manifest = json.loads((site / "manifest.json").read_text())
+    bare, full = manifest["figures"][1:]
+    assert (bare["report"], manifest["studies"]["bounce"]) == (None, [])
     agreed = {one["word"]: (one["measured"], one["agree"]) for one in full["report"]["words"]}
     assert agreed == {
         "rugged": (True, True), "gradients good": (False, False), "gradients noisy": (True, None)
@@ -179,18 +182,21 @@ def test_words_are_beside_the_papers_and_a_trade_off_is_ranked(site: Path) -> No
         "mean cosine of gradient and difference −0.50 over 0.04 of the box; "
         "smoothed over 1% of it, first order is biased at 9 of 36"
     )
-    trade, another = full["fidelities"]
+    trade, another = (one for one in manifest["studies"]["fluid"] if one["kind"] == "fidelity")
     assert (trade["device"], another["device"]) == ("cuda", "cpu")
     files = {path.name for path in (site / "studies").iterdir()}
     studies = ("fluid-cuda.fidelity", "fluid-cpu.fidelity", "fluid-cuda.model", "fluid-cuda.convergence")
     assert files == {f"{study}{kind}" for study in studies for kind in (".json", ".csv", ".png", "-dark.png")}
     said = "the reference is not converged: refining its dt moves it by 4 % where standard is off by 10 %"
-    assert trade["convergence"]["says"][0].startswith(said)
-    assert said in " ".join((site / "full/index.html").read_text().split())
-    assert another["convergence"] is None
-    assert [(row["name"], row["front"]) for row in trade["variants"]] == [
-        ("coarse", False), ("draft", True), ("standard", True), ("slow", False), ("reference", False)
-    ]  # fmt: skip
+    (convergence,) = (one for one in manifest["studies"]["fluid"] if one["kind"] == "convergence")
+    assert convergence["says"][0].startswith(said)
+    assert convergence["device"] == "cuda"
+    full_page = (site / "full/index.html").read_text()
+    assert said in " ".join(full_page.split())
+    assert trade["front"] == ["draft", "standard"]
+    assert re.findall(r'<tr><th scope="row">(?:coarse|draft|standard|slow|reference)[^<]*', full_page)[:5] == [
+        f'<tr><th scope="row">{name}' for name in ("coarse", "draft ★", "standard ★", "slow", "reference")
+    ]
     assert trade["alt"] == (
         "Loss error of 5 ways to simulate fluid over the time of an episode: draft takes 4 ms and is off by 9 %; "
         "standard takes 40 ms and is off by 3 %; the quickest within 5% is standard with 40 ms; "
@@ -214,7 +220,7 @@ def test_a_search_lies_where_its_parameters_say(site: Path, data: Path) -> None:
 
 
 def test_a_search_of_other_options_is_not_laid_over_a_slice(data: Path) -> None:
-    from gradscape.gallery.site.trajectories import lay_runs, read_runs
+    from gradscape.gallery.site.page_data import lay_runs, read_runs
 
     tables, dataset = read_runs(data), open_slice(data / "full/slice.zarr")
     assert len(tables) == 4
