@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..envs.batching import cores
-from ..jobs.league import Fixture, LeagueJob
+from ..jobs.league import LeagueJob, LeagueScene
 from ..jobs.scene import SceneSpec
 from ..jobs.watch import Watch
 from ..landscapes.convert import from_json, to_json
@@ -43,7 +43,7 @@ class LeaguePart(FigurePart):
     def label(self) -> str:
         """Return the command that runs it elsewhere."""
         how = f"--methods {','.join(METHODS)} --budget {BUDGET} --seeds {SEEDS} --device {self.device}"
-        return f"landscape league {Fixture.of(self._own_scene, self.root)} {how}"
+        return f"landscape league {LeagueScene.of(self._own_scene, self.root)} {how}"
 
     def count_left(self) -> int:
         """Return 1 where no race of these methods, seeds and episodes at this fidelity is kept."""
@@ -52,15 +52,15 @@ class LeaguePart(FigurePart):
             return 1
         known = {*kept.methods, *kept.left_out}
         whole = known >= set(METHODS) and kept.budget >= BUDGET and kept.seeds >= SEEDS
-        return int(not whole or kept.fidelity != self._fixture.fidelity)
+        return int(not whole or kept.fidelity != self._raced.fidelity)
 
     def seconds_each(self) -> float:
         """Estimate what is left of the race to simulate; what methods take themselves comes on top."""
-        return self._job.forecast(self._fixture, Watch())
+        return self._job.forecast(self._raced, Watch())
 
     def make(self, watch: Watch) -> str:
         """Race, or go on with it, and keep what is needed of it."""
-        race, left_out = self._job.run_race(self._fixture, watch)
+        race, left_out = self._job.run_race(self._raced, watch)
         found = SceneStandings.of(race, left_out=left_out, command=self.label())
         files = self._files
         make_folder(files.record.parent)
@@ -77,13 +77,15 @@ class LeaguePart(FigurePart):
         return LeagueFiles.of(self.root, self.figure.env)
 
     @property
-    def _fixture(self) -> Fixture:
-        return self._job.fixtures[0]
+    def _raced(self) -> LeagueScene:
+        return self._job.scenes[0]
 
     @property
     def _job(self) -> LeagueJob:
-        how = {"budget": BUDGET, "seeds": SEEDS, "command": self.label()}
-        return LeagueJob.of([self._own_scene], METHODS, **how, workers=cores(), executor=self.executor)  # type: ignore[arg-type] # each of its kind
+        return LeagueJob.of(
+            [self._own_scene], METHODS, budget=BUDGET, seeds=SEEDS, command=self.label(), workers=cores(),
+            executor=self.executor,
+        )  # fmt: skip
 
     @property
     def _own_scene(self) -> SceneSpec:

@@ -25,7 +25,6 @@ from ..landscapes.storage.records import reading
 from ..optim.base import Kind
 from ..optim.curves import best_so_far
 from ..optim.race import Race
-from ..optim.runs.arrays import FORWARD_EQUIVALENTS
 from ..optim.runs.run import Run
 from .files import REMAKE
 
@@ -56,7 +55,7 @@ class KeptRun:
         loss, x = data["loss"].to_numpy(), data["x"].to_numpy()
         best = best_so_far(loss)
         rows = lowered(best)
-        spent = data[FORWARD_EQUIVALENTS].to_numpy()
+        spent = data["forwards"].to_numpy()
         last = x[rows[-1]] if len(rows) else np.full(x.shape[1], np.nan)
         return cls(run.method, run.seed, rows + 1, spent[rows], loss[rows], len(loss), float(spent[-1]), last)
 

@@ -247,7 +247,7 @@ class SearchPart(FigurePart):
         from .runs import save_run
 
         job = RaceJob.of(self.scene().make(), METHODS, budget=BUDGET, seeds=1, command=self.label(), watch=watch)
-        runs = replace(job, executor=self.executor).run(watch).race.runs
+        runs = replace(job, executor=self.executor).run(watch).runs
         for method in self._missing():
             save_run(runs[method][0].data, self._file(method))
         return f"{len(METHODS)} runs of {BUDGET} episodes"

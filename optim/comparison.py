@@ -26,6 +26,8 @@ class Difference:
     low: float
     high: float
 
+    derived = ("better",)
+
     @property
     def better(self) -> str | None:
         """The method whose lead the interval leaves no doubt about, None where it includes zero or there is none."""
@@ -50,6 +52,8 @@ class Superiority:
     probability: float
     p: float
     corrected: float
+
+    derived = ("better",)
 
     @property
     def better(self) -> str | None:

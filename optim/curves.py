@@ -13,9 +13,8 @@ import numpy as np
 import xarray as xr
 
 from .bootstrap import Array, interval
-from .runs.arrays import FORWARD_EQUIVALENTS
 
-COSTS = ("episodes", FORWARD_EQUIVALENTS, "seconds")
+COSTS = ("episodes", "forwards", "seconds")
 
 Tables = Mapping[str, Sequence[xr.Dataset]]  # method -> one run's table per seed, all of the same length
 

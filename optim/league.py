@@ -108,7 +108,7 @@ class SceneStandings:
         """Return what a race says."""
         identity = {name: value for name, value in race.identity.items() if name not in OF_METHOD}
         figures, some = race.statistics, race.statistics.targets.some
-        times = {method: times_record(one[some]) for method, one in figures.times.items()}
+        times = {method: times_record(one[some]) for method, one in figures.running_times.items()}
         return cls(
             env=str(identity["objective"]),
             fidelity=str(identity["fidelity"]),

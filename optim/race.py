@@ -146,7 +146,7 @@ class Race:
                 f"best loss, high{unit}": rank.high,
                 "seeds without success": rank.unsuccessful,
                 "failed episodes": rank.failed,
-                "forward equivalents": rank.forward_equivalents,
+                "forward equivalents": rank.forwards,
                 "seconds [s]": rank.seconds,
             }
             for rank in self.statistics.ranks
@@ -186,7 +186,7 @@ class Race:
 
         figures = self.statistics
         index = pd.Index(figures.targets.loss, name=f"loss [{self.loss_unit}]" if self.loss_unit else "loss")
-        return pd.DataFrame(figures.times, index=index)
+        return pd.DataFrame(figures.running_times, index=index)
 
     def plot(self, *, width: float | None = None) -> Picture:
         """Draw best losses against episodes, and the share of targets reached.

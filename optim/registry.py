@@ -10,6 +10,7 @@ The class derives from `gradscape.optim.base.Optimizer`, and its `name` is that 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import cache
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from .base import Optimizer
 
 GROUP = "gradscape.optimizers"
+ALL = "all"  # methods that can search an environment here
 
 
 @dataclass(frozen=True)
@@ -85,6 +87,12 @@ def find_method(name: str) -> Method:
         hint = f"; did you mean {close[0]}?" if close else ";"
         raise ValueError(f"no method is called {name!r}{hint} there are {', '.join(known)}")
     return known[name]
+
+
+def check_methods(names: Sequence[str]) -> list[str]:
+    """Return methods without repetitions, none for `all`. Raises ValueError where one is not registered."""
+    found = [find_method(name).name for name in dict.fromkeys(names) if name != ALL]
+    return [] if ALL in names else found
 
 
 def optimizer_class(name: str) -> type[Optimizer]:

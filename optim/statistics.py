@@ -6,8 +6,7 @@ Everything is over the seeds of a method.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 import xarray as xr
@@ -16,8 +15,7 @@ from numpy.typing import NDArray
 from .bootstrap import Array, interval
 from .comparison import Difference, Superiority, differences, superiorities
 from .curves import COSTS, Curve, Tables, curve, final_losses
-from .runs.arrays import FORWARD_EQUIVALENTS, stored_record
-from .targets import Shares, Targets, hits, running_times, targets, times_record
+from .targets import Shares, Targets, hits, running_times, targets
 
 
 @dataclass(frozen=True)
@@ -25,7 +23,8 @@ class Rank:
     """How a method came off in the end: ranks are 1 for the best, ties share theirs; NaN where there is none.
 
     `wins` counts the seeds in which no method was better; `unsuccessful` those without one successful episode; `failed`
-    the episodes that failed; `forward_equivalents` and `seconds` are the mean cost of a run.
+    the episodes that failed; `forwards` (forward equivalents) and
+    `seconds` are the mean cost of a run.
     """
 
     method: str
@@ -39,7 +38,7 @@ class Rank:
     high: float
     unsuccessful: int
     failed: int
-    forward_equivalents: float
+    forwards: float
     seconds: float
 
 
@@ -47,7 +46,7 @@ class Rank:
 class RaceStatistics:
     """All figures of a race: ranks, the best first, how every two methods compare, targets, and by method curves.
 
-    `ecdf` is the share of pairs of target and seed reached, `times` the expected running time for each target
+    `ecdf` is the share of pairs of target and seed reached, `running_times` the expected running time for each target
     [episodes], `curves` the mean best loss against each of `COSTS`.
     """
 
@@ -56,7 +55,7 @@ class RaceStatistics:
     superiorities: list[Superiority]
     targets: Targets
     ecdf: dict[str, Shares]
-    times: dict[str, Array]
+    running_times: dict[str, Array]
     curves: dict[str, dict[str, Curve]]
 
     @classmethod
@@ -69,26 +68,9 @@ class RaceStatistics:
             superiorities=superiorities(tables),
             targets=goals,
             ecdf={method: Shares.of(hits(runs, goals)) for method, runs in tables.items()},
-            times={method: running_times(runs, goals) for method, runs in tables.items()},
+            running_times={method: running_times(runs, goals) for method, runs in tables.items()},
             curves={cost: {method: curve(runs, cost) for method, runs in tables.items()} for cost in COSTS},
         )
-
-    def record(self) -> dict[str, Any]:
-        """Return the figures as JSON has them."""
-        pairs = zip(self.differences, self.superiorities, strict=True)
-        return {
-            "ranks": [stored_record(rank) for rank in self.ranks],
-            "differences": [asdict(one) | {"better": one.better} | _chance(chance) for one, chance in pairs],
-            "targets": asdict(self.targets) | {"loss": self.targets.loss.tolist()},
-            "running_times": {method: times_record(times) for method, times in self.times.items()},
-            "ecdf": {method: asdict(shares) for method, shares in self.ecdf.items()},
-            "curves": {
-                cost: {
-                    method: {key: values.tolist() for key, values in asdict(one).items()} for method, one in by.items()
-                }
-                for cost, by in self.curves.items()
-            },
-        }
 
 
 def ranks(tables: Tables) -> list[Rank]:
@@ -119,11 +101,6 @@ def _rank(method: str, runs: Sequence[xr.Dataset], places: Array, won: NDArray[n
         high=float(high),
         unsuccessful=int(np.isnan(final).sum()),
         failed=sum(int(np.isnan(run["loss"]).sum()) for run in runs),
-        forward_equivalents=float(np.mean([run[FORWARD_EQUIVALENTS][-1] for run in runs])),
+        forwards=float(np.mean([run["forwards"][-1] for run in runs])),
         seconds=float(np.mean([run["seconds"][-1] for run in runs])),
     )
-
-
-def _chance(one: Superiority) -> dict[str, Any]:
-    """Return what a pair's row says of who wins how often, beside the difference of its means."""
-    return {"probability": one.probability, "p": one.p, "corrected_p": one.corrected, "ahead": one.better}

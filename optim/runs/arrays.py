@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import zarr
@@ -21,12 +20,8 @@ from ...landscapes.storage.ownership import store_files
 from ..base import Kind
 from .journal import CHUNK, STATE, damage_error
 
-if TYPE_CHECKING:
-    from _typeshed import DataclassInstance
-
 FORMAT = 2
 DEEP = ("x", "grad")
-FORWARD_EQUIVALENTS = "forwards"  # what files have called it since the first run: a column, and a key of summaries
 COLUMNS: dict[str, tuple[str, dict[str, Any]]] = {  # status last: a row that has one is whole
     "x": ("float64", {"long_name": "parameters, each in its own unit"}),
     "loss": ("float64", {"long_name": "loss"}),
@@ -34,7 +29,7 @@ COLUMNS: dict[str, tuple[str, dict[str, Any]]] = {  # status last: a row that ha
     "slope": ("float64", {"long_name": "length of the gradient"}),
     "kind": ("int8", {"long_name": "what the point was evaluated for", **flags(Kind)}),
     "episodes": ("int64", {"long_name": "episodes so far"}),
-    FORWARD_EQUIVALENTS: ("float64", {"long_name": "episodes so far, in episodes without gradient"}),
+    "forwards": ("float64", {"long_name": "episodes so far, in episodes without gradient"}),
     "seconds": ("float64", {"long_name": "time so far", "units": "s"}),
     "status": ("int8", {"long_name": "how the evaluation ended", **flags(Status)}),
 }
@@ -65,12 +60,6 @@ def read_rows(path: Path, group: zarr.Group, name: str, rows: int, dim: int) -> 
         return np.asarray(array[:rows])
     except Exception as error:  # whatever a missing array, a damaged layout or a codec raises
         raise damage_error(path / name, f"it cannot be read ({' '.join(str(error).split())})") from None
-
-
-def stored_record(record: DataclassInstance) -> dict[str, Any]:
-    """Return a record as files have it, in which forward equivalents go by the name they have there."""
-    names = {"forward_equivalents": FORWARD_EQUIVALENTS}
-    return {names.get(key, key): value for key, value in asdict(record).items()}
 
 
 def plain_attributes(attributes: Mapping[str, Any]) -> dict[str, Any]:

@@ -42,7 +42,6 @@ from .arrays import (
     COLUMNS,
     FILES,
     FORMAT,
-    FORWARD_EQUIVALENTS,
     Columns,
     attributes_of,
     dims_of,
@@ -312,7 +311,7 @@ class RunStore:
             "slope": grad.norm(dim=1).numpy(),
             "kind": int(kind),
             "episodes": self.count + number,
-            FORWARD_EQUIVALENTS: self._last(FORWARD_EQUIVALENTS) + cost * number,
+            "forwards": self._last("forwards") + cost * number,
             "seconds": self._last("seconds") + seconds,
             "status": evaluation.status.numpy(),
         }

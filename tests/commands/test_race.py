@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from gradscape.landscapes.storage.records import read_json
 from gradscape.optim.registry import methods
 from gradscape.optim.runs.store import RunStore
 
@@ -22,7 +23,7 @@ RACE = ["race", "branin", "--methods", "random,cma-es", "--methods", "descents",
 def test_race_leaves_runs_picture_and_figures(run: Callable[..., Said], tmp_path: Path) -> None:
     done = run(*RACE, "--json", "--out", "r", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    said, kept = json.loads(done.stdout), json.loads((tmp_path / "r/race.json").read_text())
+    said, kept = json.loads(done.stdout), read_json(tmp_path / "r/race.json")
     assert said == {key: kept[key] for key in kept if key not in ("curves", "ecdf")} | {"folder": "r"}
     assert kept["methods"] == ["random", "cma-es", "descents"]
     assert "360 episodes to compute" in done.stderr

@@ -57,7 +57,7 @@ def compute(data: Path, *arguments: str) -> int:
 def race(tmp_path_factory: pytest.TempPathFactory) -> Race:
     env = make("branin", device="cpu")
     out = tmp_path_factory.mktemp("race")
-    return RaceJob.of(env, ("random", "cma-es"), budget=20, seeds=3, command="landscape race", out=out).run().race
+    return RaceJob.of(env, ("random", "cma-es"), budget=20, seeds=3, command="landscape race", out=out).run()
 
 
 def test_a_scene_is_raced_once_for_all_its_figures_and_kept(small: Path, capsys: pytest.CaptureFixture[str]) -> None:
