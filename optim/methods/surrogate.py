@@ -18,8 +18,10 @@ them; RBFKernelGrad for bo-gradient) took, over three seeds of 100 episodes at d
 | | bo-leap | 0.8, 0.7 | 0.9 | 0.00014, 0.00014 |
 | rope (30) | bo | 26.0, 120 | 4.6 | 10.3, 10.4 |
 
-bo-leap asks a process once or twice in 100 episodes. On rope, bo-gradient with BoTorch's model had not ended after 20
-minutes. One model for all seeds could save two thirds at most, which leaves bo and bo-gradient 1.6 to 3.4 times slower.
+bo-leap asks a process once or twice in 100 episodes. The comparison of bo-gradient on rope had not ended after 20
+minutes; which half of it was running then is not known. One model for all seeds could save two thirds at most, which
+leaves bo and bo-gradient 1.6 to 3.4 times slower. That BoTorch's models find no more is what three seeds show, without
+a test.
 """
 
 from __future__ import annotations
