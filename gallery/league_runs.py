@@ -23,9 +23,9 @@ from ..landscapes.storage.files import replacing
 from ..landscapes.storage.layout import flags
 from ..landscapes.storage.records import reading
 from ..optim.base import Kind
-from ..optim.curves import best_so_far
 from ..optim.race import Race
 from ..optim.runs.run import Run
+from ..optim.statistics import best_so_far
 from .files import REMAKE
 
 PLACES = 65_535  # of a parameter in its box, less one

@@ -13,10 +13,8 @@ import xarray as xr
 
 from ..landscapes.identity import current_identity
 from ..landscapes.plain import finite
-from .bootstrap import interval
 from .claims import ClaimFinding, Claims, check_claims
-from .comparison import Superiority
-from .targets import times_record
+from .statistics import Superiority, interval, times_record
 
 OF_METHOD = ("method", "method_options", "method_version", "seed")  # of a run's identity, what is not of its scene
 

@@ -17,13 +17,11 @@ import xarray as xr
 from ..landscapes.cost import episode_cost
 from ..landscapes.objective import Objective
 from .base import Optimizer
-from .curves import Tables, final_losses
 from .lockstep import Lockstep
 from .runs.run import Run
 from .runs.store import RunStore
 from .search import SearchProgress, fill
-from .statistics import RaceStatistics
-from .targets import hits
+from .statistics import RaceStatistics, Tables, final_losses, hits
 
 if TYPE_CHECKING:
     import pandas as pd

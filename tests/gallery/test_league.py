@@ -25,10 +25,10 @@ from gradscape.landscapes.identity import DamagedError, plane_of, stored_identit
 from gradscape.landscapes.overlay import IMPROVEMENTS_OF, best_point, lowered
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.landscapes.storage.store import open_slice
-from gradscape.optim.curves import best_so_far
 from gradscape.optim.race import Race
 from gradscape.optim.runs.run import Run
 from gradscape.optim.search import search
+from gradscape.optim.statistics import best_so_far
 
 FIGURES = [
     Figure("branin", "branin", (0, 1), resolution=8, fidelity="exact", over=""),
