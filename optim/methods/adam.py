@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import torch
@@ -59,19 +59,17 @@ class AdamDescent(Descending):
     def state(self) -> dict[str, Any]:
         """Return where the descent stands, as data."""
         moments = {name: value.numpy() for name, value in self._adam.state[self._z].items()}
-        numbers = {"best": self.best, "done": self.done, "evaluated": self._evaluated, "stalled": self._stalled}
-        return {"at": self.at, "moments": moments, **numbers}
+        kept = {name: value for name, value in super().state().items() if name not in ("_z", "_adam")}
+        return kept | {"moments": moments}
 
-    @classmethod
-    def from_state(cls, state: Mapping[str, Any], options: AdamOptions) -> Self:
-        """Return the descent that had this state."""
-        descent = cls(state["at"], options)
-        moments = {name: torch.from_numpy(np.array(value)) for name, value in state["moments"].items()}
-        if moments:
-            descent._adam.state[descent._z] = moments
-        descent.best, descent.done = float(state["best"]), bool(state["done"])
-        descent._evaluated, descent._stalled = int(state["evaluated"]), int(state["stalled"])
-        return descent
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Take back what `state` returned."""
+        super().restore({name: value for name, value in state.items() if name != "moments"})
+        self._z.copy_(torch.from_numpy(self.at))
+        if state["moments"]:
+            self._adam.state[self._z] = {
+                name: torch.from_numpy(np.array(value)) for name, value in state["moments"].items()
+            }
 
 
 class Adam(Descents):

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
+import numpy as np
 import torch
 
 from ..base import Kind, Optimizer, Points, Proposal
@@ -46,12 +47,6 @@ class BO(Optimizer):
     def _inform(self, z: Points, loss: Points, grad: Points | None) -> None:
         self.surrogate.add(z, loss)
 
-    def _state(self) -> dict[str, Any]:
-        return {"surrogate": self.surrogate.state()}
-
-    def _restore(self, own: Mapping[str, Any]) -> None:
-        self.surrogate.restore(own["surrogate"])
-
 
 @dataclass(frozen=True)
 class BODescentsOptions(SurrogateOptions, DescentOptions):
@@ -77,29 +72,19 @@ class BODescents(Optimizer):
 
     def _setup(self) -> None:
         self.surrogate = Surrogate(self.space.dim, self.options)
-        self.descent: Descent | None = None
+        self.descent = Descent(np.zeros(self.space.dim), self.options, done=True)
 
     def _ask(self) -> Asking[Proposal]:
         kind = Kind.DESCENT
-        if self.descent is None:
+        if self.descent.done:
             kind = Kind.ACQUISITION if self.surrogate.informed else Kind.RANDOM
             self.descent = Descent((yield from self.surrogate.minimise(self.random)), self.options)
         return Proposal(torch.from_numpy(self.descent.at[None]), kind, grad=True)
 
     def _tell(self, z: Points, loss: Points, grad: Points | None) -> None:
-        assert self.descent is not None  # as asked
-        assert grad is not None
+        assert grad is not None  # as asked
         self.surrogate.add(z, loss)
         self.descent.tell(float(loss[0]), grad[0])
-        if self.descent.done:
-            self.descent = None
 
     def _inform(self, z: Points, loss: Points, grad: Points | None) -> None:
         self.surrogate.add(z, loss)
-
-    def _state(self) -> dict[str, Any]:
-        return {"surrogate": self.surrogate.state(), "descent": self.descent and self.descent.state()}
-
-    def _restore(self, own: Mapping[str, Any]) -> None:
-        self.surrogate.restore(own["surrogate"])
-        self.descent = own["descent"] and Descent.from_state(own["descent"], self.options)

@@ -98,15 +98,6 @@ class SlopeSurrogate(Surrogate):
         self.add(z, loss)
         self.grad = np.concatenate([self.grad, grad])
 
-    def state(self) -> dict[str, Any]:
-        """Return what the process knows, as data."""
-        return super().state() | {"grad": self.grad}
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        """Take back what `state` returned."""
-        super().restore(state)
-        self.grad = state["grad"].reshape(self.z.shape)
-
     def _to_fit(self) -> GradientProcess:
         chosen = select(self.loss, max(LEAST, FIT_ROWS // (1 + self.z.shape[1])))
         rows = torch.from_numpy(standardised(self.loss, self.grad)[chosen])

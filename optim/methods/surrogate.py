@@ -26,7 +26,6 @@ a test.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, get_args, get_type_hints
 
@@ -40,7 +39,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..base import Points
+from ..base import Part, Points
 from ..lockstep import Asking, compute_drawing
 from ..memory import FLOAT, SearchSize
 from ..options import MANY, MethodOptions, number
@@ -81,7 +80,7 @@ class SurrogateOptions(MethodOptions):
             raise ValueError(f"{self.method} option kernel takes {' or '.join(known)}; got {self.kernel}")
 
 
-class Surrogate:
+class Surrogate(Part):
     """Model losses over the box scaled to [-1, 1] by an exact Gaussian process, float64, whose mean is zero.
 
     Losses are standardised before, so that zero is their average and one their spread: a raw zero mean would promise
@@ -109,17 +108,6 @@ class Surrogate:
         """Take in points, shape (count, dim), and their losses, shape (count,), +inf where an episode failed."""
         self.z = np.concatenate([self.z, z])
         self.loss = np.concatenate([self.loss, loss])
-
-    def state(self) -> dict[str, Any]:
-        """Return what the process knows, as data."""
-        learnt = {"fitted": self._fitted, "hyper": self._hyper, "chosen": self._chosen, "seen": self._seen}
-        return {"z": self.z, "loss": self.loss, **learnt}
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        """Take back what `state` returned."""
-        self.z, self.loss = state["z"].reshape(-1, self.z.shape[1]), state["loss"]
-        self._fitted, self._hyper = int(state["fitted"]), dict(state["hyper"])
-        self._chosen, self._seen = state["chosen"], int(state["seen"])
 
     def minimise(self, random: np.random.Generator) -> Asking[Points]:
         """Return where mean - coefficient * standard deviation is least, shape (dim,); a random point before."""

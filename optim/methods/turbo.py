@@ -109,13 +109,6 @@ class TuRBO(Optimizer):
         if self.length < self.options.shortest:
             self._begin()
 
-    def _state(self) -> dict[str, Any]:
-        return super()._state() | {"surrogate": self.surrogate.state()}
-
-    def _restore(self, own: Mapping[str, Any]) -> None:
-        super()._restore({name: value for name, value in own.items() if name != "surrogate"})
-        self.surrogate.restore(own["surrogate"])
-
 
 MODELLED = SurrogateOptions(kernel="matern", initial=1)
 
