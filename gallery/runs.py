@@ -14,7 +14,7 @@ from zarr.storage import ZipStore
 from ..landscapes.storage.files import replacing
 from ..landscapes.storage.layout import COMPACT_CODECS
 from ..landscapes.storage.records import reading
-from ..optim.runs.arrays import COLUMNS
+from ..optim.runs.store import COLUMNS
 from .files import REMAKE
 
 

@@ -20,7 +20,7 @@ from ..optim.league import League, SceneStandings
 from ..optim.memory import require_runs, run_need
 from ..optim.registry import check_methods, optimizer_class
 from ..optim.registry import methods as all_methods
-from ..optim.runs.journal import Journal
+from ..optim.runs.store import Journal
 from .folder import LEAGUE, RUN_STORE, folder_named
 from .job import Job
 from .race import RaceJob, lockstep_seconds, refuse_other_folder

@@ -25,6 +25,9 @@ Points = NDArray[np.float64]
 COMMON = {"space", "seed", "options", "random", "worst", "objective", "_told_any"}  # attributes of every optimiser
 
 
+LARGE = 1e100  # a loss: the squares of a billion of them still have a sum
+
+
 class Kind(IntEnum):
     """Say what a point was evaluated for."""
 
@@ -143,7 +146,7 @@ class Optimizer(abc.ABC):
 
     @final
     def state(self) -> dict[str, Any]:
-        """Return all there is to go on from, as data that `optim.runs.state.encoded` writes."""
+        """Return all there is to go on from, as data that `optim.runs.store.encode` writes."""
         return {
             "method": self.name,
             "seed": self.seed,
@@ -216,3 +219,9 @@ def _from_data(data: Any, now: Any) -> Any:
     if isinstance(now, list) and any(isinstance(one, Part) for one in now):
         return [_from_data(*pair) for pair in zip(data, now, strict=True)]
     return data
+
+
+def tame(loss: Points) -> Points:
+    """Return finite losses as they are, or all divided by one power of two if the squares of some had no sum."""
+    largest = float(np.abs(loss).max())
+    return loss if largest < LARGE else np.ldexp(loss, -int(np.frexp(largest)[1]))

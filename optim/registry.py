@@ -48,14 +48,10 @@ BUILTIN = (
     _own("bo-leap", "bo_leap:BOLeap", "BO-Leap: Bayesian optimisation, then leaps of populations and descents"),
     _own("l-bfgs-b", "quasi_newton:LBFGSB", "L-BFGS-B from random starts"),
     _own("basin-hopping", "quasi_newton:BasinHopping", "basin hopping: L-BFGS-B from minimum to minimum"),
-    _own("adam", "adam:Adam", "Adam from random starts"),
-    _own(
-        "cma-es-gradient", "cmaes_gradient:CMAESGradient", "CMA-ES with a step down the gradient at its mean injected"
-    ),
-    _own("turbo", "turbo:TuRBO", "TuRBO-1: Bayesian optimisation in a trust region, restarted when it has shrunk"),
-    _own(
-        "bo-gradient", "bayes_gradient:BOGradient", "Bayesian optimisation by a Gaussian process of losses and slopes"
-    ),
+    _own("adam", "descent:Adam", "Adam from random starts"),
+    _own("cma-es-gradient", "cmaes:CMAESGradient", "CMA-ES with a step down the gradient at its mean injected"),
+    _own("turbo", "bayes:TuRBO", "TuRBO-1: Bayesian optimisation in a trust region, restarted when it has shrunk"),
+    _own("bo-gradient", "bayes:BOGradient", "Bayesian optimisation by a Gaussian process of losses and slopes"),
     _own("ppo", "policy:PPO", "proximal policy optimisation of a neural policy", "rl"),
     _own("sac", "policy:SAC", "soft actor-critic for a neural policy", "rl"),
 )

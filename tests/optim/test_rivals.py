@@ -12,18 +12,12 @@ from scipy.optimize import Bounds, basinhopping, minimize
 from gradscape.envs.adapters import from_torch
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.optim.base import Kind
-from gradscape.optim.methods.adam import Adam, AdamOptions
-from gradscape.optim.methods.bayes import BO
-from gradscape.optim.methods.bayes_gradient import BOGradient, GradientProcess, standardised
-from gradscape.optim.methods.bound import LowerBound
-from gradscape.optim.methods.cmaes import CMAES
-from gradscape.optim.methods.cmaes_gradient import CMAESGradient
-from gradscape.optim.methods.fit import closure_of
-from gradscape.optim.methods.process import Process, covariance_of
+from gradscape.optim.methods.bayes import BO, BOGradient, GradientProcess, TuRBO, TuRBOOptions, region, standardised
+from gradscape.optim.methods.cmaes import CMAES, CMAESGradient
+from gradscape.optim.methods.descent import Adam, AdamOptions
+from gradscape.optim.methods.process import GradientCovariance, Process, closure_of, covariance_of
 from gradscape.optim.methods.quasi_newton import LBFGSB, BasinHopping
-from gradscape.optim.methods.sloped import Sloped
-from gradscape.optim.methods.surrogate import Surrogate, SurrogateOptions
-from gradscape.optim.methods.turbo import TuRBO, TuRBOOptions, region
+from gradscape.optim.methods.surrogate import LowerBound, Surrogate, SurrogateOptions
 from gradscape.optim.runs.store import RunStore
 from gradscape.optim.search import search
 
@@ -267,7 +261,7 @@ def test_a_process_given_some_slopes_is_that_of_its_known_rows_alone(first):
     known[:, 0] = True
     rows = standardised(loss, grad)
     assert np.isfinite(rows).all()
-    covariance, noise, new = Sloped(torch.tensor([0.4, 0.7]).double()), 1e-3, random.uniform(size=(5, 2))
+    covariance, noise, new = GradientCovariance(torch.tensor([0.4, 0.7]).double()), 1e-3, random.uniform(size=(5, 2))
     kept, points = known.ravel(), torch.from_numpy(u)
     within = covariance.dense(points, points).numpy()[kept][:, kept] + noise * np.eye(kept.sum())
     cross = covariance.across(torch.from_numpy(new), points)[0].numpy()[:, kept]
