@@ -162,12 +162,6 @@ def test_what_is_no_league_is_refused_before_anything_is_made(
     assert not list(tmp_path.iterdir())
 
 
-def test_a_folder_with_other_files_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "thesis.tex").write_text("mine")
-    with pytest.raises(ValueError, match=r"holds other files and no league: thesis\.tex"):
-        job(tmp_path, "branin")
-
-
 def test_a_name_says_its_fidelity_and_a_path_does_not() -> None:
     plain = SceneSpec("", "draft")
     assert read_scene("fluid", plain) == SceneSpec("fluid", "draft")
