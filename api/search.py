@@ -101,8 +101,7 @@ def optimize(
         env, optimizer, budget=budget, command=call.command, out=as_path(out), force=force,
         prints=as_widths(figure_width_mm),
     )  # fmt: skip
-    summary = job.run(call.watch)
-    call.watch.finish(job.folder, summary.files, summary.outcome())
+    job.run(call.watch)
     return job.result()
 
 
@@ -149,7 +148,7 @@ def race(
     best_known
         Lowest loss known from elsewhere, at which the targets end.
     """
-    from ..jobs.methods import check_methods
+    from ..optim.registry import check_methods
     from ..optim.registry import methods as registered
 
     many, call = _workers(workers, scheduler), current()
@@ -166,9 +165,7 @@ def race(
         prints=as_widths(figure_width_mm), watch=call.watch,
     )  # fmt: skip
     with cluster(scheduler, env.device) as executor:
-        summary = replace(job, executor=executor).run(call.watch)
-    call.watch.finish(job.folder, summary.files)
-    return summary.race
+        return replace(job, executor=executor).run(call.watch)
 
 
 @verb
@@ -209,7 +206,7 @@ def league(
     seeds
         Number of runs per method, with seeds 0, 1, ...
     """
-    from ..jobs.methods import check_methods
+    from ..optim.registry import check_methods
 
     many, call = _workers(workers, scheduler), current()
     named = as_names(methods)
@@ -217,7 +214,6 @@ def league(
     given = list(scenes) if isinstance(scenes, list | tuple) else [scenes]
     specs = [_league_spec(one, keywords) for one in given]
     from ..gallery.paper import read_paper
-    from ..jobs.folder import LEAGUE
     from ..jobs.league import LeagueJob, simulated_scenes
     from ..jobs.workers import workers as cluster
 
@@ -226,13 +222,9 @@ def league(
         specs, named, budget=budget, seeds=seeds, command=call.command, out=as_path(out), force=force,
         prints=as_widths(figure_width_mm),
     )  # fmt: skip
-    claims = {fixture.name: read_paper().claims_about(fixture.name) for fixture in job.fixtures}
+    claims = {scene.name: read_paper().claims_about(scene.name) for scene in job.scenes}
     with cluster(scheduler, keywords.get("device", "auto")) as executor:
-        found = replace(job, claims=claims, workers=many, executor=executor).run(call.watch)
-    call.watch.finish(job.folder, [*LEAGUE.files, "and a race in each folder"])
-    if found.failed:
-        call.watch.note(f"{len(found.failed)} of {len(job.fixtures)} scenes were left out: {', '.join(found.failed)}")
-    return found
+        return replace(job, claims=claims, workers=many, executor=executor).run(call.watch)
 
 
 def open_run(path: str | Path) -> Run:

@@ -51,7 +51,7 @@ def _ranks(race: Race) -> Table:
             str(rank.wins),
             _format_interval(rank.mean, rank.low, rank.high, 3) + none,
             str(rank.failed),
-            f"{rank.forward_equivalents:.0f}",
+            f"{rank.forwards:.0f}",
             f"{rank.seconds:.3g}",
         )
     return shown
@@ -65,7 +65,7 @@ def _running_times(race: Race) -> Table:
     title = f"episodes that a method takes to reach a loss{_unit(race)}, by restarts until it does"
     shown = table("method", *losses, title=title)
     for rank in figures.ranks:
-        times = figures.times[rank.method][some]
+        times = figures.running_times[rank.method][some]
         shown.add_row(rank.method, *(f"{one:.0f}" if isfinite(one) else "never" for one in times))
     return shown
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
@@ -56,10 +55,11 @@ def as_json(result: Any, folder: Path | None) -> Any:
     """Return a result as plain JSON, with its folder: of a slice, a sweep, a run and a race the summary in there."""
     from ..jobs.folder import RACE_FIGURES, SUMMARY
     from ..landscapes.convert import to_json
+    from ..landscapes.storage.records import read_json
 
     summary = {"Slice": SUMMARY, "Sweep": SUMMARY, "Run": SUMMARY, "Race": RACE_FIGURES}.get(type(result).__name__)
     if folder is not None and summary is not None:
-        found = json.loads((folder / summary).read_text())
+        found = read_json(folder / summary)
         return {key: value for key, value in found.items() if key not in ("curves", "ecdf")} | {"folder": str(folder)}
     found = to_json(getattr(result, "summary", result))
     if not isinstance(found, dict):

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from ..envs.base import cores
 from ..jobs.folder import SUMMARY
-from ..jobs.league import Fixture, LeagueJob
+from ..jobs.league import LeagueJob, LeagueScene
 from ..jobs.scene import SceneSpec
 from ..jobs.watch import Watch
 from ..landscapes.convert import from_json, to_json
@@ -30,11 +30,10 @@ from ..landscapes.storage.files import make_folder, replacing
 from ..landscapes.storage.layout import flags
 from ..landscapes.storage.records import read_json, reading, write_record
 from ..optim.base import Kind
-from ..optim.curves import best_so_far
 from ..optim.league import League, SceneStandings
 from ..optim.race import Race
-from ..optim.runs.arrays import FORWARD_EQUIVALENTS
 from ..optim.runs.run import Run
+from ..optim.statistics import best_so_far
 from .figures import read_figures
 from .files import LEAGUE, PICTURE, REMAKE, STORE, LeagueFiles, dark_name
 from .parts import FigurePart, kept_key
@@ -64,7 +63,7 @@ class LeaguePart(FigurePart):
     def label(self) -> str:
         """Return the command that runs it elsewhere."""
         how = f"--methods {','.join(METHODS)} --budget {BUDGET} --seeds {SEEDS} --device {self.device}"
-        return f"landscape league {Fixture.of(self._own_scene, self.root)} {how}"
+        return f"landscape league {LeagueScene.of(self._own_scene, self.root)} {how}"
 
     def count_left(self) -> int:
         """Return 1 where no race of these methods, seeds and episodes at this fidelity is kept."""
@@ -75,17 +74,17 @@ class LeaguePart(FigurePart):
             return 1
         known = {*kept.methods, *kept.left_out}
         whole = known >= set(METHODS) and kept.budget >= BUDGET and kept.seeds >= SEEDS
-        return int(not whole or kept.fidelity != self._job.fixtures[0].fidelity)
+        return int(not whole or kept.fidelity != self._job.scenes[0].fidelity)
 
     def seconds_each(self) -> float:
         """Estimate what is left of the race to simulate; what methods take themselves comes on top."""
         job = self._job
-        return job.forecast(job.fixtures[0], Watch())
+        return job.forecast(job.scenes[0], Watch())
 
     def make(self, watch: Watch) -> str:
         """Race, or continue the race, and keep what is needed of it."""
         job, files = self._job, self._files
-        race, left_out = job.run_race(job.fixtures[0], watch)
+        race, left_out = job.run_race(job.scenes[0], watch)
         found = SceneStandings.of(race, left_out=left_out, command=self.label())
         make_folder(files.record.parent)
         files.record.unlink(missing_ok=True)  # which says that the others are whole
@@ -214,7 +213,7 @@ class KeptRun:
         data = run.data.isel(evaluation=slice(budget))
         loss, x = data["loss"].to_numpy(), data["x"].to_numpy()
         rows = lowered(best_so_far(loss))
-        spent = data[FORWARD_EQUIVALENTS].to_numpy()
+        spent = data["forwards"].to_numpy()
         last = x[rows[-1]] if len(rows) else np.full(x.shape[1], np.nan)
         return cls(run.method, run.seed, rows + 1, spent[rows], loss[rows], len(loss), float(spent[-1]), last)
 

@@ -419,7 +419,7 @@ class SearchPart(FigurePart):
     def make(self, watch: Watch) -> str:
         """Race the methods, in a folder under out/, and keep the runs that are missing."""
         job = RaceJob.of(self.scene().make(), METHODS, budget=BUDGET, seeds=1, command=self.label(), watch=watch)
-        runs = replace(job, executor=self.executor).run(watch).race.runs
+        runs = replace(job, executor=self.executor).run(watch).runs
         for method in self._missing():
             save_run(runs[method][0].data, self._file(method))
         return f"{len(METHODS)} runs of {BUDGET} episodes"

@@ -18,6 +18,7 @@ from ..landscapes.storage.checkpoint import Checkpoint
 from ..landscapes.storage.files import tidy
 from ..landscapes.storage.locks import holding
 from ..landscapes.storage.records import write_record
+from ..landscapes.threads import one_torch_thread
 from ..landscapes.verification import POINTS, StoredPoints, verify
 from .folder import Results
 from .watch import PREPARING, Watch, Work, resumable
@@ -133,13 +134,20 @@ def _verify(pieces: Checkpoint, make: Callable[[], Environment | None], watch: W
 
 
 @contextmanager
-def filling(objective: Objective, runs: Sequence[RunStore], folder: Path, watch: Watch) -> Iterator[None]:
-    """Hold a folder of runs, after another process that fills it, and verify the runs.
+def filling(
+    objective: Objective,
+    runs: Sequence[RunStore],
+    folder: Path,
+    kept: Callable[[], str],
+    watch: Watch,
+    leave: Callable[[], object] = lambda: None,
+) -> Iterator[None]:
+    """Hold a folder of runs, after another process that fills it, verify the runs, and let torch use one core.
 
-    Three points of a single run are evaluated anew, one of each of several, in one batch. Raises StoreMismatchError
-    where the objective gives other numbers than they hold.
+    Three points of a single run are evaluated again, one of each of several, in one batch. Raises StoreMismatchError
+    where the objective gives other numbers than they hold, and as `resumable` does.
     """
-    with holding(folder, watch.note) as waited:
+    with resumable(kept, leave), one_torch_thread(), holding(folder, watch.note) as waited:
         for run in runs if waited else ():
             with run.lock():  # reads it
                 pass

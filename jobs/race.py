@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -11,57 +12,53 @@ from typing import TYPE_CHECKING, Any
 
 import cloudpickle
 
+from ..landscapes.convert import to_json
 from ..landscapes.cost import EpisodeCost, duration, episode_cost, seconds_per_episode
 from ..landscapes.sampling.distribution import make_objective as objective_of
 from ..landscapes.sampling.distribution import run_tasks, workers_of
 from ..landscapes.space import as_whole
-from ..landscapes.storage.files import clear, tidy, visible_files, write_json
+from ..landscapes.storage.files import clear, visible_files
 from ..landscapes.storage.locks import check_free
 from ..landscapes.storage.ownership import refuse_others
 from ..landscapes.threads import one_torch_thread
 from ..optim.claims import Claims, check_claims
-from ..optim.memory import run_need
+from ..optim.memory import SearchSize, require_method, require_runs, run_need
 from ..optim.processes import workers_worth
 from ..optim.race import Competitor, Race, name_seeds, race
-from ..optim.registry import optimizer_class
+from ..optim.registry import check_methods, optimizer_class
 from ..optim.runs.store import RunStore
 from ..optim.search import SearchProgress
-from .folder import RACE, RACE_FIGURES, ROOT, RUN_STORE, folder_named
-from .job import filling
-from .methods import able_methods, check_methods, require_room
-from .race_summary import RaceSummary
+from .folder import RACE, ROOT, RUN_STORE, folder_named
+from .job import Job, filling
 from .scene import provenance
-from .search import make_optimizer, open_run_store
-from .watch import PREPARING, Watch, Work, resumable
+from .search import divide_methods, make_optimizer, open_run_store
+from .watch import PREPARING, Watch, Work
 from .workers import recipe
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
 
     from ..envs.base import Environment
-    from ..optim.base import Optimizer
 
-PICTURE = RACE.picture
 Options = Mapping[str, Mapping[str, Any]]  # method -> name -> value, which may be text
 
 
-@dataclass(frozen=True)
-class RaceJob:
-    """A race to run in `folder`, and to hold claims against; methods compute in so many processes, `workers`.
+@dataclass(frozen=True, kw_only=True)
+class RaceJob(Job[Race]):
+    """A race to run, and to hold claims against; methods compute in so many processes, `workers`.
 
-    Its runs go on in lockstep, their proposals evaluated in one batch. With an `executor` its workers search instead,
+    Its runs advance in lockstep, their proposals evaluated in one batch. With an `executor` its workers search instead,
     a share of the runs each. `best_known` is the least loss that is known from elsewhere, down to which targets go.
     """
 
+    results = RACE
     env: Environment
     competitors: Sequence[Competitor]
-    folder: Path
     budget: int
-    command: str
+    options: Options
     claims: Claims = Claims()  # noqa: RUF009 -- it is frozen
     workers: int = 1
     executor: Executor | None = None
-    prints: Sequence[float] = ()
     best_known: float | None = None
 
     @classmethod
@@ -82,36 +79,38 @@ class RaceJob:
         best_known: float | None = None,
         watch: Watch | None = None,
     ) -> RaceJob:
-        """Go on with the race in `out`, by default a folder named after it, or begin it there; `force` begins anew.
+        """Continue the race in `out`, by default a folder named after it, or begin it there; `force` replaces it.
 
         `methods` are by default all that can search the environment here. Raises ValueError where the folder holds
         something else, and for methods and options that are not there, StoreMismatchError where it holds a run of other
-        settings, StoreError where another process fills the race that is to be begun anew, and TooLargeError where the
+        settings, StoreError where another process fills the race that is to be replaced, and TooLargeError where the
         race would not fit this machine.
         """
         watch, options = watch or Watch(), options or {}
         budget, seeds = as_whole(budget, "a budget", least=1), as_whole(seeds, "a number of seeds", least=1)
         workers = as_whole(workers, "a number of workers", least=1)
-        methods = check_methods(methods) or able_methods(env, watch)
+        methods = check_methods(methods) or _able_methods(env, watch)
         folder = out or race_folder(env, options)
-        if not any(folder.glob(f"*-*/{RUN_STORE}")):
-            refuse_others(
-                folder, (one for one in visible_files(folder) if not one.is_dir() or visible_files(one)), RACE.kind
-            )
+        refuse_other_folder(folder, RACE.kind, f"*-*/{RUN_STORE}")
         if force:
             check_free(folder)
-        require_room(env, methods, options, seeds=seeds, budget=budget, folder=folder)
-        how: dict[str, Any] = {"budget": budget, "command": command, "force": force}
+        _require_memory(env, methods, options, seeds=seeds, budget=budget, folder=folder)
+        competitors = []
         with watch.busy(f"opening {len(methods) * seeds} runs"):
-            competitors = [
-                _open_competitor(env, method, seed, options.get(method, {}), folder, **how)
-                for seed in range(seeds)
-                for method in methods
-            ]
+            for seed in range(seeds):
+                for method in methods:
+                    path, chosen = folder / f"{method}-{seed}" / RUN_STORE, options.get(method, {})
+                    optimizer = make_optimizer(method, env, seed=seed, options=chosen)
+                    run = open_run_store(env, optimizer, path, budget=budget, command=command, force=force)
+                    competitors.append(_competitor(env, method, seed, chosen, run))
         if force:
-            clear(folder, (PICTURE, RACE_FIGURES), PICTURE)
-        known = _check_loss(best_known)
-        return cls(env, competitors, folder, budget, command, claims or Claims(), workers, None, prints, known)
+            clear(folder, RACE.files, RACE.picture)
+        if best_known is not None and not math.isfinite(best_known):
+            raise ValueError(f"the best known loss is a finite number; got {best_known}")
+        return cls(
+            env=env, competitors=competitors, budget=budget, options=options, claims=claims or Claims(),
+            workers=workers, best_known=best_known, folder=folder, command=command, prints=prints,
+        )  # fmt: skip
 
     @property
     def methods(self) -> list[str]:
@@ -123,30 +122,53 @@ class RaceJob:
         """How many seeds each of them has."""
         return len(self.competitors) // len(self.methods)
 
-    def run(self, watch: Watch | None = None) -> RaceSummary:
-        """Compute what is missing, draw the race, write and return its figures.
-
-        Raises StoreMismatchError where the scene gives other numbers than are stored, Stopped where it is interrupted,
-        and DiskFullError; the same job goes on from what is kept then.
-        """
-        watch = watch or Watch()
-        watch.plan(self.work())
-        runs = [one.run for one in self.competitors]
-        with resumable(self.say_kept), one_torch_thread(), filling(self.env, runs, self.folder, watch):
-            self._search(watch)
-            with watch.busy("resampling seeds"):
-                return self._save()
-
-    def result(self) -> Race:
-        """Return the race as one works with it."""
+    def compute(self, watch: Watch) -> Race:
+        """Search until every run has its budget, and return the race with its figures."""
+        self._search(watch)
         runs = {method: [one.run.read() for one in self.competitors if one.method == method] for method in self.methods}
-        return Race(runs, self.budget, self.folder, provenance(self.env, self.command), self.best_known)
+        found = Race(runs, self.budget, self.folder, provenance(self.env, self.command), self.best_known)
+        with watch.busy("resampling seeds"):
+            found.statistics  # noqa: B018 -- computed once, then kept
+        return found
 
-    def say_kept(self) -> str:
+    def holding(self, watch: Watch) -> AbstractContextManager[None]:
+        """Hold the folder, and verify the scene against the runs."""
+        return filling(self.env, [one.run for one in self.competitors], self.folder, self.kept, watch)
+
+    def kept(self) -> str:
         """Say how much of it is on disk."""
         stores = (RunStore.open(one.run.path) for one in self.competitors if one.run.path)
         done = sum(min(store.count, self.budget) for store in stores)
         return f"{done} of {self.budget * len(self.competitors)} episodes are kept in {self.folder}"
+
+    def record(self, found: Race) -> dict[str, Any]:
+        """Return the race as its file has it; `silence` says why there is no claim."""
+        figures, env = found.statistics, self.env
+        return {
+            "env": env.name,
+            "fidelity": env.fidelity.name,
+            "device": env.device,
+            "engine": env.engine,
+            "options": asdict(env.options),
+            "loss_unit": env.loss_unit,
+            "methods": self.methods,
+            "method_options": {one.method: one.run.identity["method_options"] for one in self.competitors},
+            "budget": self.budget,
+            "seeds": self.seeds,
+            **to_json(figures),
+            "claims": to_json(check_claims(self.claims.claims, figures.differences, figures.superiorities)),
+            "silence": self.claims.silence,
+            "command": self.command,
+        }
+
+    def work(self) -> list[Work]:
+        """Return the budget of every run, with gradients where its method asks for them."""
+        losses, gradients = (
+            sum(self.budget for one in self.competitors if optimizer_class(one.method).needs_grad == way)
+            for way in (False, True)
+        )
+        need = run_need(self.env.space.dim, self.budget).times(len(self.competitors))
+        return [Work(self.env, losses, gradients, need.disk, need.memory)]
 
     def _search(self, watch: Watch) -> None:
         ratio, lines = self._announce(watch), Lines(self)
@@ -170,43 +192,12 @@ class RaceJob:
         """Let workers search, a share of the runs each, and read what they wrote."""
         left = [one for one in self.competitors if self._count_left(one)]
         there, many = cloudpickle.dumps(recipe(self.env)), min(workers_of(executor), len(left))
-        shares = [list(range(start, len(left), many)) for start in range(many)]
-        tasks = [(there, share, [_recipe_of(left[number]) for number in share], self.budget, ratio) for share in shares]
+        numbered = [(number, one.method, one.seed, str(one.run.path)) for number, one in enumerate(left)]
+        tasks = [(there, numbered[start::many], dict(self.options), self.budget, ratio) for start in range(many)]
         for found in run_tasks(executor, _race_there, tasks):
             for number, now in found.items():
                 with left[number].run.lock():  # reads it
                     follow(left[number], now)
-
-    def _save(self) -> RaceSummary:
-        from ..landscapes.draw.figures.page import save, save_prints
-
-        result, path = self.result(), self.folder / PICTURE
-        save(result.plot(), path)
-        printed = save_prints(lambda width: result.plot(width=width), path, self.prints)
-        summary = self._summary(result, [RACE_FIGURES, PICTURE, *printed])
-        write_json(self.folder / RACE_FIGURES, summary.record())
-        tidy(self.folder)
-        return summary
-
-    def _summary(self, result: Race, files: list[str]) -> RaceSummary:
-        figures = result.statistics
-        return RaceSummary(
-            env=self.env.name,
-            fidelity=self.env.fidelity.name,
-            device=self.env.device,
-            engine=self.env.engine,
-            options=asdict(self.env.options),
-            loss_unit=self.env.loss_unit,
-            methods=self.methods,
-            method_options={one.method: one.run.identity["method_options"] for one in self.competitors},
-            budget=self.budget,
-            seeds=self.seeds,
-            race=result,
-            claims=check_claims(self.claims.claims, figures.differences, figures.superiorities),
-            silence=self.claims.silence,
-            command=self.command,
-            files=files,
-        )
 
     def _announce(self, watch: Watch) -> float | None:
         """Say what is left to compute, and return what an episode with gradient costs if any method asks for it."""
@@ -242,15 +233,6 @@ class RaceJob:
         abreast = sum(self._count_left(one) > 0 for one in self.competitors)
         seconds = lockstep_seconds(self.env, left, abreast)
         return episode_cost(self.env, grad=grad), f"{duration(seconds)} to simulate, and what the methods take"
-
-    def work(self) -> list[Work]:
-        """Return the budget of every run, with gradients where its method asks for them."""
-        losses, gradients = (
-            sum(self.budget for one in self.competitors if optimizer_class(one.method).needs_grad == way)
-            for way in (False, True)
-        )
-        need = run_need(self.env.space.dim, self.budget).times(len(self.competitors))
-        return [Work(self.env, losses, gradients, need.disk, need.memory)]
 
     def _count_left(self, one: Competitor) -> int:
         return max(0, self.budget - one.run.count)
@@ -294,61 +276,60 @@ def race_folder(env: Environment, options: Options, root: Path = ROOT) -> Path:
     return folder_named(["race", env.name, env.fidelity.name], [env.identity(), texts], root)
 
 
-def _recipe_of(one: Competitor) -> tuple[str, str, dict[str, Any]]:
-    """Return the path of a run, its method, and how the optimiser is made."""
-    how = one.make.keywords  # type: ignore[attr-defined] # of the partial that `_open_competitor` makes
-    return str(one.run.path), one.method, {"seed": one.seed, "options": dict(how["options"])}
+def refuse_other_folder(folder: Path, kind: str, *marks: str) -> None:
+    """Raise ValueError for a folder with files, none of which matches the `marks` of such a `kind` of results."""
+    if not any(any(folder.glob(mark)) for mark in marks):
+        refuse_others(folder, (one for one in visible_files(folder) if not one.is_dir() or visible_files(one)), kind)
+
+
+def _able_methods(env: Environment, watch: Watch) -> list[str]:
+    """Return the methods that can search an environment here, and say of the others why they cannot."""
+    able, unable = divide_methods(env)
+    for method, why in unable.items():
+        watch.note(f"without {method}: {why}")
+    return able
+
+
+def _require_memory(
+    env: Environment, methods: Sequence[str], options: Options, *, seeds: int, budget: int, folder: Path
+) -> None:
+    """Raise TooLargeError where a race of these methods is larger than this machine."""
+    require_runs(env.space.dim, budget, seeds, folder, abreast=len(methods))
+    for method in methods:
+        optimizer = make_optimizer(method, env, options=options.get(method))
+        require_method(type(optimizer), optimizer.options, SearchSize(env.space.dim, env.decisions, budget))
+
+
+def _competitor(env: Environment, method: str, seed: int, options: Mapping[str, Any], run: RunStore) -> Competitor:
+    return Competitor(method, seed, run, partial(make_optimizer, method, env, seed=seed, options=options))
 
 
 def _race_there(
     there: bytes,
-    numbers: Sequence[int],
-    recipes: Sequence[tuple[str, str, dict[str, Any]]],
+    numbered: Sequence[tuple[int, str, int, str]],
+    options: Options,
     budget: int,
     gradient_cost: float | None,
 ) -> dict[int, SearchProgress]:
-    """Fill a worker's share of the runs in lockstep, and return how far each came, by its number."""
+    """Fill a worker's share of the runs (number, method, seed, path); return how far each came, by its number."""
     env: Any = objective_of(there).objective
-    share = [
-        Competitor(method, how["seed"], RunStore.open(path), partial(make_optimizer, method, env, **how))
-        for path, method, how in recipes
-    ]
-    number_of, seen = dict(zip(map(id, share), numbers, strict=True)), {}
+    share = {
+        number: _competitor(env, method, seed, options.get(method, {}), RunStore.open(path))
+        for number, method, seed, path in numbered
+    }
+    number_of = {(one.method, one.seed): number for number, one in share.items()}
+    seen = dict[int, SearchProgress]()
 
     def follow(one: Competitor, now: SearchProgress) -> None:
-        seen[number_of[id(one)]] = now
+        seen[number_of[one.method, one.seed]] = now
 
     with one_torch_thread():
-        race(env, share, budget=budget, gradient_cost=gradient_cost, progress=follow)
+        race(env, list(share.values()), budget=budget, gradient_cost=gradient_cost, progress=follow)
     return seen
 
 
 def _cost_there(there: bytes, grad: bool) -> EpisodeCost:
     return episode_cost(objective_of(there).objective, grad=grad)
-
-
-def _open_competitor(
-    env: Environment,
-    method: str,
-    seed: int,
-    options: Mapping[str, Any],
-    folder: Path,
-    *,
-    budget: int,
-    command: str,
-    force: bool,
-) -> Competitor:
-    make: Callable[[], Optimizer] = partial(make_optimizer, method, env, seed=seed, options=options)
-    path = folder / f"{method}-{seed}" / RUN_STORE
-    store = open_run_store(env, make(), path, budget=budget, command=command, force=force)
-    return Competitor(method, seed, store, make)
-
-
-def _check_loss(best_known: float | None) -> float | None:
-    """Refuse a best known loss that is not finite."""
-    if best_known is not None and not math.isfinite(best_known):
-        raise ValueError(f"the best known loss is a finite number; got {best_known}")
-    return best_known
 
 
 def _least(losses: Sequence[float]) -> float:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypedDict
+from typing import TYPE_CHECKING, Any
 
+from ..landscapes.convert import to_json
 from ..landscapes.cost import duration, episode_cost
 from ..landscapes.identity import METHOD_VERSION
 from ..landscapes.objective import FAILED, Objective, Status, describe_errors
@@ -17,15 +19,14 @@ from ..landscapes.storage.locks import check_free
 from ..landscapes.threads import one_torch_thread
 from ..optim.base import Kind
 from ..optim.memory import SearchSize, require_method, require_runs, run_need
-from ..optim.registry import optimizer_class
-from ..optim.runs.arrays import FORWARD_EQUIVALENTS, stored_record
+from ..optim.registry import methods, optimizer_class
 from ..optim.runs.run import Run
 from ..optim.runs.store import RunStore
 from ..optim.search import SearchProgress, search
 from .folder import ROOT, RUN, SUMMARY, folder_named
-from .job import filling
+from .job import Job, filling
 from .scene import provenance
-from .watch import PREPARING, Watch, Work, resumable
+from .watch import PREPARING, Watch, Work
 
 if TYPE_CHECKING:
     from ..envs.base import Environment
@@ -34,7 +35,8 @@ if TYPE_CHECKING:
 STORE, PICTURE = RUN.store, RUN.picture
 
 
-class BestRecord(TypedDict):
+@dataclass(frozen=True)
+class BestRecord:
     """The best episode of a run, as its summary has it."""
 
     loss: float
@@ -46,7 +48,7 @@ class BestRecord(TypedDict):
 class SearchSummary:
     """Say what a run cost and found, as `summary.json` beside it has it; `best` is None where no episode succeeded.
 
-    `error` is what the first episode that raised said.
+    `forwards` is what it cost in episodes without gradient, `error` is what the first episode that raised said.
     """
 
     env: str
@@ -60,7 +62,7 @@ class SearchSummary:
     episodes: int
     resumed: int
     seconds: float
-    forward_equivalents: float
+    forwards: float
     gradient_cost: float | None
     status: dict[str, int]
     kinds: dict[str, int]
@@ -69,14 +71,10 @@ class SearchSummary:
     files: list[str]
     error: str = ""
 
-    def record(self) -> dict[str, Any]:
-        """Return the summary as its file has it."""
-        return stored_record(self)
-
     def outcome(self) -> str:
         """Say in a line what the run cost and found."""
         best = self.best
-        found = f"best loss {best['loss']:.6g} at episode {best['episode']}" if best else "no episode succeeded"
+        found = f"best loss {best.loss:.6g} at episode {best.episode}" if best else "no episode succeeded"
         counts = {kind: self.status.get(kind.name.lower(), 0) for kind in Status}
         lost, lacking = sum(counts[kind] for kind in FAILED), counts[Status.NO_GRADIENT]
         parts = [
@@ -87,17 +85,15 @@ class SearchSummary:
         return "; ".join([f"{self.episodes} episodes in {duration(self.seconds)}", found, *filter(None, parts)])
 
 
-@dataclass(frozen=True)
-class SearchJob:
-    """A run to fill in `folder`, and to draw for pages of the widths of `prints` [mm], too."""
+@dataclass(frozen=True, kw_only=True)
+class SearchJob(Job[SearchSummary]):
+    """A run to fill up to a budget."""
 
+    results = RUN
     env: Environment
     optimizer: Optimizer
-    folder: Path
     store: RunStore
     budget: int
-    command: str
-    prints: Sequence[float] = ()
 
     @classmethod
     def of(
@@ -111,10 +107,10 @@ class SearchJob:
         force: bool = False,
         prints: Sequence[float] = (),
     ) -> SearchJob:
-        """Go on with the run in `out`, by default a folder named after it, or begin it there; `force` begins anew.
+        """Continue the run in `out`, by default a folder named after it, or begin it there; `force` replaces it.
 
         Raises ValueError where the folder holds something else, StoreMismatchError where it holds another run,
-        StoreError where another process fills the run that is to be begun anew, and TooLargeError where the run would
+        StoreError where another process fills the run that is to be replaced, and TooLargeError where the run would
         not fit this machine.
         """
         budget, identity = as_whole(budget, "a budget", least=1), run_identity(env, optimizer)
@@ -122,37 +118,34 @@ class SearchJob:
         require_runs(env.space.dim, budget, 1, folder)
         require_method(type(optimizer), optimizer.options, SearchSize(env.space.dim, env.decisions, budget))
         RUN.check(folder)
-        if anew := force and (folder / STORE).exists():
+        if replaced := force and (folder / STORE).exists():
             check_free(folder)
         store = open_run_store(env, optimizer, folder / STORE, budget=budget, command=command, force=force)
-        if anew:
+        if replaced:
             clear(folder, (PICTURE, SUMMARY), PICTURE)
-        return cls(env, optimizer, folder, store, budget, command, prints)
+        return cls(
+            env=env, optimizer=optimizer, store=store, budget=budget, folder=folder, command=command, prints=prints
+        )
 
-    def run(self, watch: Watch | None = None) -> SearchSummary:
-        """Search until the budget is spent, draw the run, write and return the summary.
+    def compute(self, watch: Watch) -> SearchSummary:
+        """Search until the budget is spent, draw the run and return the summary."""
+        start, resumed = time.monotonic(), self.store.count
+        if resumed < self.budget:
+            resumed = self._search(watch)
+        else:
+            watch.note(f"{self._place()}\nall {self.budget} episodes are there already")
+        printed = self.draw(self.result().plot)
+        return self._summary(resumed, time.monotonic() - start, [STORE, PICTURE, *printed, SUMMARY])
 
-        Raises StoreMismatchError where the scene gives other numbers than are stored, Stopped where it is interrupted,
-        and DiskFullError; the same job goes on from what is kept then.
-        """
-        watch, start = watch or Watch(), time.monotonic()
-        watch.plan(self.work())
-        with (
-            resumable(self.say_kept, lambda: self._on_disk().picture()),
-            one_torch_thread(),
-            filling(self.env, [self.store], self.folder, watch),
-        ):
-            resumed = self.store.count
-            if resumed < self.budget:
-                resumed = self._search(watch)
-            else:
-                watch.note(f"{self._place()}\nall {self.budget} episodes are there already")
-            self.picture()
-            files = [STORE, PICTURE, *self._print(), SUMMARY]
-            summary = self._summary(resumed, time.monotonic() - start, files)
-            write_json(self.folder / SUMMARY, summary.record())
-            tidy(self.folder)
-        return summary
+    def write(self, found: SearchSummary) -> list[str]:
+        """Write the summary."""
+        write_json(self.folder / SUMMARY, to_json(found))
+        tidy(self.folder)
+        return found.files
+
+    def outcome(self, found: SearchSummary) -> str:
+        """Say in a line what the run cost and found."""
+        return found.outcome()
 
     def work(self) -> list[Work]:
         """Return the budget, with gradients if the method asks for them."""
@@ -160,23 +153,23 @@ class SearchJob:
         need = run_need(self.env.space.dim, self.budget)
         return [Work(self.env, *counts, need.disk, need.memory)]
 
+    def holding(self, watch: Watch) -> AbstractContextManager[None]:
+        """Hold the folder, and verify the scene against the run; one that is stopped leaves a picture."""
+        return filling(self.env, [self.store], self.folder, self.kept, watch, self._draw_kept)
+
+    def kept(self) -> str:
+        """Say how much of it is on disk."""
+        return f"{RunStore.open(self.folder / STORE).count} of {self.budget} episodes are kept in {self.folder}"
+
     def result(self) -> Run:
         """Return the run as one works with it."""
         return replace(self.store.read(), folder=self.folder)
 
-    def say_kept(self) -> str:
-        """Say how much of it is on disk."""
-        return f"{self._on_disk().store.count} of {self.budget} episodes are kept in {self.folder}"
-
-    def picture(self) -> None:
-        """Draw what there is of the run, if there is anything to draw."""
-        from ..landscapes.draw.figures.page import save
-
-        if self.store.count:
-            save(self.result().plot(), self.folder / PICTURE)
-
-    def _on_disk(self) -> SearchJob:
-        return replace(self, store=RunStore.open(self.folder / STORE), prints=())
+    def _draw_kept(self) -> None:
+        """Draw what is on disk, if there is anything to draw."""
+        kept = replace(self, store=RunStore.open(self.folder / STORE), prints=())
+        if kept.store.count:
+            kept.draw(kept.result().plot)
 
     def _search(self, watch: Watch) -> int:
         """Search, and return how many episodes were there before."""
@@ -209,17 +202,11 @@ class SearchJob:
     def _place(self) -> str:
         return f"{self.env.name} · {self.env.fidelity.name} · {self.env.device} · {self.optimizer.name} · {self.folder}"
 
-    def _print(self) -> list[str]:
-        from ..landscapes.draw.figures.page import save_prints
-
-        path = self.folder / PICTURE  # the run is read only where it is printed
-        return save_prints(lambda width: self.result().plot(width=width), path, self.prints)
-
     def _summary(self, resumed: int, seconds: float, files: list[str]) -> SearchSummary:
         run, identity = self.store.read(), self.store.identity
         data, best = run.data, None
         if self.store.count > self.store.failed:
-            best = BestRecord(loss=run.best.loss, episode=run.best.episode, x=run.best.x.tolist())
+            best = BestRecord(run.best.loss, run.best.episode, run.best.x.tolist())
         return SearchSummary(
             env=identity["objective"],
             method=identity["method"],
@@ -232,7 +219,7 @@ class SearchJob:
             episodes=self.store.count - resumed,
             resumed=resumed,
             seconds=round(seconds, 3),
-            forward_equivalents=float(data[FORWARD_EQUIVALENTS][-1]),
+            forwards=float(data["forwards"][-1]),
             gradient_cost=self.store.gradient_cost,
             status={kind.name.lower(): int((data["status"] == kind).sum()) for kind in Status if kind},
             kinds={kind.name.lower(): int((data["kind"] == kind).sum()) for kind in Kind},
@@ -258,6 +245,20 @@ def make_optimizer(
     chosen = read_options(method, kind.Options, options or {})
     require_method(kind, chosen, SearchSize(objective.space.dim, objective.decisions))
     return kind.on(objective, seed=seed, options=chosen)
+
+
+def divide_methods(env: Environment, names: Sequence[str] = (), *, budget: int = 0) -> tuple[list[str], dict[str, str]]:
+    """Return which methods, by default of all, can search an environment here, and why the others cannot."""
+    able, unable = list[str](), dict[str, str]()
+    for method in names or methods():
+        try:
+            made = make_optimizer(method, env)
+            require_method(type(made), made.options, SearchSize(env.space.dim, env.decisions, budget))
+        except ValueError as error:
+            unable[method] = " ".join(str(error).split())
+        else:
+            able.append(method)
+    return able, unable
 
 
 def open_run_store(

@@ -25,6 +25,9 @@ Points = NDArray[np.float64]
 COMMON = {"space", "seed", "options", "random", "worst", "objective", "_told_any"}  # attributes of every optimiser
 
 
+LARGE = 1e100  # a loss: the squares of a billion of them still have a sum
+
+
 class Kind(IntEnum):
     """Say what a point was evaluated for."""
 
@@ -44,6 +47,21 @@ class Proposal:
     grad: bool = False
 
 
+class Part:
+    """A part of an optimiser whose attributes are data, but for its `options`."""
+
+    def state(self) -> dict[str, Any]:
+        """Return where it stands, as data."""
+        return {name: value for name, value in vars(self).items() if name != "options"}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Take back what `state` returned."""
+        for name, value in state.items():
+            if name not in vars(self):
+                raise ValueError(f"{name} is no attribute of a {type(self).__name__}")
+            setattr(self, name, value)
+
+
 class Optimizer(abc.ABC):
     """Search a box for the least loss: `ask` for points, evaluate them, `tell` what came out, and so on.
 
@@ -52,9 +70,9 @@ class Optimizer(abc.ABC):
     asked for them, gradients with respect to the scaled parameters: zero where an episode failed, NaN where it has a
     loss alone. Randomness comes from `self.random` alone, so that a seed decides everything.
 
-    Between `tell` and `ask` an optimiser is its `state`: what `from_state` makes of it goes on bit for bit. A method
-    whose attributes are numbers, strings, arrays, lists and mappings of them needs nothing for that; any other says in
-    `_state` and `_restore` what of it is data.
+    Between `tell` and `ask` an optimiser is its `state`: what `from_state` makes of it continues bit for bit. A method
+    whose attributes are numbers, strings, arrays, lists and mappings of them, or parts (`Part`) that it has from
+    `_setup` on, needs nothing for that; any other says in `_state` and `_restore` what of it is data.
     """
 
     name: ClassVar[str]
@@ -128,7 +146,7 @@ class Optimizer(abc.ABC):
 
     @final
     def state(self) -> dict[str, Any]:
-        """Return all there is to go on from, as data that `optim.runs.state.encoded` writes."""
+        """Return all there is to go on from, as data that `optim.runs.store.encode` writes."""
         return {
             "method": self.name,
             "seed": self.seed,
@@ -165,14 +183,14 @@ class Optimizer(abc.ABC):
 
     def _state(self) -> dict[str, Any]:
         """Return what the method itself goes on from; `self.random` stands where it did after the last draw."""
-        return {name: value for name, value in vars(self).items() if name not in COMMON}
+        return {name: _to_data(value) for name, value in vars(self).items() if name not in COMMON}
 
     def _restore(self, own: Mapping[str, Any]) -> None:
         """Take back what `_state` returned, after `_setup` and `attach`; draws are put back afterwards."""
         for name, value in own.items():
             if hasattr(type(self), name):
                 raise ValueError(f"{name} is no attribute that {self.name} keeps")
-            setattr(self, name, value)
+            setattr(self, name, _from_data(value, getattr(self, name, None)))
 
     @abc.abstractmethod
     def _ask(self) -> Proposal | Asking[Proposal]:
@@ -184,3 +202,26 @@ class Optimizer(abc.ABC):
     @abc.abstractmethod
     def _tell(self, z: Points, loss: Points, grad: Points | None) -> None:
         """Take in points as they were evaluated, with shapes (count, dim), (count,) and (count, dim)."""
+
+
+def _to_data(value: Any) -> Any:
+    """Return the state of a part, or of each part in a list, and any other value as it is."""
+    if isinstance(value, list):
+        return [_to_data(one) for one in value]
+    return value.state() if isinstance(value, Part) else value
+
+
+def _from_data(data: Any, now: Any) -> Any:
+    """Return what `_to_data` made data of; `now` are the parts to restore, if any."""
+    if isinstance(now, Part):
+        now.restore(data)
+        return now
+    if isinstance(now, list) and any(isinstance(one, Part) for one in now):
+        return [_from_data(*pair) for pair in zip(data, now, strict=True)]
+    return data
+
+
+def tame(loss: Points) -> Points:
+    """Return finite losses as they are, or all divided by one power of two if the squares of some had no sum."""
+    largest = float(np.abs(loss).max())
+    return loss if largest < LARGE else np.ldexp(loss, -int(np.frexp(largest)[1]))

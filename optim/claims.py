@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
-from .comparison import Difference, Superiority
+from .statistics import Difference, Superiority
 
 
 @dataclass(frozen=True)

@@ -13,10 +13,8 @@ import xarray as xr
 
 from ..landscapes.identity import current_identity
 from ..landscapes.plain import finite
-from .bootstrap import interval
 from .claims import ClaimFinding, Claims, check_claims
-from .comparison import Superiority
-from .targets import times_record
+from .statistics import Superiority, interval, times_record
 
 OF_METHOD = ("method", "method_options", "method_version", "seed")  # of a run's identity, what is not of its scene
 
@@ -108,7 +106,7 @@ class SceneStandings:
         """Return what a race says."""
         identity = {name: value for name, value in race.identity.items() if name not in OF_METHOD}
         figures, some = race.statistics, race.statistics.targets.some
-        times = {method: times_record(one[some]) for method, one in figures.times.items()}
+        times = {method: times_record(one[some]) for method, one in figures.running_times.items()}
         return cls(
             env=str(identity["objective"]),
             fidelity=str(identity["fidelity"]),

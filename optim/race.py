@@ -17,13 +17,11 @@ import xarray as xr
 from ..landscapes.cost import episode_cost
 from ..landscapes.objective import Objective
 from .base import Optimizer
-from .curves import Tables, final_losses
 from .lockstep import Lockstep
 from .runs.run import Run
 from .runs.store import RunStore
 from .search import SearchProgress, fill
-from .statistics import RaceStatistics
-from .targets import hits
+from .statistics import RaceStatistics, Tables, final_losses, hits
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -146,7 +144,7 @@ class Race:
                 f"best loss, high{unit}": rank.high,
                 "seeds without success": rank.unsuccessful,
                 "failed episodes": rank.failed,
-                "forward equivalents": rank.forward_equivalents,
+                "forward equivalents": rank.forwards,
                 "seconds [s]": rank.seconds,
             }
             for rank in self.statistics.ranks
@@ -186,7 +184,7 @@ class Race:
 
         figures = self.statistics
         index = pd.Index(figures.targets.loss, name=f"loss [{self.loss_unit}]" if self.loss_unit else "loss")
-        return pd.DataFrame(figures.times, index=index)
+        return pd.DataFrame(figures.running_times, index=index)
 
     def plot(self, *, width: float | None = None) -> Picture:
         """Draw best losses against episodes, and the share of targets reached.

@@ -10,6 +10,7 @@ The class derives from `gradscape.optim.base.Optimizer`, and its `name` is that 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import cache
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from .base import Optimizer
 
 GROUP = "gradscape.optimizers"
+ALL = "all"  # methods that can search an environment here
 
 
 @dataclass(frozen=True)
@@ -46,14 +48,10 @@ BUILTIN = (
     _own("bo-leap", "bo_leap:BOLeap", "BO-Leap: Bayesian optimisation, then leaps of populations and descents"),
     _own("l-bfgs-b", "quasi_newton:LBFGSB", "L-BFGS-B from random starts"),
     _own("basin-hopping", "quasi_newton:BasinHopping", "basin hopping: L-BFGS-B from minimum to minimum"),
-    _own("adam", "adam:Adam", "Adam from random starts"),
-    _own(
-        "cma-es-gradient", "cmaes_gradient:CMAESGradient", "CMA-ES with a step down the gradient at its mean injected"
-    ),
-    _own("turbo", "turbo:TuRBO", "TuRBO-1: Bayesian optimisation in a trust region, restarted when it has shrunk"),
-    _own(
-        "bo-gradient", "bayes_gradient:BOGradient", "Bayesian optimisation by a Gaussian process of losses and slopes"
-    ),
+    _own("adam", "descent:Adam", "Adam from random starts"),
+    _own("cma-es-gradient", "cmaes:CMAESGradient", "CMA-ES with a step down the gradient at its mean injected"),
+    _own("turbo", "bayes:TuRBO", "TuRBO-1: Bayesian optimisation in a trust region, restarted when it has shrunk"),
+    _own("bo-gradient", "bayes:BOGradient", "Bayesian optimisation by a Gaussian process of losses and slopes"),
     _own("ppo", "policy:PPO", "proximal policy optimisation of a neural policy", "rl"),
     _own("sac", "policy:SAC", "soft actor-critic for a neural policy", "rl"),
 )
@@ -85,6 +83,12 @@ def find_method(name: str) -> Method:
         hint = f"; did you mean {close[0]}?" if close else ";"
         raise ValueError(f"no method is called {name!r}{hint} there are {', '.join(known)}")
     return known[name]
+
+
+def check_methods(names: Sequence[str]) -> list[str]:
+    """Return methods without repetitions, none for `all`. Raises ValueError where one is not registered."""
+    found = [find_method(name).name for name in dict.fromkeys(names) if name != ALL]
+    return [] if ALL in names else found
 
 
 def optimizer_class(name: str) -> type[Optimizer]:

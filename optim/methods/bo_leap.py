@@ -71,11 +71,11 @@ class BOLeap(Optimizer):
             raise ValueError(f"bo-leap searches two parameters or more; this space has {self.space.dim}")
         self.surrogate = Surrogate(self.space.dim, self.options)
         self.local: SemiLocal | None = None
-        self.descent: Descent | None = None
+        self.descent = Descent(np.zeros(self.space.dim), self.options, done=True)
         self.spent = 0  # episodes, by this semi-local search
 
     def _ask(self) -> Asking[Proposal]:
-        if self.descent is not None:
+        if not self.descent.done:
             return Proposal(torch.from_numpy(self.descent.at[None]), Kind.DESCENT, grad=True)
         if self.local is None or self.spent >= self.options.local_budget:
             mu = yield from self.surrogate.minimise(self.random)
@@ -86,31 +86,23 @@ class BOLeap(Optimizer):
         assert self.local is not None  # as asked
         self.surrogate.add(z, loss)
         self.spent += len(z)
-        if self.descent is None:
+        if self.descent.done:
             self.descent = Descent(self.local.tell(z, loss), self.options)
             return
         assert grad is not None
         self.descent.tell(float(loss[0]), grad[0])
         if self.descent.done:
             self.local.leap(self.descent.at)
-            self.descent = None
 
     def _inform(self, z: Points, loss: Points, grad: Points | None) -> None:
         self.surrogate.add(z, loss)
 
     def _state(self) -> dict[str, Any]:
-        return {
-            "surrogate": self.surrogate.state(),
-            "local": self.local and self.local.state(),
-            "descent": self.descent and self.descent.state(),
-            "spent": self.spent,
-        }
+        return super()._state() | {"local": self.local and self.local.state()}
 
     def _restore(self, own: Mapping[str, Any]) -> None:
-        self.surrogate.restore(own["surrogate"])
+        super()._restore({name: value for name, value in own.items() if name != "local"})
         self.local = own["local"] and SemiLocal.from_state(own["local"], self.options, self.random)
-        self.descent = own["descent"] and Descent.from_state(own["descent"], self.options)
-        self.spent = int(own["spent"])
 
 
 class SemiLocal:

@@ -6,12 +6,12 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
 
-from ..base import Kind, Optimizer, Points, Proposal
+from ..base import Kind, Optimizer, Part, Points, Proposal
 from ..memory import FLOAT, SearchSize
 from ..options import MANY, MethodOptions, number
 
@@ -42,7 +42,7 @@ def lacks(grad: Points) -> bool:
     return bool(np.isnan(grad).any())
 
 
-class Descending(ABC):
+class Descending(Part, ABC):
     """A descent in the scaled box: `at` is the iterate to evaluate next, until `done`; `best` is the least loss so far.
 
     By its options it ends after `steps` iterates, or after more than `patience` in a row that have not lowered the best
@@ -50,24 +50,15 @@ class Descending(ABC):
     to go from there.
     """
 
-    def __init__(self, start: Points, options: Any) -> None:
+    def __init__(self, start: Points, options: Any, *, done: bool = False) -> None:
         self.options = options
         self.at = np.clip(start, -1.0, 1.0)
-        self.best, self.done = math.inf, False
+        self.best, self.done = math.inf, done
         self._evaluated = self._stalled = 0
 
     @abstractmethod
     def tell(self, loss: float, grad: Points) -> None:
         """Take in the iterate's loss, +inf where the episode failed, and gradient, shape (dim,); move on or end."""
-
-    @abstractmethod
-    def state(self) -> dict[str, Any]:
-        """Return where the descent stands, as data."""
-
-    @classmethod
-    @abstractmethod
-    def from_state(cls, state: Mapping[str, Any], options: Any) -> Self:
-        """Return the descent that had this state."""
 
     def _ends_with(self, loss: float) -> bool:
         """Count an iterate with this loss; return whether it is the last."""
@@ -85,8 +76,8 @@ class Descent(Descending):
     where it has a loss and no gradient, unless its episode failed: then the one before, the last that has a loss.
     """
 
-    def __init__(self, start: Points, options: DescentOptions) -> None:
-        super().__init__(start, options)
+    def __init__(self, start: Points, options: DescentOptions, *, done: bool = False) -> None:
+        super().__init__(start, options, done=done)
         self._last, self._last_loss = self.at, math.inf
         self._scale = 1.0
 
@@ -104,18 +95,6 @@ class Descent(Descending):
         self.done = last or np.array_equal(moved, self.at)  # at a stationary point, or pushed against the border
         if not self.done:
             self._last, self._last_loss, self.at = self.at, loss, moved
-
-    def state(self) -> dict[str, Any]:
-        """Return where the descent stands, as data."""
-        return {name: value for name, value in vars(self).items() if name != "options"}
-
-    @classmethod
-    def from_state(cls, state: Mapping[str, Any], options: DescentOptions) -> Self:
-        """Return the descent that had this state."""
-        descent = cls(state["at"], options)
-        for name in descent.state():
-            setattr(descent, name, state[name])
-        return descent
 
     def _move(self, grad: Points) -> Points:
         """Return z - step * gradient, kept inside the box."""
@@ -163,12 +142,72 @@ class Descents(Optimizer):
             descent.tell(float(one_loss), one_grad)
         self.descents = [self._begin() if one.done else one for one in self.descents]
 
-    def _state(self) -> dict[str, Any]:
-        return {"descents": [one.state() for one in self.descents]}
-
-    def _restore(self, own: Mapping[str, Any]) -> None:
-        self.descents = [self.Descent.from_state(one, self.options) for one in own["descents"]]
-
     def _begin(self) -> Descending:
         descent: Descending = self.Descent(self.random.uniform(-1.0, 1.0, self.space.dim), self.options)
         return descent
+
+
+@dataclass(frozen=True)
+class AdamOptions(MethodOptions):
+    """How a descent moves in the box scaled to [-1, 1], and when it ends.
+
+    `rate` is the learning rate, about what a parameter moves by in a step at first; `beta1` and `beta2` say how slowly
+    the means of gradients and of their squares forget (torch's defaults). A descent ends after `steps` iterates, or
+    when the loss has failed more than `patience` times in a row to fall below the best so far by `tolerance`, a
+    fraction of it. `batch_size` descents are evaluated as one batch.
+    """
+
+    method = "adam"
+
+    rate: float = number(0.05, 1e-12, 1000)
+    beta1: float = number(0.9, 0, 0.999999)
+    beta2: float = number(0.999, 0, 0.999999)
+    steps: int = number(100, 1, MANY)
+    patience: int = number(20, 0, MANY)
+    tolerance: float = number(1e-4, 0, 1)
+    batch_size: int = number(4, 1, 10_000)
+
+
+class AdamDescent(Descending):
+    """Follow gradients by torch's Adam from `start`, inside the box, until an episode fails or has no gradient."""
+
+    def __init__(self, start: Points, options: AdamOptions) -> None:
+        super().__init__(start, options)
+        self._z = torch.from_numpy(self.at.copy())
+        self._adam = torch.optim.Adam([self._z], lr=options.rate, betas=(options.beta1, options.beta2), foreach=False)
+
+    def tell(self, loss: float, grad: Points) -> None:
+        """Take in the iterate's loss, +inf where the episode failed, and gradient, shape (dim,); move on or end."""
+        if not math.isfinite(loss):
+            self.done = True
+            return
+        self.done = self._ends_with(loss) or lacks(grad)
+        if lacks(grad):
+            return
+        self._z.grad = torch.from_numpy(np.nan_to_num(grad))
+        self._adam.step()
+        self.at = self._z.clamp_(-1.0, 1.0).numpy().copy()
+
+    def state(self) -> dict[str, Any]:
+        """Return where the descent stands, as data."""
+        moments = {name: value.numpy() for name, value in self._adam.state[self._z].items()}
+        kept = {name: value for name, value in super().state().items() if name not in ("_z", "_adam")}
+        return kept | {"moments": moments}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Take back what `state` returned."""
+        super().restore({name: value for name, value in state.items() if name != "moments"})
+        self._z.copy_(torch.from_numpy(self.at))
+        if state["moments"]:
+            self._adam.state[self._z] = {
+                name: torch.from_numpy(np.array(value)) for name, value in state["moments"].items()
+            }
+
+
+class Adam(Descents):
+    """Descend by torch's Adam from uniformly random starts; where one descent ends the next begins."""
+
+    name = "adam"
+    Options = AdamOptions
+    Descent = AdamDescent
+    held = 10_000

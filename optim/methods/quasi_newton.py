@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from scipy.optimize import minimize
 
-from ..base import Kind, Optimizer, Points, Proposal
+from ..base import Kind, Optimizer, Part, Points, Proposal
 from ..memory import FLOAT, SearchSize
 from ..options import MANY, MethodOptions, number
 from .descent import lacks
@@ -27,7 +27,7 @@ class _Unknown(Exception):  # noqa: N818 -- no error: it takes control back from
         self.z = z.copy()
 
 
-class LocalSearch:
+class LocalSearch(Part):
     """Minimise by scipy's L-BFGS-B from `start`, in the scaled box: `at` is the point it asks for next, until `done`.
 
     scipy calls a function and wants its value at once, so every `tell` minimises from the start again, with the values
@@ -37,9 +37,9 @@ class LocalSearch:
 
     def __init__(self, start: Points, evaluations: int) -> None:
         self.start, self.evaluations = np.clip(start, -1.0, 1.0), evaluations
-        self.z: list[Points] = []
+        self.z: Points = np.empty((0, len(start)))
         self.loss: list[float] = []
-        self.grad: list[Points] = []
+        self.grad: Points = np.empty((0, len(start)))
         self.at, self.best, self.best_loss = self.start, self.start, math.inf
         self.done = self.failed = False
 
@@ -48,9 +48,8 @@ class LocalSearch:
 
         A point that has no gradient ends the search, at the least loss so far: scipy makes nothing of NaN.
         """
-        self.z.append(self.at)
+        self.z, self.grad = np.vstack([self.z, self.at]), np.vstack([self.grad, grad])
         self.loss.append(loss)
-        self.grad.append(grad)
         if lacks(grad):
             least = int(np.argmin(self.loss))
             self.done, self.failed, self.best, self.best_loss = True, True, self.z[least], self.loss[least]
@@ -74,25 +73,6 @@ class LocalSearch:
 
         options, box = {"maxcor": MEMORY, "maxfun": self.evaluations}, [(-1.0, 1.0)] * len(self.start)
         return minimize(at, self.start, jac=True, method="L-BFGS-B", bounds=box, options=options)
-
-    def state(self) -> dict[str, Any]:
-        """Return where the search stands, as data."""
-        dim = len(self.start)
-        return vars(self) | {
-            "z": np.array(self.z).reshape(-1, dim),
-            "loss": np.array(self.loss),
-            "grad": np.array(self.grad).reshape(-1, dim),
-        }
-
-    @classmethod
-    def from_state(cls, state: Mapping[str, Any]) -> LocalSearch:
-        """Return the search that had this state."""
-        search = cls(state["start"], int(state["evaluations"]))
-        for name in vars(search):
-            value = state[name]
-            setattr(search, name, list(value) if name in ("z", "grad") else value)
-        search.loss = [float(loss) for loss in state["loss"]]
-        return search
 
 
 @dataclass(frozen=True)
@@ -139,13 +119,6 @@ class LBFGSB(Optimizer):
     def _next_start(self) -> Points:
         """Return where the next search begins, now that one has ended."""
         return self.random.uniform(-1.0, 1.0, self.space.dim)
-
-    def _state(self) -> dict[str, Any]:
-        return super()._state() | {"local": self.local.state()}
-
-    def _restore(self, own: Mapping[str, Any]) -> None:
-        super()._restore({name: value for name, value in own.items() if name != "local"})
-        self.local = LocalSearch.from_state(own["local"])
 
 
 @dataclass(frozen=True)

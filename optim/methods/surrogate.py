@@ -18,41 +18,125 @@ them; RBFKernelGrad for bo-gradient) took, over three seeds of 100 episodes at d
 | | bo-leap | 0.8, 0.7 | 0.9 | 0.00014, 0.00014 |
 | rope (30) | bo | 26.0, 120 | 4.6 | 10.3, 10.4 |
 
-bo-leap asks a process once or twice in 100 episodes. On rope, bo-gradient with BoTorch's model had not ended after 20
-minutes. One model for all seeds could save two thirds at most, which leaves bo and bo-gradient 1.6 to 3.4 times slower.
+bo-leap asks a process once or twice in 100 episodes. The comparison of bo-gradient on rope had not ended after 20
+minutes; which half of it was running then is not known. One model for all seeds could save two thirds at most, which
+leaves bo and bo-gradient 1.6 to 3.4 times slower. That BoTorch's models find no more is what three seeds show, without
+a test.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import threading
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Literal, get_args, get_type_hints
 
 import numpy as np
 import torch
+from botorch.exceptions.warnings import BotorchWarning
 from botorch.models import SingleTaskGP
 from botorch.models.utils.gpytorch_modules import get_covar_module_with_dim_scaled_prior
+from botorch.optim.batched_lbfgs_b import fmin_l_bfgs_b_batched
 from gpytorch.means import ZeroMean
 from gpytorch.models import ExactGP
+from gpytorch.utils.warnings import GPInputWarning
 from jaxtyping import Float
+from linear_operator.utils.warnings import NumericalWarning
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..base import Points
+from ...landscapes.threads import one_torch_thread
+from ..base import Part, Points, tame
 from ..lockstep import Asking, compute_drawing
 from ..memory import FLOAT, SearchSize
 from ..options import MANY, MethodOptions, number
-from .bound import NEAR, SPREAD, LowerBound, exclusive, least_point, unit
-from .fit import GROWTH, fitted, with_parameters
-from .magnitude import tame
-from .process import Covariance, Process
-from .radial import Radial
+from .process import GROWTH, KERNELS, Covariance, Matrix, Process, fitted, with_parameters
 
+STEPS = 30  # of L-BFGS on the bound, from each start
+BOUND_TOLERANCE = 1e-4  # deviations of the losses: a step that lowers the bound by less is the last
+STARTS, SPREAD, NEAR, JITTER = 4, 128, 32, 0.02  # of the search for its least value: see `_starts`
+# GPyTorch's settings and Python's warning filters belong to the process, not to a thread.
+ONE_AT_A_TIME = threading.RLock()
 Rows = NDArray[np.intp]
-
 ARRAYS = 16  # of points x points: ten that a process makes (measured with BoTorch 0.16), and factors kept
 FIT_POINTS = 300  # points to fit hyper-parameters to, spread over the run: each step's cost grows with their cube
-LEAST_SPREAD = 1e-8  # of losses that are put in deviations from their average, as in BoTorch's `Standardize`
+MIN_SPREAD = 1e-8  # of losses that are put in deviations from their average, as in BoTorch's `Standardize`
+
+
+class LowerBound:
+    """The lower confidence bound of a process, in standard deviations of the losses from their average.
+
+    It is that of BoTorch's `UpperConfidenceBound` with `maximize=False`, before the losses' scale is put back: of a
+    process of one function, alone or with its slopes, with a variance of one where nothing is known. What does not
+    change from point to point is computed once: weights of what is known, and a factor of the covariance.
+    """
+
+    @torch.no_grad()
+    def __init__(self, process: Process, coefficient: float) -> None:
+        self.coefficient = coefficient
+        self.covariance, self.known = process.covariance, process.u
+        self.factor = process.factor()
+        self.weights = self.factor.weights(process.values)
+
+    @torch.no_grad()
+    def __call__(self, u: Float[Tensor, "count dim"]) -> Float[Tensor, " count"]:
+        """Return mean - coefficient * standard deviation at points."""
+        covariance = self.covariance.across(u, self.known)[0]
+        deviation = _deviation(self.factor.whiten(covariance))
+        return covariance @ self.weights - self.coefficient * deviation
+
+    @torch.no_grad()
+    def with_slope(self, u: Float[Tensor, "count dim"]) -> tuple[Float[Tensor, " count"], Float[Tensor, "count dim"]]:
+        """Return the bound at points, and its slopes there."""
+        covariance, pull = self.covariance.across(u, self.known)
+        white = self.factor.whiten(covariance)
+        deviation = _deviation(white)
+        # variance = 1 - c K^-1 c, so that the deviation's slope by c is -K^-1 c / deviation
+        by_covariance = self.weights + self.factor.solve_whitened(white) * (self.coefficient / deviation)[:, None]
+        return covariance @ self.weights - self.coefficient * deviation, pull(by_covariance)
+
+
+def _deviation(white: Matrix) -> Float[Tensor, " count"]:
+    return (1.0 - white.square().sum(dim=1)).clamp_min(1e-20).sqrt()
+
+
+def least_point(bound: LowerBound, z: Points, loss: Points, random: np.random.Generator) -> Points:
+    """Return where in [-1, 1]^dim the bound is least, shape (dim,), given the points z and their losses so far."""
+
+    def at(x: Points) -> tuple[Points, Points]:
+        value, slope = bound.with_slope(torch.from_numpy(x))
+        return value.numpy(), slope.numpy()
+
+    starts = _starts(bound, z, loss, random).numpy()
+    minimise: Any = fmin_l_bfgs_b_batched  # untyped
+    how = {"bounds": [(0.0, 1.0)] * z.shape[1], "factr": None, "ftol": BOUND_TOLERANCE}
+    found, least, _ = minimise(at, starts, maxiter=STEPS, **how)
+    return np.asarray(2.0 * found[np.argmin(least)] - 1.0)
+
+
+def _starts(bound: LowerBound, z: Points, loss: Points, random: np.random.Generator) -> Float[Tensor, "start dim"]:
+    """Return where the search for the least bound starts: the best of many points all over, and near the best."""
+    leaders = z[np.argsort(loss, kind="stable")[:8]]
+    near = np.resize(leaders, (NEAR, z.shape[1])) + 2 * JITTER * random.standard_normal((NEAR, z.shape[1]))
+    near[: len(leaders)] = leaders
+    groups = (random.uniform(-1.0, 1.0, (SPREAD, z.shape[1])), near.clip(-1.0, 1.0))
+    return torch.cat([u[bound(u).topk(STARTS // 2, largest=False).indices] for u in map(unit, groups)])
+
+
+def unit(z: Points) -> Float[Tensor, "count dim"]:
+    """Return points of [-1, 1]^dim as points of [0, 1]^dim."""
+    return torch.from_numpy((z + 1.0) / 2.0)
+
+
+@contextmanager
+def exclusive() -> Iterator[None]:
+    """Keep other threads out, let torch use one core, and quiet what is no news: iteration limits, jitter added."""
+    with ONE_AT_A_TIME, one_torch_thread(), warnings.catch_warnings():
+        for category in (BotorchWarning, NumericalWarning, GPInputWarning):
+            warnings.simplefilter("ignore", category)
+        yield
 
 
 @dataclass(frozen=True)
@@ -79,7 +163,7 @@ class SurrogateOptions(MethodOptions):
             raise ValueError(f"{self.method} option kernel takes {' or '.join(known)}; got {self.kernel}")
 
 
-class Surrogate:
+class Surrogate(Part):
     """Model losses over the box scaled to [-1, 1] by an exact Gaussian process, float64, whose mean is zero.
 
     Losses are standardised before, so that zero is their average and one their spread: a raw zero mean would promise
@@ -107,17 +191,6 @@ class Surrogate:
         """Take in points, shape (count, dim), and their losses, shape (count,), +inf where an episode failed."""
         self.z = np.concatenate([self.z, z])
         self.loss = np.concatenate([self.loss, loss])
-
-    def state(self) -> dict[str, Any]:
-        """Return what the process knows, as data."""
-        learnt = {"fitted": self._fitted, "hyper": self._hyper, "chosen": self._chosen, "seen": self._seen}
-        return {"z": self.z, "loss": self.loss, **learnt}
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        """Take back what `state` returned."""
-        self.z, self.loss = state["z"].reshape(-1, self.z.shape[1]), state["loss"]
-        self._fitted, self._hyper = int(state["fitted"]), dict(state["hyper"])
-        self._chosen, self._seen = state["chosen"], int(state["seen"])
 
     def minimise(self, random: np.random.Generator) -> Asking[Points]:
         """Return where mean - coefficient * standard deviation is least, shape (dim,); a random point before."""
@@ -155,13 +228,13 @@ class Surrogate:
         return unit(self.z[rows])
 
     def _covariance(self) -> Covariance:
-        return Radial(self.options.kernel, torch.from_numpy(self._hyper["scale"]))
+        return KERNELS[self.options.kernel](torch.from_numpy(self._hyper["scale"]))
 
     def _values(self, rows: Rows) -> Points:
         """Return a number for each row of the process: losses in deviations from their average, as BoTorch has them."""
         loss = self._losses()[rows]
         spread = float(loss.std(ddof=1)) if len(loss) > 1 else 0.0
-        return np.asarray((loss - loss.mean()) / (spread if spread >= LEAST_SPREAD else 1.0))
+        return np.asarray((loss - loss.mean()) / (spread if spread >= MIN_SPREAD else 1.0))
 
     def _losses(self) -> Points:
         finite = np.isfinite(self.loss)

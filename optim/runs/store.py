@@ -1,7 +1,7 @@
-"""A run on disk: every point an optimiser evaluated, and what it goes on from.
+"""A run on disk: every point an optimiser evaluated, and what it is continued from.
 
 A run is a zarr group of columns along `evaluation`, as long as the budget; a row without a status is not there yet.
-Beside the columns lies the file `state` (see `journal`): it counts the rows and those the optimiser has been told, has
+Beside the columns lies the file `state` (see `Journal`): it counts the rows and those the optimiser has been told, has
 their checksums, and then the optimiser itself, its random numbers included, as data that is read and never run. Rows
 are written first, that file at once after them, so rows it does not count do not exist: whatever is lost by stopping a
 run at any instant is computed again, to the same bits. Rows that are not what the file says are damage, which is
@@ -15,10 +15,16 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import hashlib
+import io
+import json
 import os
 import time
+import zlib
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -30,37 +36,228 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ...landscapes.identity import ERROR, StoreError, StoreExistsError, check_identity, current_identity
-from ...landscapes.objective import Evaluation, failed
+from ...landscapes.identity import (
+    ERROR,
+    StoreError,
+    StoreExistsError,
+    check_identity,
+    current_identity,
+    record_parameters,
+    with_package,
+)
+from ...landscapes.objective import Evaluation, Status, failed
+from ...landscapes.plain import plain_json
 from ...landscapes.space import ParameterSpace
-from ...landscapes.storage.files import placing, resolve
-from ...landscapes.storage.layout import FILL, consolidate, open_group
-from ...landscapes.storage.ownership import check_ours, clear_halves, has_lost_root
+from ...landscapes.storage.files import placing, replacing, resolve
+from ...landscapes.storage.layout import FILL, consolidate, create_array, flags, open_group
+from ...landscapes.storage.ownership import check_ours, clear_halves, has_lost_root, store_files
 from ..base import Kind
 from . import RUN as RUN
-from .arrays import (
-    COLUMNS,
-    FILES,
-    FORMAT,
-    FORWARD_EQUIVALENTS,
-    Columns,
-    attributes_of,
-    dims_of,
-    empty,
-    lay_out,
-    plain_attributes,
-    read_rows,
-)
-from .journal import CHUNK, STATE, Journal, checksums, damage_error, digest_of, find_damage
 from .run import Run
-from .state import decode, encode
 
+ARRAY = "__array__"  # stands in the outline for the number of an array
+STATE = "state"
+CHUNK = 64  # rows
+CHANGING = {"budget", "gradient_cost", ERROR}  # attributes of a run that are not what they were when it was made
+FORMAT = 2
+DEEP = ("x", "grad")
+COLUMNS: dict[str, tuple[str, dict[str, Any]]] = {  # status last: a row that has one is whole
+    "x": ("float64", {"long_name": "parameters, each in its own unit"}),
+    "loss": ("float64", {"long_name": "loss"}),
+    "grad": ("float64", {"long_name": "gradient of the loss by each parameter in its own unit"}),
+    "slope": ("float64", {"long_name": "length of the gradient"}),
+    "kind": ("int8", {"long_name": "what the point was evaluated for", **flags(Kind)}),
+    "episodes": ("int64", {"long_name": "episodes so far"}),
+    "forwards": ("float64", {"long_name": "episodes so far, in episodes without gradient"}),
+    "seconds": ("float64", {"long_name": "time so far", "units": "s"}),
+    "status": ("int8", {"long_name": "how the evaluation ended", **flags(Status)}),
+}
+Columns = dict[str, NDArray[Any]]
+FILES = store_files((*COLUMNS, "dim"), STATE)  # of a run on disk
 PAUSE = 1.0  # least seconds between two writes, so that quick episodes are not held up
 SHARE = 0.05  # most of the time that may go into writing, that of all runs that go on abreast
 
 
+def encode(state: Any) -> bytes:
+    """Return a state as the bytes of an `.npz` file: its arrays by number, and as `outline` the rest, which is JSON.
+
+    Raises TypeError where something in it is no number, string, array, list or mapping.
+    """
+    arrays: list[NDArray[Any]] = []
+
+    def stand_in(value: object) -> Any:
+        if isinstance(value, np.ndarray) and value.dtype != object:
+            arrays.append(value)
+            return {ARRAY: len(arrays) - 1}
+        if isinstance(value, np.generic):
+            return value.item()
+        raise TypeError(f"a state holds numbers, strings and arrays; got a {type(value).__name__}")
+
+    outline = json.dumps(state, default=stand_in).encode()
+    kept = io.BytesIO()
+    numbered = {str(number): array for number, array in enumerate(arrays)}
+    np.savez(kept, outline=np.frombuffer(outline, np.uint8), **numbered)  # type: ignore[arg-type]
+    return kept.getvalue()
+
+
+def decode(kept: bytes) -> Any:
+    """Return the state that `encode` wrote; tuples come back as lists."""
+    with np.load(io.BytesIO(kept), allow_pickle=False) as arrays:
+
+        def put_back(found: dict[str, Any]) -> Any:
+            return arrays[str(found[ARRAY])] if ARRAY in found else found
+
+        return json.loads(arrays["outline"].tobytes(), object_hook=put_back)
+
+
+@dataclass(frozen=True)
+class Journal:
+    """What the file `state` of a run holds: which rows count, their checksums, and what the optimiser continues from.
+
+    Its first line is the SHA-256 digest of all that follows, its second a JSON object, and the rest what `encode`
+    wrote. A file that is not what was written is refused, whatever became of it. `rows` are there, `told` of them the
+    optimiser has been told; `sums` are the checksums of every 64 of them. `gradient_cost` is that of the run, `about`
+    the digest of what the run says of itself; `state` is encoded.
+    """
+
+    rows: int = 0
+    told: int = 0
+    gradient_cost: float | None = None
+    about: str = ""
+    sums: list[int] = field(default_factory=list)
+    state: bytes = b""
+
+    def write(self, run: Path) -> None:
+        """Write the file into a run's folder, whole or not at all."""
+        head = asdict(replace(self, state=b"")) | {"state": len(self.state)}
+        content = json.dumps(head).encode() + b"\n" + self.state
+        with replacing(run / STATE) as partial:
+            partial.write_bytes(hashlib.sha256(content).hexdigest().encode() + b"\n" + content)
+
+    @classmethod
+    def read(cls, run: Path) -> Journal:
+        """Read the file of a run. Raises StoreError, which names it, where it is missing or not what was written."""
+        try:
+            digest, _, content = (run / STATE).read_bytes().partition(b"\n")
+        except OSError as error:
+            raise damage_error(run / STATE, f"it cannot be read ({error.strerror})") from None
+        if digest.decode(errors="replace") != hashlib.sha256(content).hexdigest():
+            raise damage_error(run / STATE, "it is not what was written")
+        head, _, state = content.partition(b"\n")
+        try:
+            return cls(**(json.loads(head) | {"state": state}))
+        except (TypeError, ValueError) as error:
+            raise damage_error(run / STATE, str(error)) from None
+
+
+def damage_error(path: Path, why: str) -> StoreError:
+    """Return the error that says of a run, or of a file in it, that it is not what was written."""
+    return StoreError(f"{path} is damaged: {why}; restore it, or begin the run anew in another folder")
+
+
+def digest_of(attributes: Mapping[str, Any]) -> str:
+    """Return a digest of what a run says of itself, but for what changes while it is filled."""
+    lasting = {name: value for name, value in attributes.items() if name not in CHANGING}
+    return hashlib.sha256(json.dumps(lasting, sort_keys=True).encode()).hexdigest()
+
+
+def checksums(columns: Mapping[str, NDArray[Any]], count: int, known: list[int]) -> list[int]:
+    """Return the checksum of every 64 of the first `count` rows, given those of the first ones.
+
+    Each begins with the number of its first row, so that rows in another place have another one.
+    """
+    found = list(known)
+    for low in range(len(known) * CHUNK, count, CHUNK):
+        total = zlib.crc32(str(low).encode())
+        for values in columns.values():
+            total = zlib.crc32(values[low : min(low + CHUNK, count)].tobytes(), total)
+        found.append(total)
+    return found
+
+
+def find_damage(sums: list[int], journal: Journal) -> range | None:
+    """Return the first rows whose checksum is not the journal's, None where all are right."""
+    for low, pair in zip(range(0, journal.rows, CHUNK), zip_longest(sums, journal.sums), strict=False):
+        if len({*pair}) > 1:
+            return range(low, min(low + CHUNK, journal.rows))
+    return None
+
+
+def empty(rows: int, dim: int) -> Columns:
+    """Return columns of so many rows, in which nothing is yet."""
+    return {
+        name: np.full((rows, dim) if name in DEEP else rows, FILL[dtype], dtype) for name, (dtype, _) in COLUMNS.items()
+    }
+
+
+def read_rows(path: Path, group: zarr.Group, name: str, rows: int, dim: int) -> NDArray[Any]:
+    """Return the first rows of a column of the run at `path`.
+
+    Raises StoreError, which names the column, where they cannot be read.
+    """
+    wanted = empty(0, dim)[name]
+    try:
+        array: Any = group[name]
+        if (array.dtype, array.shape[1:], array.chunks[0]) != (wanted.dtype, wanted.shape[1:], CHUNK):
+            raise ValueError("its layout is not what it was made")
+        if array.shape[0] < rows:
+            raise ValueError(f"it has room for {array.shape[0]} rows, and {rows} were written")
+        return np.asarray(array[:rows])
+    except Exception as error:  # whatever a missing array, a damaged layout or a codec raises
+        raise damage_error(path / name, f"it cannot be read ({' '.join(str(error).split())})") from None
+
+
+def plain_attributes(attributes: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a run's attributes as any format of files has them; what is not known yet is left out."""
+    known = {name: value for name, value in attributes.items() if value is not None and name != "units"}
+    return {name: json.dumps(value) if isinstance(value, dict) else value for name, value in known.items()}
+
+
+def dims_of(column: str) -> tuple[str, ...]:
+    """Return the names of a column's dimensions."""
+    return ("evaluation", "dim") if column in DEEP else ("evaluation",)
+
+
+def attributes_of(
+    space: ParameterSpace, identity: Mapping[str, Any], provenance: Mapping[str, Any], budget: int
+) -> dict[str, Any]:
+    """Return what a run says of itself, on disk as attributes of its group."""
+    box = {**record_parameters(space), "lower": space.lower.tolist(), "upper": space.upper.tolist()}
+    whole = plain_json({**identity, **box}, "a run's identity")
+    return {
+        "gradscape_run": FORMAT,
+        "env": whole.get("objective", ""),
+        "method": whole.get("method", ""),
+        "seed": whole.get("seed", 0),
+        "budget": budget,
+        "fidelity": whole.get("fidelity", ""),
+        "loss_unit": str(provenance.get("loss_unit", "")),
+        "units": list(space.units),
+        "lower": whole["lower"],
+        "upper": whole["upper"],
+        "gradient_cost": None,
+        "identity": whole,
+        "provenance": plain_json(with_package(provenance), "a run's provenance"),
+    }
+
+
+def lay_out(group: zarr.Group, attributes: dict[str, Any]) -> None:
+    """Make the empty arrays of a run."""
+    group.attrs.update(attributes)
+    budget, parameters = attributes["budget"], attributes["identity"]["parameters"]
+    for name, (dtype, about) in COLUMNS.items():
+        unit = {"units": attributes["loss_unit"]} if name == "loss" else {}
+        deep = (len(parameters),) if name in DEEP else ()
+        create_array(group, name, (budget, *deep), (CHUNK, *deep), dims_of(name), dtype, **{**about, **unit})
+    axis = create_array(
+        group, "dim", (len(parameters),), (len(parameters),), ("dim",), "string",
+        long_name="parameter", units=attributes["units"],
+    )  # fmt: skip
+    axis[:] = np.array(parameters, dtype=object)
+
+
 class RunStore:
-    """Keep what an optimiser evaluates, row by row, so that a run stopped at any instant can go on.
+    """Keep what an optimiser evaluates, row by row, so that a run stopped at any instant can be continued.
 
     Make one with `create`, `open`, `open_or_create` or `in_memory`; `search` fills it. `identity` holds what decides
     the numbers (objective, options, fidelity, device, method, its options, seed); the budget is not of it, since a run
@@ -312,7 +509,7 @@ class RunStore:
             "slope": grad.norm(dim=1).numpy(),
             "kind": int(kind),
             "episodes": self.count + number,
-            FORWARD_EQUIVALENTS: self._last(FORWARD_EQUIVALENTS) + cost * number,
+            "forwards": self._last("forwards") + cost * number,
             "seconds": self._last("seconds") + seconds,
             "status": evaluation.status.numpy(),
         }

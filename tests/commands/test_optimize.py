@@ -95,44 +95,6 @@ def test_every_different_run_has_a_folder_of_its_own(run: Callable[..., Said], t
     assert folders == ["branin-cma-es-exact-s0"] * 2 + ["branin-cma-es-exact-s1", "branin-random-exact-s0"]
 
 
-def test_a_folder_of_other_files_is_left_alone(run: Callable[..., Said], tmp_path: Path) -> None:
-    (tmp_path / "mine").mkdir()
-    (tmp_path / "mine/progress.png").write_text("precious")
-    for extra in ([], ["--force"]):
-        done = run(*QUICK, "--out", "mine", *extra, cwd=tmp_path)
-        assert done.returncode == 2
-        assert "holds other files and no run" in done.stderr
-    assert (tmp_path / "mine/progress.png").read_text() == "precious"
-
-
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (["optimize", "brannin", "--method", "random"], "did you mean branin?"),
-        (["optimize", "branin", "--method", "cma"], "no method is called 'cma'; did you mean cma-es?"),
-        (["optimize", "branin", "--method", "random", "--budget", "0"], "--budget"),
-        (["optimize", "branin", "--method", "random", "--seed", "-1"], "--seed"),
-        (["optimize", "branin", "--method", "random", "--option", "sigma=1"], "random has no option 'sigma'"),
-        (["optimize", "branin", "--method", "cma-es", "--option", "sigma=big"], "sigma takes a number; got 'big'"),
-        (["optimize", "branin", "--method", "cma-es", "--option", "sigma"], "--option takes name=value; got 'sigma'"),
-        (["optimize", "branin", "--method", "cma-es", "--option", "sigma=0"], "from 1e-09 to 1000; got 0.0"),
-        (["optimize", "branin", "--method", "random", "--fidelity", "best"], "has fidelities exact; got 'best'"),
-        (["optimize", "branin", "--method", "random", "--set", "dim=3"], "branin has no option 'dim'"),
-        (["methods", "newton"], "no method is called 'newton'"),
-    ],
-)
-def test_bad_input_gets_one_line_and_exit_code_2(
-    run: Callable[..., Said], tmp_path: Path, arguments: list[str], said: str
-) -> None:
-    done = run(*arguments, cwd=tmp_path)
-    assert done.returncode == 2
-    assert done.stdout == ""
-    assert done.stderr.startswith("landscape: ")
-    assert len(done.stderr.splitlines()) == 1
-    assert said in done.stderr
-    assert not list(tmp_path.iterdir())
-
-
 def test_methods_lists_them_all_and_shows_one_in_full(
     run: Callable[..., Said], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from gradscape.landscapes.storage.records import read_json
 from gradscape.optim.registry import methods
 from gradscape.optim.runs.store import RunStore
 
@@ -22,7 +23,7 @@ RACE = ["race", "branin", "--methods", "random,cma-es", "--methods", "descents",
 def test_race_leaves_runs_picture_and_figures(run: Callable[..., Said], tmp_path: Path) -> None:
     done = run(*RACE, "--json", "--out", "r", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    said, kept = json.loads(done.stdout), json.loads((tmp_path / "r/race.json").read_text())
+    said, kept = json.loads(done.stdout), read_json(tmp_path / "r/race.json")
     assert said == {key: kept[key] for key in kept if key not in ("curves", "ecdf")} | {"folder": "r"}
     assert kept["methods"] == ["random", "cma-es", "descents"]
     assert "360 episodes to compute" in done.stderr
@@ -95,38 +96,6 @@ def test_all_methods_that_can_run_here_race_by_default_and_by_name(run: Callable
     )
     assert named == default
     assert {name for name, one in methods().items() if not one.extra} <= set(named)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (["race", "nothing"], "no environment is called 'nothing'"),
-        (["race", "branin", "--methods", "random,magic"], "no method is called 'magic'"),
-        (
-            ["race", "branin", "--methods", "random", "--option", "cma-es.sigma=1"],
-            "METHOD.NAME=VALUE for one of random",
-        ),
-        (["race", "branin", "--methods", "cma-es", "--option", "cma-es.speed=1"], "cma-es has no option 'speed'"),
-        (["race", "branin", "--seeds", "0"], "--seeds"),
-        (["race", "branin", "--workers", "2", "--scheduler", "local:2"], "--scheduler has workers of its own"),
-    ],
-)
-def test_bad_input_gets_one_line_and_leaves_nothing(
-    run: Callable[..., Said], tmp_path: Path, arguments: list[str], said: str
-) -> None:
-    done = run(*arguments, cwd=tmp_path)
-    assert done.returncode == 2
-    assert said in done.stderr
-    assert len(done.stderr.splitlines()) == 1
-    assert not list(tmp_path.iterdir())
-
-
-def test_a_folder_with_other_files_is_refused(run: Callable[..., Said], tmp_path: Path) -> None:
-    (tmp_path / "r").mkdir()
-    (tmp_path / "r/thesis.tex").write_text("mine")
-    done = run(*RACE, "--out", "r", cwd=tmp_path)
-    assert done.returncode == 2
-    assert "holds other files and no race" in done.stderr
 
 
 LONG = ["race", "bounce", "--methods", "random,descents", "--fidelity", "draft", "--budget", "40", "--seeds", "2"]

@@ -24,10 +24,10 @@ from gradscape.landscapes.identity import DamagedError, plane_of, stored_identit
 from gradscape.landscapes.overlay import IMPROVEMENTS_OF, best_point, lowered
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.landscapes.storage.store import open_slice
-from gradscape.optim.curves import best_so_far
 from gradscape.optim.race import Race
 from gradscape.optim.runs.run import Run
 from gradscape.optim.search import search
+from gradscape.optim.statistics import best_so_far
 
 FIGURES = [
     Figure("branin", "branin", (0, 1), resolution=8, fidelity="exact", over=""),
@@ -56,7 +56,7 @@ def compute(data: Path, *arguments: str) -> int:
 def race(tmp_path_factory: pytest.TempPathFactory) -> Race:
     env = make("branin", device="cpu")
     out = tmp_path_factory.mktemp("race")
-    return RaceJob.of(env, ("random", "cma-es"), budget=20, seeds=3, command="landscape race", out=out).run().race
+    return RaceJob.of(env, ("random", "cma-es"), budget=20, seeds=3, command="landscape race", out=out).run()
 
 
 def test_a_scene_is_raced_once_for_all_its_figures_and_kept(small: Path, capsys: pytest.CaptureFixture[str]) -> None:

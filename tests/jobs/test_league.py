@@ -12,9 +12,9 @@ from gradscape.envs.functions import Branin
 from gradscape.envs.registry import make
 from gradscape.gallery.paper import read_paper
 from gradscape.jobs.league import LeagueJob, simulated_scenes
-from gradscape.jobs.methods import divide_methods
 from gradscape.jobs.race import RaceJob
 from gradscape.jobs.scene import SceneSpec, read_scene
+from gradscape.jobs.search import divide_methods
 from gradscape.jobs.watch import Stopped, Watch
 from gradscape.landscapes.convert import from_json, to_json
 from gradscape.landscapes.storage.records import read_json
@@ -61,7 +61,7 @@ def test_a_league_has_the_races_that_each_scene_has_alone(tmp_path: Path) -> Non
     assert [scene.env for scene in league.scenes] == ["branin", "beale"]
     for scene in league.scenes:
         env = make(scene.env, device="cpu")
-        alone = RaceJob.of(env, METHODS, budget=12, seeds=2, command="", out=tmp_path / scene.env).run().race
+        alone = RaceJob.of(env, METHODS, budget=12, seeds=2, command="", out=tmp_path / scene.env).run()
         ranks = {rank.method: (rank.rank, rank.mean, rank.low) for rank in alone.statistics.ranks}
         assert {one.method: (one.rank, one.mean, one.low) for one in scene.standings} == ranks
         assert scene.pairs == tuple(alone.statistics.superiorities)
@@ -160,12 +160,6 @@ def test_what_is_no_league_is_refused_before_anything_is_made(
     with pytest.raises(ValueError, match=said):
         job(tmp_path, *scenes, **how)
     assert not list(tmp_path.iterdir())
-
-
-def test_a_folder_with_other_files_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "thesis.tex").write_text("mine")
-    with pytest.raises(ValueError, match=r"holds other files and no league: thesis\.tex"):
-        job(tmp_path, "branin")
 
 
 def test_a_name_says_its_fidelity_and_a_path_does_not() -> None:

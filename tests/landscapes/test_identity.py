@@ -23,8 +23,7 @@ from gradscape.landscapes.storage.checkpoint import SETTINGS, Checkpoint
 from gradscape.landscapes.storage.layout import consolidate
 from gradscape.landscapes.storage.store import SliceStore, open_slice
 from gradscape.optim.registry import optimizer_class
-from gradscape.optim.runs.journal import Journal, digest_of
-from gradscape.optim.runs.store import RunStore
+from gradscape.optim.runs.store import Journal, RunStore, digest_of
 
 OLD = {"code": "9b9583bcc31d", "gradscape": "0.1.0"}  # what identities held before there were versions
 NOW = {"objective": "branin", "model_version": 1, "seed": 0}

@@ -8,9 +8,8 @@ from botorch.models import SingleTaskGP
 from gradscape.landscapes.objective import Objective
 from gradscape.optim.base import Optimizer, Points
 from gradscape.optim.lockstep import answer_alone
-from gradscape.optim.methods.bound import exclusive
-from gradscape.optim.methods.surrogate import Surrogate
-from gradscape.optim.runs.state import decode, encode
+from gradscape.optim.methods.surrogate import Surrogate, exclusive
+from gradscape.optim.runs.store import decode, encode
 
 T = TypeVar("T", bound=Optimizer)
 

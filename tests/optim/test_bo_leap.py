@@ -1,18 +1,13 @@
 import math
 
 import numpy as np
-import pytest
-import torch
 
 from gradscape.envs.adapters import from_torch
 from gradscape.envs.registry import make
-from gradscape.landscapes.objective import Evaluation, Objective, Status
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.optim.base import Kind
 from gradscape.optim.methods.bo_leap import BOLeap, BOLeapOptions, SemiLocal
 from gradscape.optim.search import search
-
-from .states import restored
 
 SPACE = ParameterSpace.box(("x", "y", "z"), -2.0, 4.0, "m")
 RIPPLES = from_torch(lambda x: ((x - 0.5) ** 2).sum(dim=1) + (4 * x).cos().sum(dim=1), SPACE)
@@ -113,50 +108,3 @@ def test_a_new_proposal_is_made_once_the_local_budget_is_spent(monkeypatch):
     assert len(between) >= 3
     assert (between >= 25).all()
     assert (between < 25 + 14).all()
-
-
-def test_the_process_sees_population_and_descents_failures_and_all():
-    class Hole(Objective):
-        space = SPACE
-
-        def evaluate(self, x, *, grad=True):
-            loss = torch.where(x[:, 0] < -0.5, torch.nan, ((x - 0.5) ** 2).sum(dim=1))
-            return Evaluation.from_results(loss, 2 * (x - 0.5) if grad else None)
-
-    optimizer = BOLeap(SPACE, seed=4)
-    ends = []
-    for _ in range(40):
-        ask = optimizer.ask()
-        ends.append((ask.x, evaluation := Hole().evaluate(ask.x, grad=ask.grad)))
-        optimizer.tell(ask.x, evaluation)
-    x = torch.cat([x for x, _ in ends])
-    loss = torch.cat([e.loss for _, e in ends])
-    assert torch.isnan(loss).sum() > 3
-    np.testing.assert_allclose(1.0 + 3.0 * optimizer.surrogate.z, x, atol=1e-12)
-    np.testing.assert_array_equal(optimizer.surrogate.loss, torch.nan_to_num(loss, nan=math.inf))
-
-
-def test_points_lie_in_the_box():
-    table = search(RIPPLES, BOLeap(SPACE, seed=2), budget=60, gradient_cost=2.0).dataset()
-    assert (np.abs(table["x"] - 1.0) <= 3.0).all()
-    assert (table["status"] == Status.OK).all()
-
-
-def test_a_seed_decides_every_point_bit_for_bit_through_its_state_too():
-    options = BOLeapOptions(local_budget=30)
-    plain, kept, other = (BOLeap(SPACE, seed=seed, options=options) for seed in (7, 7, 8))
-    before = np.random.get_state()[1].copy()
-    for _ in range(40):
-        asks = [one.ask() for one in (plain, kept, other)]
-        assert torch.equal(asks[0].x, asks[1].x)
-        assert asks[0].x.shape != asks[2].x.shape or not torch.equal(asks[0].x, asks[2].x)
-        for one, ask in zip((plain, kept, other), asks, strict=True):
-            one.tell(ask.x, RIPPLES.evaluate(ask.x, grad=ask.grad))
-        kept = restored(kept, RIPPLES)
-    np.testing.assert_array_equal(before, np.random.get_state()[1])
-
-
-@pytest.mark.parametrize("wrong", [{"best": 0}, {"best": 10}, {"sigma": 0.0}, {"local_budget": 0}])
-def test_a_search_that_cannot_be_is_refused(wrong):
-    with pytest.raises(ValueError, match=next(iter(wrong))):
-        BOLeap(SPACE, options=BOLeapOptions(**wrong))

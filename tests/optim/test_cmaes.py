@@ -165,20 +165,6 @@ def test_nothing_is_printed_written_or_warned_of(tmp_path, monkeypatch, capfd) -
     assert [path.name for path in tmp_path.iterdir()] == ["cma_signals.in"]
 
 
-@pytest.mark.parametrize(
-    ("dim", "options", "said"),
-    [
-        (1, {}, "two parameters or more; this space has 1"),
-        (2, {"sigma": 0.0}, "option sigma takes numbers from 1e-09 to 1000; got 0.0"),
-        (2, {"population": 2}, "population takes 0 or at least 3; got 2"),
-    ],
-)
-def test_what_cannot_work_is_refused(dim: int, options: dict[str, float], said: str) -> None:
-    space = ParameterSpace.box([f"x{i}" for i in range(dim)], 0.0, 1.0)
-    with pytest.raises(ValueError, match=said):
-        CMAES(space, options=CMAESOptions(**options))
-
-
 def test_options_reach_the_library() -> None:
     optimizer = CMAES(BOX, options=CMAESOptions(sigma=0.1, population=12))
     assert optimizer.strategy.sigma == 0.1

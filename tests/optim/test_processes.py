@@ -55,8 +55,8 @@ def test_a_process_computes_the_same_bits_and_what_it_has_learnt_comes_back(core
         states.append([(one.state(), drawn.bit_generator.state) for one, drawn in zip(surrogates, random, strict=True)])
     np.testing.assert_array_equal(*found)
     for (one, drawn), (other, redrawn) in zip(*states, strict=True):
-        assert one["fitted"] == other["fitted"] == KNOWN
-        assert all(np.array_equal(one["hyper"][name], other["hyper"][name]) for name in one["hyper"])
+        assert one["_fitted"] == other["_fitted"] == KNOWN
+        assert all(np.array_equal(one["_hyper"][name], other["_hyper"][name]) for name in one["_hyper"])
         assert drawn == redrawn
     assert torch.get_num_threads() == cores
     torch.set_num_threads(before)

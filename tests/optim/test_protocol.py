@@ -1,5 +1,8 @@
-"""What docs/races.md says of a fair race: methods with the same seed begin at the same point."""
+"""What holds of every method: how it begins, what its seed decides, and which options it refuses."""
 
+import math
+
+import numpy as np
 import pytest
 import torch
 
@@ -7,10 +10,24 @@ from gradscape.envs.adapters import from_torch
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.optim.registry import methods, optimizer_class
 
+from .states import restored
+
 SPACE = ParameterSpace.box(("a", "b", "c"), -1.0, 1.0)
 BOWL = from_torch(lambda x: (x**2).sum(dim=1), SPACE, name="bowl")
 AROUND = ("cma-es", "cma-es-gradient", "bo-leap")  # draw a population around their first point
-ELSEWHERE = ("ppo", "sac")  # begin with a policy
+ELSEWHERE = ("ppo", "sac")  # begin with a policy; see test_policy.py
+EGGS = from_torch(  # Rastrigin's function
+    lambda x: (x**2 - 10.0 * torch.cos(2.0 * math.pi * x) + 10.0).sum(dim=1),
+    ParameterSpace.box(("a", "b"), -4.0, 5.0),
+    name="rastrigin",
+)
+QUICK = {"bo-leap": {"local_budget": 30}, "bo": {"initial": 5}, "bo-descents": {"initial": 5}}
+REFUSED = {  # what is not the range of one option alone, and of some ranges an end
+    "cma-es": [({"population": 2}, "population takes 0 or at least 3; got 2"), ({"sigma": 0.0}, "from 1e-09 to 1000")],
+    "descents": [({name: 0.0}, name) for name in ("step", "shrink")] + [({"max_step": -1.0}, "max_step")],
+    "bo": [({"coefficient": -1.0}, "coefficient")],
+    "bo-leap": [({"best": 0}, "best"), ({"best": 10}, "best"), ({"local_budget": 0}, "local_budget")],
+}
 
 
 @pytest.mark.parametrize("name", [name for name in methods() if name not in ELSEWHERE])
@@ -34,3 +51,42 @@ def test_surrogates_are_told_the_same_points_first(name):
         optimizer.tell(proposal.x, BOWL.evaluate(proposal.x, grad=proposal.grad))
         found += list(proposal.x)
     torch.testing.assert_close(torch.stack(found[:6]), wanted, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", [name for name in methods() if name not in ELSEWHERE])
+def test_a_seed_decides_every_point_bit_for_bit_through_its_state_too(name):
+    kind = optimizer_class(name)
+    options, before = kind.Options(**QUICK.get(name, {})), np.random.get_state()[1].copy()
+    plain, kept, other = (kind.on(EGGS, seed=seed, options=options) for seed in (7, 7, 8))
+    same = []
+    for _ in range(25 if name == "bo" else 50):
+        asks = [one.ask() for one in (plain, kept, other)]
+        assert torch.equal(asks[0].x, asks[1].x)
+        assert (asks[0].kind, asks[0].grad) == (asks[1].kind, asks[1].grad)
+        same.append(torch.equal(asks[0].x, asks[2].x))
+        assert bool(((asks[0].x >= EGGS.space.lower) & (asks[0].x <= EGGS.space.upper)).all())
+        for one, ask in zip((plain, kept, other), asks, strict=True):
+            one.tell(ask.x, EGGS.evaluate(ask.x, grad=ask.grad))
+        kept = restored(kept, EGGS)
+    assert sum(same) < len(same) / 5  # searches may meet at a corner
+    np.testing.assert_array_equal(before, np.random.get_state()[1])
+
+
+@pytest.mark.parametrize(("name", "number"), [(name, n) for name, rows in REFUSED.items() for n in range(len(rows))])
+def test_options_that_cannot_work_are_refused(name, number):
+    options, said = REFUSED[name][number]
+    with pytest.raises(ValueError, match=said):
+        optimizer_class(name).Options(**options)
+
+
+@pytest.mark.parametrize(
+    ("name", "dim", "said"),
+    [
+        ("cma-es", 1, "two parameters or more; this space has 1"),
+        ("bo-leap", 1, "two parameters or more; this space has 1"),
+        ("bo-gradient", 50, "bo-gradient models slopes of 49 parameters at most; this space has 50"),
+    ],
+)
+def test_a_space_that_a_method_cannot_search_is_refused(name, dim, said):
+    with pytest.raises(ValueError, match=said):
+        optimizer_class(name)(ParameterSpace.box([f"x{n}" for n in range(dim)], -1.0, 1.0))

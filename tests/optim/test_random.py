@@ -19,9 +19,3 @@ def test_points_are_uniform_in_the_box_whatever_their_losses() -> None:
         assert kstest(axis, "uniform").pvalue > 0.01
     assert abs(np.corrcoef(u.T)[0, 1]) < 0.05
     assert (table["kind"] == Kind.RANDOM).all()
-
-
-def test_a_seed_decides_every_point() -> None:
-    one, again, other = (search(FLAT, RandomSearch(SPACE, seed=seed), budget=20).dataset()["x"] for seed in (1, 1, 2))
-    np.testing.assert_array_equal(one, again)
-    assert not np.isin(one, other).any()

@@ -12,22 +12,13 @@ from scipy.optimize import Bounds, basinhopping, minimize
 from gradscape.envs.adapters import from_torch
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.optim.base import Kind
-from gradscape.optim.methods.adam import Adam, AdamOptions
-from gradscape.optim.methods.bayes import BO
-from gradscape.optim.methods.bayes_gradient import BOGradient, GradientProcess, standardised
-from gradscape.optim.methods.bound import LowerBound
-from gradscape.optim.methods.cmaes import CMAES
-from gradscape.optim.methods.cmaes_gradient import CMAESGradient
-from gradscape.optim.methods.fit import closure_of
-from gradscape.optim.methods.process import Process, covariance_of
+from gradscape.optim.methods.bayes import BO, BOGradient, GradientProcess, TuRBO, TuRBOOptions, region, standardised
+from gradscape.optim.methods.cmaes import CMAES, CMAESGradient
+from gradscape.optim.methods.descent import Adam, AdamOptions
+from gradscape.optim.methods.process import GradientCovariance, Process, closure_of, covariance_of
 from gradscape.optim.methods.quasi_newton import LBFGSB, BasinHopping
-from gradscape.optim.methods.sloped import Sloped
-from gradscape.optim.methods.surrogate import Surrogate, SurrogateOptions
-from gradscape.optim.methods.turbo import TuRBO, TuRBOOptions, region
-from gradscape.optim.runs.store import RunStore
+from gradscape.optim.methods.surrogate import LowerBound, Surrogate, SurrogateOptions
 from gradscape.optim.search import search
-
-from .states import restored
 
 FEW = {BOGradient: 30}  # episodes are enough for it, each of which it thinks long of
 RIVALS = [LBFGSB, BasinHopping, Adam, CMAESGradient, TuRBO, BOGradient]
@@ -78,19 +69,6 @@ def evaluated(objective, optimizer, budget):
 def test_minima_are_found(kind):
     _, losses = evaluated(BRANIN, kind.on(BRANIN, seed=1), FEW.get(kind, 200))
     assert losses.min() == pytest.approx(0.397887, abs=0.05 if kind in (Adam, TuRBO) else 1e-3)
-
-
-@pytest.mark.parametrize("kind", RIVALS)
-def test_a_run_goes_on_from_every_state_bit_for_bit(kind):
-    whole, stopped = (kind.on(EGGS, seed=2) for _ in range(2))
-    for _ in range(60):
-        proposals = [one.ask() for one in (whole, stopped)]
-        torch.testing.assert_close(proposals[1].x, proposals[0].x, rtol=0, atol=0)
-        assert proposals[0].grad == proposals[1].grad
-        found = EGGS.evaluate(proposals[0].x, grad=proposals[0].grad)
-        for one in (whole, stopped):
-            one.tell(proposals[0].x, found)
-        stopped = restored(stopped, EGGS)
 
 
 @pytest.mark.parametrize("kind", RIVALS)
@@ -208,19 +186,6 @@ def test_thompson_samples_follow_the_process():
     assert float(late.median()) < 5.0  # random points have a median of 40
 
 
-@pytest.mark.parametrize("kind", [LBFGSB, TuRBO])
-def test_rivals_are_kept_in_runs_on_disk(tmp_path, kind):
-    def run(name):
-        identity = {"objective": "rastrigin", "method": kind.name, "seed": 3}
-        return RunStore.open_or_create(tmp_path / name, EGGS.space, identity=identity, budget=60)
-
-    search(EGGS, kind.on(EGGS, seed=3), run("whole"), budget=60, gradient_cost=2.0)
-    search(EGGS, kind.on(EGGS, seed=3), run("parts"), budget=37, gradient_cost=2.0)
-    search(EGGS, kind.on(EGGS, seed=3), run("parts"), budget=60, gradient_cost=2.0)
-    one, two = (run(name).dataset() for name in ("whole", "parts"))
-    np.testing.assert_array_equal(one["x"], two["x"])
-
-
 def test_the_process_of_losses_and_slopes_is_that_of_the_closed_form():
     random = np.random.default_rng(1)
     u, loss, grad = random.uniform(size=(7, 2)), random.normal(size=7), random.normal(size=(7, 2))
@@ -267,7 +232,7 @@ def test_a_process_given_some_slopes_is_that_of_its_known_rows_alone(first):
     known[:, 0] = True
     rows = standardised(loss, grad)
     assert np.isfinite(rows).all()
-    covariance, noise, new = Sloped(torch.tensor([0.4, 0.7]).double()), 1e-3, random.uniform(size=(5, 2))
+    covariance, noise, new = GradientCovariance(torch.tensor([0.4, 0.7]).double()), 1e-3, random.uniform(size=(5, 2))
     kept, points = known.ravel(), torch.from_numpy(u)
     within = covariance.dense(points, points).numpy()[kept][:, kept] + noise * np.eye(kept.sum())
     cross = covariance.across(torch.from_numpy(new), points)[0].numpy()[:, kept]
@@ -309,9 +274,3 @@ def test_slopes_tell_the_process_more_than_losses_alone():
 
     with_slopes, without = (np.median([error(kind.on(BRANIN, seed=s)) for s in range(5)]) for kind in (BOGradient, BO))
     assert with_slopes < 0.2 * without
-
-
-def test_more_parameters_than_slopes_can_be_modelled_of_are_refused():
-    space = ParameterSpace.box([f"x{n}" for n in range(50)], -1.0, 1.0)
-    with pytest.raises(ValueError, match="bo-gradient models slopes of 49 parameters at most; this space has 50"):
-        BOGradient(space)

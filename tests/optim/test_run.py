@@ -20,8 +20,7 @@ from gradscape.landscapes.identity import StoreError
 from gradscape.landscapes.objective import Evaluation, Status
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.optim.base import Kind
-from gradscape.optim.runs.journal import CHUNK, STATE, Journal
-from gradscape.optim.runs.store import RunStore, is_run
+from gradscape.optim.runs.store import CHUNK, STATE, Journal, RunStore, is_run
 
 from ..clock import Clock
 

@@ -5,10 +5,11 @@ import pytest
 import xarray as xr
 
 from gradscape.gallery.paper import read_paper
-from gradscape.optim import bootstrap, curves, statistics, targets
+from gradscape.optim import statistics
 from gradscape.optim.base import Kind
 from gradscape.optim.claims import ClaimVerdict, check_claims
-from gradscape.optim.comparison import (
+from gradscape.optim.race import picture
+from gradscape.optim.statistics import (
     Superiority,
     difference,
     differences,
@@ -17,7 +18,6 @@ from gradscape.optim.comparison import (
     superiorities,
     win_probability,
 )
-from gradscape.optim.race import picture
 
 NAN = math.nan
 
@@ -37,29 +37,29 @@ RACE = {
 
 
 def test_a_failed_episode_improves_nothing_and_before_a_success_there_is_no_best():
-    np.testing.assert_array_equal(curves.best_so_far(np.array([NAN, 3, NAN, 5, 2])), [NAN, 3, 3, 3, 2])
+    np.testing.assert_array_equal(statistics.best_so_far(np.array([NAN, 3, NAN, 5, 2])), [NAN, 3, 3, 3, 2])
 
 
 def test_a_mean_curve_begins_with_the_last_seeds_first_success_and_steps_where_one_improves():
-    a, b = (curves.curve(RACE[name], "episodes") for name in "ab")
+    a, b = (statistics.curve(RACE[name], "episodes") for name in "ab")
     np.testing.assert_array_equal([a.cost, a.mean], [[1, 3, 4], [4, 3, 1.5]])
     np.testing.assert_array_equal([b.cost, b.mean], [[2, 4], [6, 2.5]])
     np.testing.assert_array_equal([b.low, b.high], [[4, 1], [8, 4]])  # two seeds: as wide as the seeds themselves
 
 
 def test_costs_are_those_that_were_paid_and_a_curve_ends_with_its_first_run():
-    b = curves.curve(RACE["b"], "forwards")
+    b = statistics.curve(RACE["b"], "forwards")
     np.testing.assert_array_equal([b.cost, b.mean], [[4, 8], [6, 2.5]])
     apart = [table([2, 1, 1], forward=1.0), table([4, 3, 0], forward=10.0)]
-    assert len(curves.curve(apart, "forwards").cost) == 0  # the second had not begun when the first had ended
+    assert len(statistics.curve(apart, "forwards").cost) == 0  # the second had not begun when the first had ended
     late = [table([2, 1, 1], forward=10.0), table([4, 3, 0], forward=4.0)]
-    curve = curves.curve(late, "forwards")
+    curve = statistics.curve(late, "forwards")
     np.testing.assert_array_equal([curve.cost, curve.mean], [[10, 12], [2.5, 1.0]])
 
 
 def test_a_method_with_a_seed_that_never_succeeds_has_no_mean():
     runs = [table([1, 2]), table([NAN, NAN])]
-    assert len(curves.curve(runs, "episodes").cost) == 0
+    assert len(statistics.curve(runs, "episodes").cost) == 0
     (rank,) = statistics.ranks({"a": runs})
     assert math.isnan(rank.mean)
     assert (rank.unsuccessful, rank.failed) == (1, 2)
@@ -78,70 +78,70 @@ def test_ranks_average_ties_put_failures_last_and_share_wins():
 
 def test_targets_run_from_the_best_loss_to_the_median_of_random_points():
     random = [table([100, 1000, NAN], kind=Kind.RANDOM), table([10, 100, 1], kind=Kind.RANDOM)]
-    goals = targets.targets({"random": random, "a": [table([9000, 0.01, 5])] * 2})
+    goals = statistics.targets({"random": random, "a": [table([9000, 0.01, 5])] * 2})
     assert (goals.loss[0], goals.loss[-1], len(goals.loss)) == (0.01, 100, 51)
     np.testing.assert_allclose(np.diff(np.log(goals.loss)), np.log(1e4) / 50)
     assert (goals.spacing, goals.easiest) == ("log", "median loss of the random points")
-    shifted = targets.targets({"random": [run - 50 for run in random], "a": [table([-60])]})
+    shifted = statistics.targets({"random": [run - 50 for run in random], "a": [table([-60])]})
     assert shifted.spacing == "linear"
 
 
 def test_targets_without_random_points_begin_where_the_runs_did():
-    goals = targets.targets(RACE)
+    goals = statistics.targets(RACE)
     assert (goals.loss[0], goals.loss[-1], goals.spacing) == (1, 4.5, "log")  # of 3, 5, 8, 4
     assert goals.easiest == "median of the first loss of each run"
-    assert len(targets.targets({"a": [table([NAN])]}).loss) == 0
+    assert len(statistics.targets({"a": [table([NAN])]}).loss) == 0
 
 
 def test_targets_go_down_to_the_best_that_is_known_and_not_below_what_coco_asks_for():
-    known = targets.targets(RACE, best_known=0.3)
+    known = statistics.targets(RACE, best_known=0.3)
     assert (known.loss[0], known.best_known) == (0.3, 0.3)
-    assert targets.running_times(RACE["a"], known)[0] == math.inf  # none has reached it
-    worse = targets.targets(RACE, best_known=2.0)
+    assert statistics.running_times(RACE["a"], known)[0] == math.inf  # none has reached it
+    worse = statistics.targets(RACE, best_known=2.0)
     assert (worse.loss[0], worse.best_known) == (1, 1)
-    zero = targets.targets(RACE, best_known=0.0)
+    zero = statistics.targets(RACE, best_known=0.0)
     assert zero.loss[0] == pytest.approx(4.5e-8)
     assert (zero.spacing, zero.best_known) == ("log", 0.0)
 
 
 def test_every_tenth_target_stands_for_all_with_both_ends():
-    goals = targets.targets(RACE)
+    goals = statistics.targets(RACE)
     assert goals.some == [0, 10, 20, 30, 40, 50]
 
 
 def test_an_expected_running_time_is_all_that_was_spent_by_how_many_succeeded():
-    goals = targets.Targets(np.array([0.5, 1.0, 2.0, 4.5]), "log", "")
+    goals = statistics.Targets(np.array([0.5, 1.0, 2.0, 4.5]), "log", "")
     # a: never; after 3 and in vain all 4; after 3 and 4; after 1 and 4
-    np.testing.assert_array_equal(targets.running_times(RACE["a"], goals), [math.inf, 7, 3.5, 2.5])
-    np.testing.assert_array_equal(targets.running_times(RACE["b"], goals), [math.inf, 8, 8, 2.5])
-    assert targets.times_record(np.array([math.inf, 10 / 3])) == [None, 3.33333]
+    np.testing.assert_array_equal(statistics.running_times(RACE["a"], goals), [math.inf, 7, 3.5, 2.5])
+    np.testing.assert_array_equal(statistics.running_times(RACE["b"], goals), [math.inf, 8, 8, 2.5])
+    assert statistics.times_record(np.array([math.inf, 10 / 3])) == [None, 3.33333]
 
 
 def test_the_ecdf_counts_each_target_from_the_episode_that_reached_it():
-    goals = targets.Targets(np.array([1.0, 2.0, 4.5]), "linear", "")
-    np.testing.assert_array_equal(targets.hits(RACE["a"], goals), [[3, 3, 1], [NAN, 4, 4]])
-    np.testing.assert_array_equal(targets.hits(RACE["b"], goals), [[4, 4, 4], [NAN, NAN, 1]])
-    share = targets.Shares.of(targets.hits(RACE["a"], goals))
+    goals = statistics.Targets(np.array([1.0, 2.0, 4.5]), "linear", "")
+    np.testing.assert_array_equal(statistics.hits(RACE["a"], goals), [[3, 3, 1], [NAN, 4, 4]])
+    np.testing.assert_array_equal(statistics.hits(RACE["b"], goals), [[4, 4, 4], [NAN, NAN, 1]])
+    share = statistics.Shares.of(statistics.hits(RACE["a"], goals))
     assert share.episodes == [1, 3, 3, 4, 4]
     assert share.share == [pytest.approx(n / 6) for n in range(1, 6)]
 
 
 def test_intervals_cover_the_mean_as_often_as_they_say():
     samples = np.random.default_rng(5).exponential(size=(50, 800))
-    low, high = bootstrap.interval(samples)
+    low, high = statistics.interval(samples)
     assert 0.92 < ((low < 1) & (high > 1)).mean() < 0.97
 
 
 def test_an_interval_is_that_of_scipys_bootstrap():
-    from scipy.stats import bootstrap as scipy_bootstrap
+    from scipy.stats import bootstrap
 
     sample = np.random.default_rng(1).normal(size=12)
-    theirs = scipy_bootstrap((sample,), np.mean, n_resamples=100_000, method="percentile", rng=2).confidence_interval
-    np.testing.assert_allclose(bootstrap.interval(sample), theirs, atol=0.02)
+    theirs = bootstrap((sample,), np.mean, n_resamples=100_000, method="percentile", rng=2).confidence_interval
+    np.testing.assert_allclose(statistics.interval(sample), theirs, atol=0.02)
 
 
 def test_one_seed_has_no_interval_and_decides_nothing():
-    assert np.isnan(bootstrap.interval(np.array([[1.0, 2.0]]))).all()
+    assert np.isnan(statistics.interval(np.array([[1.0, 2.0]]))).all()
     assert difference("a", np.array([0.0]), "b", np.array([9.0])).better is None
 
 

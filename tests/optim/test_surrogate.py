@@ -11,12 +11,9 @@ from gpytorch.kernels import MaternKernel
 from gpytorch.mlls import ExactMarginalLogLikelihood
 
 from gradscape.optim.methods import process
-from gradscape.optim.methods.bound import LowerBound
-from gradscape.optim.methods.fit import GROWTH, closure_of
-from gradscape.optim.methods.process import Process
-from gradscape.optim.methods.radial import Radial
-from gradscape.optim.methods.surrogate import Surrogate, SurrogateOptions
-from gradscape.optim.runs.state import decode, encode
+from gradscape.optim.methods.process import GROWTH, Process, closure_of, covariance_of
+from gradscape.optim.methods.surrogate import LowerBound, Surrogate, SurrogateOptions
+from gradscape.optim.runs.store import decode, encode
 
 from .states import model_of, proposal_of
 
@@ -114,8 +111,8 @@ def test_fits_climb_the_likelihood_that_botorch_has(kernel):
 
 
 def test_a_covariance_that_is_not_radial_is_refused():
-    with pytest.raises(ValueError, match="an RBFKernel or a MaternKernel of 5/2; got"):
-        Radial.of(MaternKernel(nu=0.5))
+    with pytest.raises(ValueError, match="or a MaternKernel of 5/2; got"):
+        covariance_of(MaternKernel(nu=0.5))
 
 
 def test_losses_of_another_scale_are_searched_alike():
