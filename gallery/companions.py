@@ -91,7 +91,7 @@ class CompanionPart(FigurePart):
 
     def make(self, watch: Watch) -> str:
         """Sample them, draw them beside the slice, and keep what they are."""
-        from ..landscapes.draw.figures.companions import CompanionSlice, companions_figure
+        from ..landscapes.draw.figures.multiples import CompanionSlice, companions_figure
         from ..landscapes.draw.figures.page import save
         from ..landscapes.draw.film import lighten
         from ..landscapes.storage.store import open_slice

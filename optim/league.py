@@ -215,7 +215,7 @@ class League:
         """
         if not self.scenes:
             raise ValueError("no race of the league was run, so there is nothing to draw")
-        from ..landscapes.draw.figures.league import league_figure
+        from ..landscapes.draw.figures.search import league_figure
 
         return league_figure(self._picture(), width=width)
 

@@ -193,7 +193,7 @@ class Race:
 
         The picture is matplotlib's figure, shown by a notebook as it is; `width` draws it for a page so wide [mm].
         """
-        from ..landscapes.draw.figures.race import race_figure
+        from ..landscapes.draw.figures.search import race_figure
 
         return race_figure(self._picture, width=width)
 

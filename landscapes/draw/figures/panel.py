@@ -15,8 +15,8 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, MaxNLocat
 from ...plane import Plane
 from ...space import LOG10
 from .. import style
-from ..decades import mark_decades
 from ..figure import Picture
+from ..style import mark_decades
 from .page import picture_of, sheet_of, write_over
 from .typesetting import side_room, title_room
 

@@ -16,25 +16,27 @@ from matplotlib.text import Text
 
 from gradscape.landscapes import draw
 from gradscape.landscapes.draw.figures import page, typesetting
-from gradscape.landscapes.draw.figures.card import card_figure
-from gradscape.landscapes.draw.figures.census import census_figure
-from gradscape.landscapes.draw.figures.companions import CompanionSlice, companions_figure
 from gradscape.landscapes.draw.figures.comparison import comparison_figure
 from gradscape.landscapes.draw.figures.contact import Caption, episode_figure
 from gradscape.landscapes.draw.figures.contour import landscape_figure
 from gradscape.landscapes.draw.figures.convergence import convergence_figure
-from gradscape.landscapes.draw.figures.curve import run_figure
 from gradscape.landscapes.draw.figures.extremes import extremes_figure
 from gradscape.landscapes.draw.figures.fidelity import fidelity_figure
-from gradscape.landscapes.draw.figures.league import league_figure
 from gradscape.landscapes.draw.figures.model import model_figure
+from gradscape.landscapes.draw.figures.multiples import (
+    CompanionSlice,
+    Landscape,
+    card_figure,
+    census_figure,
+    companions_figure,
+    thumbnail_figure,
+    wall_figure,
+)
 from gradscape.landscapes.draw.figures.overlay import overlay_figure
 from gradscape.landscapes.draw.figures.profile import profile_figure
 from gradscape.landscapes.draw.figures.quality import quality_figure
-from gradscape.landscapes.draw.figures.race import race_figure
+from gradscape.landscapes.draw.figures.search import league_figure, race_figure, run_figure
 from gradscape.landscapes.draw.figures.sweep import Scales, frame_figure
-from gradscape.landscapes.draw.figures.thumbnail import thumbnail_figure
-from gradscape.landscapes.draw.figures.wall import Landscape, wall_figure
 from gradscape.landscapes.draw.render.surface import surface_figure
 from gradscape.landscapes.episode import Episode, Part, View
 from gradscape.landscapes.measures import gradient_quality as gradients
