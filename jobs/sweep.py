@@ -268,10 +268,10 @@ class SweepJob(Job[SweepSummary]):
 
     def _film(self, drawn: Sweep) -> None:
         from ..landscapes.draw.figures.sweep import save_films
-        from ..landscapes.draw.recordings.sweep import save_stream
+        from ..landscapes.draw.recordings.runs import save_sweep
 
         save_films(drawn, self.folder / FILM, self.folder / GIF)
-        save_stream(drawn, self.folder / STREAM)
+        save_sweep(drawn, self.folder / STREAM)
 
     def _summary(self, drawn: Sweep, resumed: int, seconds: float) -> SweepSummary:
         first = self.stores[0]

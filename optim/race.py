@@ -236,7 +236,7 @@ class Race:
 
 
 def picture(tables: Tables, figures: RaceStatistics) -> xr.Dataset:
-    """Return what `landscapes.draw.figures.race` draws of a race, its attributes aside."""
+    """Return what `race_figure` draws of a race, its attributes aside."""
     curves = list(figures.curves["episodes"].values())
     steps = max(len(curve.cost) for curve in curves)
     padded = {

@@ -23,7 +23,7 @@ from ...identity import plane_of
 from ...lattice import own_cells, sampled_line
 from .. import style
 from ..figure import Picture
-from . import page, panel
+from . import page
 
 if TYPE_CHECKING:
     from ...measures.card import Card, CardSlice, Grade
@@ -68,19 +68,19 @@ def companions_figure(
     sheet = style.Sheet.of(width, pitch=PITCH, columns=len(cuts), least=LEAST)
     rows = -(-len(cuts) // sheet.columns)
     picture = page.Picture(sheet, rows * TALL * sheet.pitch)
-    axes = panel.grid(picture, len(cuts), share=True)
+    axes = page.grid(picture, len(cuts), share=True)
     scale = style.Scale.of_loss(np.concatenate([cut.loss.ravel().astype(float) for cut in cuts]))
     plane = plane_of(dataset)
     y = plane.labels[1] if plane.rank == 2 else page.loss_name(dataset)
     for ax, cut in zip(axes, cuts, strict=True):
         _draw(ax, cut, dataset, scale)
-        panel.dress(ax, plane)
+        page.dress(ax, plane)
         if plane.rank == 1 and scale.logarithmic:
-            panel.log_axis(ax.yaxis)
-        panel.caption(ax, cut.title())
-        panel.name_outer(ax, plane.labels[0], y)
+            page.log_axis(ax.yaxis)
+        page.caption(ax, cut.title())
+        page.name_outer(ax, plane.labels[0], y)
     if plane.rank == 2:
-        panel.colour_bar(axes[0], axes[0].images[0], page.loss_name(dataset), scale, beside=axes)
+        page.colour_bar(axes[0], axes[0].images[0], page.loss_name(dataset), scale, beside=axes)
     page.finish(picture, [])
     return picture
 
@@ -123,7 +123,7 @@ def census_figure(census: Census, *, width: float | None = None) -> page.Picture
     for empty in axes[len(census.slices) :]:
         empty.set_axis_off()
     unit = f" [{census.loss_unit}]" if census.loss_unit else ""
-    panel.colour_bar(axes[0], drawn, f"loss{unit}", scale, beside=axes)
+    page.colour_bar(axes[0], drawn, f"loss{unit}", scale, beside=axes)
     many = f"{len(census.slices)} slices, the least rugged first"
     page.entitle(picture, f"{census.env} · census at {census.fidelity} · {many}")
     page.finish(picture, _words(census), columns=2, heading=_made(census))
@@ -174,9 +174,9 @@ def wall_figure(landscapes: Sequence[Landscape], *, width: float | None = None) 
     )
     rows = -(-len(landscapes) // sheet.columns)
     picture = page.Picture(sheet, 1.15 * rows * sheet.pitch)
-    for ax, one in zip(panel.grid(picture, len(landscapes)), landscapes, strict=True):
+    for ax, one in zip(page.grid(picture, len(landscapes)), landscapes, strict=True):
         _draw_wall(ax, one.dataset)
-        panel.caption(ax, one.name)
+        page.caption(ax, one.name)
         said = "\n".join(textwrap.wrap(one.said.replace(" %", "\N{NO-BREAK SPACE}%"), LINE)) or " "
         ax.set_xlabel(said, size=sheet.small, color=style.QUIET, parse_math=False)
     page.entitle(picture, "Losses, each on its own scale: dark is low, light is high")
@@ -247,7 +247,7 @@ def _draw_scene(scene: str, places: Sequence[tuple[int | None, Axes]], card: Car
     if cuts:
         unit = f" [{cuts[0].loss_unit}]" if cuts[0].loss_unit else ""
         shown = ScalarMappable(scale.norm, style.LOSS_MAP)
-        panel.colour_bar(places[0][1], shown, f"{scene}: loss{unit}", scale, beside=[ax for _, ax in places], aspect=12)
+        page.colour_bar(places[0][1], shown, f"{scene}: loss{unit}", scale, beside=[ax for _, ax in places], aspect=12)
 
 
 def _draw_map(ax: Axes, grade: Grade, cut: CardSlice | None, scale: style.Scale) -> None:
@@ -259,7 +259,7 @@ def _draw_map(ax: Axes, grade: Grade, cut: CardSlice | None, scale: style.Scale)
         said += f"; {share:.0%} oppose" if np.isfinite(share) else ""
         _map(ax, cut.loss, scale, (0, 1, 0, 1))
         _draw_arrows(ax, cut, opposed)
-        panel.name_axes(ax, *cut.labels)
+        page.name_axes(ax, *cut.labels)
         for label in (ax.xaxis.label, ax.yaxis.label):
             label.set_fontsize(sheet.small)
     ax.set_title(said, size=sheet.small, color=look, parse_math=False)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ...objective import failed
 from .. import style
-from . import page, panel
+from . import page
 
 PITCH, SHAPE = 7.2, 0.5  # room of the panel on a screen [inch]; its height, against its width
 WIDE = 30.0  # ratio of losses from which the axis is logarithmic
@@ -25,13 +25,13 @@ def run_figure(table: xr.Dataset, *, width: float | None = None) -> page.Picture
     sheet = style.Sheet.of(width, pitch=PITCH)
     picture = page.Picture(sheet, sheet.width)
     ax = picture.subplots()
-    panel.dress(ax)
+    page.dress(ax)
     ax.set_box_aspect(SHAPE)
     loss = table["loss"].to_numpy()
     best = np.fmin.accumulate(loss)
     _scale(ax, loss)
     entries = [*_draw_points(ax, table), _draw_best(ax, table, best), *_draw_failures(ax, table)]
-    panel.name_axes(ax, "episodes", page.loss_name(table))
+    page.name_axes(ax, "episodes", page.loss_name(table))
     ax.set_xlim(0, len(loss) + 1)
     page.head(picture, ax, table, _title(table))
     page.finish(picture, entries)
@@ -113,14 +113,14 @@ def race_figure(dataset: xr.Dataset, *, width: float | None = None) -> page.Pict
     """
     sheet = style.Sheet.of(width, pitch=RACE_PITCH, columns=2)
     picture = page.Picture(sheet, 2 / sheet.columns * sheet.pitch)
-    losses, shares = panel.grid(picture, 2)
+    losses, shares = page.grid(picture, 2)
     entries: list[Artist] = [_draw_method(losses, shares, dataset, row) for row in range(dataset.sizes["method"])]
     for ax in (losses, shares):
-        panel.dress(ax)
+        page.dress(ax)
         ax.set_box_aspect(RACE_SHAPE)
         style.log_axis(ax.xaxis)
         ax.set_xlim(1, dataset.attrs["budget"])
-        panel.name_axes(ax, "episodes")
+        page.name_axes(ax, "episodes")
     _frame_losses(losses, dataset)
     _frame_shares(shares, dataset)
     page.head(picture, losses, dataset, dataset.attrs["title"])
@@ -157,7 +157,7 @@ def _where_finite(values: xr.DataArray, where: xr.DataArray) -> NDArray[np.float
 
 def _frame_losses(ax: Axes, dataset: xr.Dataset) -> None:
     unit, seeds = dataset.attrs["loss_unit"], dataset.attrs["seeds"]
-    panel.name_axes(ax, y=f"best loss so far [{unit}]" if unit else "best loss so far")
+    page.name_axes(ax, y=f"best loss so far [{unit}]" if unit else "best loss so far")
     count, hardest, easiest = dataset.attrs["targets"]
     said = "one seed: no interval" if seeds == 1 else f"mean of {seeds} seeds and 95 % bootstrap interval"
     if not np.isfinite(dataset["mean"]).any():
@@ -175,7 +175,7 @@ def _frame_shares(ax: Axes, dataset: xr.Dataset) -> None:
     count, hardest, easiest = dataset.attrs["targets"]
     ax.set_ylim(0, 1)
     ax.yaxis.set_major_formatter(PercentFormatter(1.0))
-    panel.name_axes(ax, y="pairs of target and seed reached")
+    page.name_axes(ax, y="pairs of target and seed reached")
     unit = f" {dataset.attrs['loss_unit']}" if dataset.attrs["loss_unit"] else ""
     spaced = "logarithmically" if dataset.attrs["spacing"] == "log" else "evenly"
     ends = f"{style.number(easiest)}{unit} down to {style.number(hardest)}{unit}"
@@ -209,7 +209,7 @@ def league_figure(dataset: xr.Dataset, *, width: float | None = None) -> page.Pi
     _write_cells(ax, dataset, most, told=told)
     _frame(ax, dataset, upright=told)
     place: dict[str, Any] = {"aspect": 30} if told else {"location": "bottom", "aspect": 30, "shrink": 0.9}
-    bar = panel.colour_bar(ax, drawn, f"mean rank among {methods} methods, 1 is best", **place)
+    bar = page.colour_bar(ax, drawn, f"mean rank among {methods} methods, 1 is best", **place)
     if told:
         bar.ax.invert_yaxis()
     page.entitle(picture, dataset.attrs["title"])

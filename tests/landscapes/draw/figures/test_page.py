@@ -15,7 +15,7 @@ from matplotlib import rcParams
 from matplotlib.text import Text
 
 from gradscape.landscapes import draw
-from gradscape.landscapes.draw.figures import page, typesetting
+from gradscape.landscapes.draw.figures import page
 from gradscape.landscapes.draw.figures.comparison import comparison_figure
 from gradscape.landscapes.draw.figures.contact import Caption, episode_figure
 from gradscape.landscapes.draw.figures.contour import landscape_figure
@@ -285,7 +285,7 @@ def test_prints_are_named_by_their_width_and_those_there_are_drawn_anew(tmp_path
 
 def test_a_text_is_wrapped_by_its_width() -> None:
     for width in (1.0, 2.5, 6.0):
-        lines = typesetting.wrap_text(COMMAND, width, 7.0, lines=3).split("\n")
-        assert max(typesetting.text_width(line, 7.0) for line in lines) <= width
+        lines = page.wrap_text(COMMAND, width, 7.0, lines=3).split("\n")
+        assert max(page.text_width(line, 7.0) for line in lines) <= width
         assert len(lines) <= 3
-    assert typesetting.wrap_text("short", 6.0, 7.0) == "short"
+    assert page.wrap_text("short", 6.0, 7.0) == "short"
