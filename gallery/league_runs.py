@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from ..landscapes.objective import Status
 from ..landscapes.overlay import IMPROVEMENTS_OF, lowered
+from ..landscapes.storage.arrays import flags
 from ..landscapes.storage.files import replacing
-from ..landscapes.storage.layout import flags
 from ..landscapes.storage.records import reading
 from ..optim.base import Kind
 from ..optim.curves import best_so_far

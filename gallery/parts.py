@@ -131,7 +131,7 @@ class SlicePart(FigurePart):
     def state(self) -> State:
         """Look at the data without making an environment; who sampled it, and on what device, does not matter."""
         from ..landscapes.storage.arrays import FILES
-        from ..landscapes.storage.ownership import has_lost_root
+        from ..landscapes.storage.files import has_lost_root
         from ..landscapes.storage.paths import is_slice
         from ..landscapes.storage.store import SliceStore
 

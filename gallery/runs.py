@@ -11,8 +11,8 @@ from zipfile import ZipFile
 import xarray as xr
 from zarr.storage import ZipStore
 
+from ..landscapes.storage.arrays import COMPACT_CODECS
 from ..landscapes.storage.files import replacing
-from ..landscapes.storage.layout import COMPACT_CODECS
 from ..landscapes.storage.records import reading
 from ..optim.runs.arrays import COLUMNS
 from .files import REMAKE

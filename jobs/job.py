@@ -16,7 +16,7 @@ from ..landscapes.objective import Evaluation, Objective
 from ..landscapes.sampling.memory import free_memory
 from ..landscapes.storage.checkpoint import Checkpoint
 from ..landscapes.storage.files import tidy
-from ..landscapes.storage.locks import holding
+from ..landscapes.storage.files import holding
 from ..landscapes.storage.records import write_record
 from ..landscapes.verification import POINTS, StoredPoints, verify
 from .folder import Results

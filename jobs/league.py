@@ -13,9 +13,7 @@ from ..envs.registry import entries
 from ..landscapes.convert import to_json
 from ..landscapes.cost import duration, episode_cost
 from ..landscapes.space import as_whole
-from ..landscapes.storage.disk import full, is_full
-from ..landscapes.storage.files import tidy, visible_files
-from ..landscapes.storage.ownership import refuse_others
+from ..landscapes.storage.files import full, is_full, refuse_others, tidy, visible_files
 from ..landscapes.storage.records import write_record
 from ..optim.claims import Claims
 from ..optim.league import League, SceneStandings

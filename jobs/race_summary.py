@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from ..landscapes.plain import plain
+from ..landscapes.plain import jsonable
 from ..optim.claims import ClaimFinding
 from ..optim.race import Race
 
@@ -46,7 +46,7 @@ class RaceSummary:
             "command": self.command,
             "files": self.files,
         }
-        return {name: plain(value) for name, value in whole.items()}
+        return {name: jsonable(value) for name, value in whole.items()}
 
 
 def claim_record(finding: ClaimFinding) -> dict[str, Any]:

@@ -26,8 +26,7 @@ from ..landscapes.objective import BoxedObjective, Objective, failed
 from ..landscapes.plain import plain_name
 from ..landscapes.sampling.fill import Progress, sample
 from ..landscapes.storage.arrays import need_of as slice_need
-from ..landscapes.storage.files import discard, tidy, visible_files, write_json
-from ..landscapes.storage.ownership import refuse_others
+from ..landscapes.storage.files import discard, refuse_others, tidy, visible_files, write_json
 from ..landscapes.storage.paths import check_replaceable, filling_path, slice_exists
 from ..landscapes.storage.store import SliceStore
 from .folder import ROOT, SWEEP, folder_named

@@ -16,8 +16,7 @@ from platformdirs import user_cache_path
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
-from ...landscapes.storage.disk import moved_by
-from ...landscapes.storage.files import replacing
+from ...landscapes.storage.files import moved_by, replacing
 from ..engines.mpm.model import Model
 from ..engines.mpm.raster import Raster
 from ..engines.mpm.tools import Kind, Tool

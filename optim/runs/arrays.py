@@ -16,8 +16,8 @@ from ...landscapes.identity import record_parameters, with_package
 from ...landscapes.objective import Status
 from ...landscapes.plain import plain_json
 from ...landscapes.space import ParameterSpace
-from ...landscapes.storage.layout import FILL, create_array, flags
-from ...landscapes.storage.ownership import store_files
+from ...landscapes.storage.arrays import FILL, create_array, flags
+from ...landscapes.storage.files import store_files
 from ..base import Kind
 from .journal import CHUNK, STATE, damage_error
 

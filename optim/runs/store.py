@@ -33,9 +33,8 @@ from torch import Tensor
 from ...landscapes.identity import ERROR, StoreError, StoreExistsError, check_identity, current_identity
 from ...landscapes.objective import Evaluation, failed
 from ...landscapes.space import ParameterSpace
-from ...landscapes.storage.files import placing, resolve
-from ...landscapes.storage.layout import FILL, consolidate, open_group
-from ...landscapes.storage.ownership import check_ours, clear_halves, has_lost_root
+from ...landscapes.storage.arrays import FILL, consolidate, open_group
+from ...landscapes.storage.files import check_ours, clear_halves, has_lost_root, placing, resolve
 from ..base import Kind
 from . import RUN as RUN
 from .arrays import (

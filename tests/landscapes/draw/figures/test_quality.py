@@ -7,7 +7,7 @@ import pytest
 from matplotlib.text import Text
 
 from gradscape.landscapes.draw import style
-from gradscape.landscapes.draw.figures.page import Label, place_labels
+from gradscape.landscapes.draw.figures.page import Label, Picture, place_labels
 from gradscape.landscapes.draw.figures.quality import quality_figure
 from gradscape.landscapes.sampling.fill import sample
 
