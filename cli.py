@@ -364,7 +364,7 @@ def _usage(error: CycloptsError) -> str:
 
 def _system(error: OSError) -> str:
     """Return what to say where the system refused: of a full disk how to continue, of a file which, why and what."""
-    from .landscapes.storage.disk import DiskFullError, is_full
+    from .landscapes.storage.files import DiskFullError, is_full
 
     if not isinstance(error, DiskFullError) and is_full(error):
         return (

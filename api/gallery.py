@@ -101,7 +101,7 @@ def build(*, data: Data = None, out: Site = "out/gallery") -> None:
     from ..gallery.site import build as site
     from ..landscapes.capacity import size
     from ..landscapes.cost import duration
-    from ..landscapes.storage.disk import until_full
+    from ..landscapes.storage.files import until_full
 
     watch, start = current().watch, time.perf_counter()
     with until_full(lambda: f"{out} is as it was before"):

@@ -5,19 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Annotated, Literal, Unpack, cast
 
 from .call import current, verb
-from .options import (
-    ARGUMENT,
-    FigureWidth,
-    Force,
-    MadeKeywords,
-    Names,
-    Out,
-    Scene,
-    SceneKeywords,
-    Seed,
-    Share,
-    at_least,
-)
+from .options import ARGUMENT, FigureWidth, Force, MadeKeywords, Names, Out, Scene, SceneKeywords, Seed, Share, at_least
 from .scene import spec_of
 from .values import as_names, as_path, as_share, as_widths
 

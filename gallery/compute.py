@@ -16,8 +16,7 @@ from ..jobs.workers import workers
 from ..landscapes.capacity import require
 from ..landscapes.cost import duration
 from ..landscapes.lattice import count_gradients
-from ..landscapes.storage.disk import full, is_full
-from ..landscapes.storage.files import tidy
+from ..landscapes.storage.files import full, is_full, tidy
 from .figures import Figure
 from .league import LeaguePart, LeagueSlicePart
 from .parts import CompanionPart, EpisodePart, FidelityPart, FigurePart, ReportPart, SearchPart, SlicePart, SweepPart

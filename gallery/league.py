@@ -26,8 +26,8 @@ from ..landscapes.convert import from_json, to_json
 from ..landscapes.identity import MODEL_VERSION
 from ..landscapes.objective import Status
 from ..landscapes.overlay import IMPROVEMENTS_OF, lowered, overlay
+from ..landscapes.storage.arrays import flags
 from ..landscapes.storage.files import make_folder, replacing
-from ..landscapes.storage.layout import flags
 from ..landscapes.storage.records import read_json, reading, write_record
 from ..optim.base import Kind
 from ..optim.league import League, SceneStandings

@@ -31,8 +31,7 @@ from ..landscapes.measures.profile import effort
 from ..landscapes.objective import Evaluation, Status, evaluate
 from ..landscapes.plane import Plane
 from ..landscapes.storage.arrays import FILES
-from ..landscapes.storage.files import make_folder
-from ..landscapes.storage.ownership import has_lost_root
+from ..landscapes.storage.files import has_lost_root, make_folder
 from ..landscapes.storage.paths import is_slice
 from ..landscapes.storage.records import read_json, write_record
 from ..landscapes.storage.store import SliceStore, open_slice
@@ -247,7 +246,7 @@ class CompanionPart(FigurePart):
 
     def make(self, watch: Watch) -> str:
         """Sample them, draw them beside the slice, and keep what they are."""
-        from ..landscapes.draw.figures.companions import CompanionSlice, companions_figure
+        from ..landscapes.draw.figures.multiples import CompanionSlice, companions_figure
         from ..landscapes.draw.figures.page import save
         from ..landscapes.draw.film import lighten
 

@@ -15,8 +15,8 @@ from zarr.storage import ZipStore
 
 from ..landscapes.convert import from_json, to_json
 from ..landscapes.objective import Status
+from ..landscapes.storage.arrays import COMPACT_CODECS
 from ..landscapes.storage.files import replacing, write_json
-from ..landscapes.storage.layout import COMPACT_CODECS
 from ..landscapes.storage.records import read_json, reading, sign, verify
 from ..optim.runs.store import COLUMNS
 from .files import COMPANION_PICTURE, COMPANIONS, REMAKE, SWEEP_FILM, SWEEP_RECORD, episode_name

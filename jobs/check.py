@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from ..landscapes.capacity import Need, require
 from ..landscapes.conformance.finding import Finding
 from ..landscapes.cost import duration, episode_cost
-from ..landscapes.plain import plain
+from ..landscapes.plain import jsonable
 from .scene import SceneSpec
 from .watch import PREPARING, Say, Stopped, Watch, Work
 
@@ -290,4 +290,4 @@ def _refuse_forward(dim: int) -> Environment:
 
 def _record(finding: Finding) -> dict[str, Any]:
     record = {name: getattr(finding, name) for name in ("check", "outcome", "figure", "why")}
-    return {**record, "numbers": plain(finding.numbers or {}), "table": plain(finding.table)}
+    return {**record, "numbers": jsonable(finding.numbers or {}), "table": jsonable(finding.table)}

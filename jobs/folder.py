@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..landscapes.plain import digest
 from ..landscapes.storage import paths
-from ..landscapes.storage.files import other_files, visible_files
-from ..landscapes.storage.ownership import refuse_others
+from ..landscapes.storage.files import other_files, refuse_others, visible_files
 from ..landscapes.storage.paths import slice_exists
 from ..optim import runs
 from ..studies import KINDS

@@ -15,8 +15,7 @@ from ..landscapes.convert import to_json
 from ..landscapes.objective import Evaluation, Objective
 from ..landscapes.sampling.memory import free_memory
 from ..landscapes.storage.checkpoint import Checkpoint
-from ..landscapes.storage.files import tidy
-from ..landscapes.storage.locks import holding
+from ..landscapes.storage.files import holding, tidy
 from ..landscapes.storage.records import write_record
 from ..landscapes.threads import one_torch_thread
 from ..landscapes.verification import POINTS, StoredPoints, verify

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from ..envs.registry import entries
 from ..landscapes.cost import duration, episode_cost
 from ..landscapes.space import as_whole
-from ..landscapes.storage.disk import is_full
+from ..landscapes.storage.files import is_full
 from ..landscapes.storage.records import write_record
 from ..optim.claims import Claims
 from ..optim.league import League, SceneStandings

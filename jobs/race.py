@@ -17,9 +17,7 @@ from ..landscapes.cost import EpisodeCost, duration, episode_cost, seconds_per_e
 from ..landscapes.sampling.distribution import make_objective as objective_of
 from ..landscapes.sampling.distribution import run_tasks, workers_of
 from ..landscapes.space import as_whole
-from ..landscapes.storage.files import clear, visible_files
-from ..landscapes.storage.locks import check_free
-from ..landscapes.storage.ownership import refuse_others
+from ..landscapes.storage.files import check_free, clear, refuse_others, visible_files
 from ..landscapes.threads import one_torch_thread
 from ..optim.claims import Claims, check_claims
 from ..optim.memory import SearchSize, require_method, require_runs, run_need

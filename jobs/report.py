@@ -26,8 +26,7 @@ from ..landscapes.measures.classify import QuotedWord
 from ..landscapes.measures.doubled_resolution import DoubledResolution
 from ..landscapes.measures.profile import Profile
 from ..landscapes.objective import BoxedObjective, Evaluation, ObjectiveWrapper
-from ..landscapes.storage.disk import is_full
-from ..landscapes.storage.files import make_folder, other_files, replacing, tidy, write_json
+from ..landscapes.storage.files import is_full, make_folder, other_files, replacing, tidy, write_json
 from ..landscapes.storage.records import read_json, reading, write_record
 from ..landscapes.verification import RESAMPLE, verify_dataset
 from . import growth
@@ -326,7 +325,7 @@ def _leave(dataset: xr.Dataset, report: Report, folder: Path, watch: Watch) -> N
 
     from ..landscapes.draw.figures.page import save
     from ..landscapes.draw.figures.quality import quality_figure
-    from ..landscapes.storage.bundle import save_bundle
+    from ..landscapes.storage.records import save_bundle
 
     noise, quality = xr.Dataset({"deviation": report.profile.noise.deviation}), report.profile.quality
     assert quality is not None  # measured just now
@@ -510,7 +509,7 @@ class Report:
         from ..landscapes.draw.figures.quality import quality_figure
         from ..landscapes.lattice import sampled_lattice
         from ..landscapes.measures.gradient_quality import GradientQuality, compare_samples
-        from ..landscapes.storage.bundle import open_bundle
+        from ..landscapes.storage.records import open_bundle
         from ..landscapes.storage.store import open_slice
 
         if self.folder is None or self.store is None or not (self.folder / ARRAYS).exists():

@@ -19,7 +19,7 @@ from ..envs.registry import find_environment, make, registered_environment
 from ..landscapes.convert import from_json
 from ..landscapes.identity import MODEL_VERSION, PACKAGE, VERSIONS
 from ..landscapes.plain import digest, plain_json
-from ..landscapes.storage.disk import moved_by
+from ..landscapes.storage.files import moved_by
 from ..landscapes.storage.records import read_json, reading
 from ..optim.league import SceneStandings
 from ..studies.kept import find_fidelity, own_folder

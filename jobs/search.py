@@ -14,8 +14,7 @@ from ..landscapes.cost import duration, episode_cost
 from ..landscapes.identity import METHOD_VERSION
 from ..landscapes.objective import FAILED, Objective, Status, describe_errors
 from ..landscapes.space import as_whole
-from ..landscapes.storage.files import clear, tidy, write_json
-from ..landscapes.storage.locks import check_free
+from ..landscapes.storage.files import check_free, clear, tidy, write_json
 from ..landscapes.threads import one_torch_thread
 from ..optim.base import Kind
 from ..optim.memory import SearchSize, require_method, require_runs, run_need

@@ -30,16 +30,15 @@ from ..landscapes.measures.undersampled import Undersampled, find_undersampled, 
 from ..landscapes.objective import BoxedObjective, Objective, Status, describe_errors, failed
 from ..landscapes.plain import digest, plain_name
 from ..landscapes.plane import Plane
-from ..landscapes.sampling.distribution import RemoteSite, Site, evaluator, run_tasks, workers_of
+from ..landscapes.sampling.distribution import TileWriter, WorkerTileWriter, evaluator, run_tasks, workers_of
 from ..landscapes.sampling.fill import Progress, sample
 from ..landscapes.sampling.memory import MemoryBound
 from ..landscapes.sampling.refine import Refined, Refinement, partly_refined, refine
-from ..landscapes.storage.arrays import need_of
+from ..landscapes.storage.arrays import Tile, need_of
 from ..landscapes.storage.checkpoint import Checkpoint
 from ..landscapes.storage.files import clear, tidy, write_json
 from ..landscapes.storage.paths import is_slice, slice_exists
 from ..landscapes.storage.store import SliceStore
-from ..landscapes.storage.tiles import Tile
 from ..landscapes.verification import verify_dataset, verify_store
 from .folder import ROOT, SLICE, SUMMARY, folder_named
 from .job import Job
@@ -170,7 +169,7 @@ class SliceJob(Job[SliceSummary]):
         if force and slice_exists(path):
             store = SliceStore.create(path, plane, objective.space, overwrite=True, **settings)
             clear(folder, (PICTURE, SUMMARY), PICTURE)
-            pieces_in(folder, store).remove()
+            checkpoint_in(folder, store).remove()
         else:
             store = SliceStore.open_or_create(path, plane, objective.space, **settings)
         return cls(
@@ -278,7 +277,7 @@ class SliceJob(Job[SliceSummary]):
 
     def _so_far(self) -> xr.Dataset:
         """Return what is sampled of a slice that is refined."""
-        return partly_refined(self.store, pieces_in(self.folder, self.store))
+        return partly_refined(self.store, checkpoint_in(self.folder, self.store))
 
     def _verify(self, watch: Watch) -> None:
         """Evaluate a few stored points anew, before anything is added to them."""
@@ -333,7 +332,7 @@ class SliceJob(Job[SliceSummary]):
             how |= {"progress": follow, "conclude": conclude}
             if self.refinement is None:
                 return sample(self.objective, self.plane, self.store, gradients=int(self.store.grad), **how), computed
-            how |= {"refinement": self.refinement, "pieces": pieces_in(self.folder, self.store)}
+            how |= {"refinement": self.refinement, "checkpoint": checkpoint_in(self.folder, self.store)}
             return refine(self.objective, self.plane, self.store, **how), computed
 
     def _summary(self, dataset: xr.Dataset, computed: int, seconds: float, files: list[str]) -> SliceSummary:
@@ -386,7 +385,7 @@ def picture_of(objective: Objective, plane: Plane) -> Draw:
     return surface if plane.rank == 2 else profile
 
 
-def pieces_in(folder: Path, store: SliceStore) -> Checkpoint:
+def checkpoint_in(folder: Path, store: SliceStore) -> Checkpoint:
     """Return what is kept of a slice in a folder while it is refined."""
     return Checkpoint(folder / REFINING, digest(store.identity))
 
@@ -411,8 +410,8 @@ def estimate_cost(
     """Estimate what is left of a slice, here or, with an `executor`, on its workers."""
     if executor is None:
         return cost_of(objective, store)
-    site = Site(MemoryBound(objective), store, remake)
-    costs = list(run_tasks(executor, _cost_there, [(site,)] * workers_of(executor)))
+    writer = TileWriter(MemoryBound(objective), store, remake)
+    costs = list(run_tasks(executor, _cost_there, [(writer,)] * workers_of(executor)))
     shares = [1 / cost.seconds for cost in costs if cost.seconds]
     return replace(costs[0], seconds=1 / sum(shares) if shares else 0.0)
 
@@ -433,8 +432,8 @@ def cost_of(objective: Objective, store: SliceStore) -> SliceCost:
     return SliceCost(left, seconds, peak_memory() + round(arrays.memory), each)
 
 
-def _cost_there(site: Site | RemoteSite) -> SliceCost:
-    here = site.here()
+def _cost_there(writer: TileWriter | WorkerTileWriter) -> SliceCost:
+    here = writer.here()
     return cost_of(here.objective.objective, here.store)
 
 

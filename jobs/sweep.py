@@ -26,8 +26,7 @@ from ..landscapes.objective import BoxedObjective, Objective, failed
 from ..landscapes.plain import plain_name
 from ..landscapes.sampling.fill import Progress, sample
 from ..landscapes.storage.arrays import need_of as slice_need
-from ..landscapes.storage.files import discard, tidy, visible_files, write_json
-from ..landscapes.storage.ownership import refuse_others
+from ..landscapes.storage.files import discard, refuse_others, tidy, visible_files, write_json
 from ..landscapes.storage.paths import check_replaceable, filling_path, slice_exists
 from ..landscapes.storage.store import SliceStore
 from .folder import ROOT, SWEEP, folder_named
@@ -268,10 +267,10 @@ class SweepJob(Job[SweepSummary]):
 
     def _film(self, drawn: Sweep) -> None:
         from ..landscapes.draw.figures.sweep import save_films
-        from ..landscapes.draw.recordings.sweep import save_stream
+        from ..landscapes.draw.recordings.runs import save_sweep
 
         save_films(drawn, self.folder / FILM, self.folder / GIF)
-        save_stream(drawn, self.folder / STREAM)
+        save_sweep(drawn, self.folder / STREAM)
 
     def _summary(self, drawn: Sweep, resumed: int, seconds: float) -> SweepSummary:
         first = self.stores[0]

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..landscapes.storage.disk import until_full
+from ..landscapes.storage.files import until_full
 
 if TYPE_CHECKING:
     from ..landscapes.objective import Objective

@@ -9,7 +9,7 @@ from enum import Enum
 from functools import cache
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
-from .plain import plain
+from .plain import jsonable
 
 if TYPE_CHECKING:
     from cattrs import Converter
@@ -25,7 +25,7 @@ def to_json(record: Any) -> Any:
     that their class names in `derived`, which are for readers alone. NaN and infinity become None; arrays, tensors and
     tuples become lists. Raises TypeError for what has no form in JSON.
     """
-    return plain(record)
+    return jsonable(record)
 
 
 def from_json(kind: type[Record], data: Any) -> Record:

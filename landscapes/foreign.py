@@ -22,7 +22,7 @@ from .identity import stored_identity
 from .objective import Status
 from .plain import plain_json
 from .space import ParameterSpace
-from .storage.layout import flags
+from .storage.arrays import flags
 
 if TYPE_CHECKING:
     import pandas as pd

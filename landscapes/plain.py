@@ -24,12 +24,7 @@ def finite(value: float) -> float | None:
     return float(value) if math.isfinite(value) else None
 
 
-def or_nan(value: Any) -> float:
-    """Return a number that JSON had, NaN for None. Raises TypeError for anything else."""
-    return math.nan if value is None else number(value)
-
-
-def plain(value: Any) -> Any:
+def jsonable(value: Any) -> Any:
     """Return a value as JSON has it, at any depth.
 
     NaN and infinity become None; arrays, tensors and tuples become lists, numbers of numpy those of Python; whatever
@@ -37,16 +32,16 @@ def plain(value: Any) -> Any:
     Raises TypeError for anything else that JSON does not know.
     """
     if hasattr(value, "record"):
-        return plain(value.record())
+        return jsonable(value.record())
     if is_dataclass(value):
         names = [*(one.name for one in fields(value) if one.metadata.get("json", True)), *getattr(value, "derived", ())]
-        return {name: plain(getattr(value, name)) for name in names}
+        return {name: jsonable(getattr(value, name)) for name in names}
     if isinstance(value, Mapping):
-        return {name: plain(inner) for name, inner in value.items()}
+        return {name: jsonable(inner) for name, inner in value.items()}
     if isinstance(value, list | tuple):
-        return [plain(inner) for inner in value]
+        return [jsonable(inner) for inner in value]
     if hasattr(value, "tolist"):
-        return plain(value.tolist())
+        return jsonable(value.tolist())
     if isinstance(value, float):
         return finite(value)
     if value is None or isinstance(value, str | int):

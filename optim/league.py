@@ -213,12 +213,12 @@ class League:
         """
         if not self.scenes:
             raise ValueError("no race of the league was run, so there is nothing to draw")
-        from ..landscapes.draw.figures.league import league_figure
+        from ..landscapes.draw.figures.search import league_figure
 
         return league_figure(self._picture(), width=width)
 
     def _picture(self) -> xr.Dataset:
-        """Return what `landscapes.draw.figures.league` draws: ranks by scene and method, all scenes together last."""
+        """Return what `league_figure` draws: ranks by scene and method, all scenes together last."""
         ranks = {(scene.env, scene.fidelity): {one.method: one for one in scene.standings} for scene in self.scenes}
         rows = [[standings.get(method) for method in self.methods] for standings in ranks.values()]
         parts = {

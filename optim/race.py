@@ -191,7 +191,7 @@ class Race:
 
         The picture is matplotlib's figure, shown by a notebook as it is; `width` draws it for a page so wide [mm].
         """
-        from ..landscapes.draw.figures.race import race_figure
+        from ..landscapes.draw.figures.search import race_figure
 
         return race_figure(self._picture, width=width)
 
@@ -234,7 +234,7 @@ class Race:
 
 
 def picture(tables: Tables, figures: RaceStatistics) -> xr.Dataset:
-    """Return what `landscapes.draw.figures.race` draws of a race, its attributes aside."""
+    """Return what `race_figure` draws of a race, its attributes aside."""
     curves = list(figures.curves["episodes"].values())
     steps = max(len(curve.cost) for curve in curves)
     padded = {

@@ -14,7 +14,7 @@ from platformdirs import user_data_path
 from ..landscapes.convert import from_json, to_json
 from ..landscapes.identity import MODEL_VERSION, current_identity
 from ..landscapes.plain import digest, number, text
-from ..landscapes.storage.disk import moved_by
+from ..landscapes.storage.files import moved_by
 from ..landscapes.storage.records import read_json, reading, write_record
 from . import record_class
 

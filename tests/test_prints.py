@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from gradscape.landscapes.storage.bundle import open_bundle, save_bundle
+from gradscape.landscapes.storage.records import open_bundle, save_bundle
 
 from .command import Said
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from gradscape.landscapes.storage.locks import holding
+from gradscape.landscapes.storage.files import holding
 from gradscape.optim.runs.store import RunStore
 
 SEARCHES = {

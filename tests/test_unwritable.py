@@ -11,7 +11,7 @@ import pytest
 from gradscape.envs.engines import runtime
 from gradscape.envs.mpm import targets
 from gradscape.jobs import margins
-from gradscape.landscapes.storage.disk import moved_by
+from gradscape.landscapes.storage.files import moved_by
 
 SLICE = "slice bounce --dims 0 1 --resolution 2 --fidelity draft --device cpu --out made"
 

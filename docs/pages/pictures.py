@@ -13,8 +13,8 @@ from gradscape.gallery.files import STORE, dark_name
 from gradscape.gallery.league import save_both
 from gradscape.landscapes import draw
 from gradscape.landscapes.draw.figures.contour import landscape_figure
+from gradscape.landscapes.draw.figures.multiples import thumbnail_figure
 from gradscape.landscapes.draw.figures.profile import profile_figure
-from gradscape.landscapes.draw.figures.thumbnail import thumbnail_figure
 from gradscape.landscapes.plane import Plane
 from gradscape.landscapes.sampling.fill import sample
 

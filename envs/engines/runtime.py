@@ -11,7 +11,7 @@ from typing import Any
 import torch
 import warp as wp
 
-from ...landscapes.storage.disk import moved_by
+from ...landscapes.storage.files import moved_by
 
 wp.config.log_level = wp.LOG_ERROR  # no banner
 

@@ -17,8 +17,7 @@ from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from ...landscapes.space import sobol
-from ...landscapes.storage.disk import moved_by
-from ...landscapes.storage.files import replacing
+from ...landscapes.storage.files import moved_by, replacing
 from ..engines.mpm.boundaries import Kind, Tool
 from ..engines.mpm.model import Model
 from ..engines.mpm.raster import Raster

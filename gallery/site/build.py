@@ -29,8 +29,7 @@ from ...landscapes.identity import plane_of, stored_identity, stored_provenance
 from ...landscapes.measures.card import Card
 from ...landscapes.measures.classify import WORDS
 from ...landscapes.storage.arrays import parameters_of
-from ...landscapes.storage.files import placing, resolve
-from ...landscapes.storage.ownership import check_ours
+from ...landscapes.storage.files import check_ours, placing, resolve
 from ...landscapes.storage.paths import is_slice
 from ...landscapes.storage.records import reading
 from ...landscapes.storage.store import SliceStore, open_slice

@@ -236,8 +236,7 @@ def pack(values: np.ndarray[Any, Any], kind: str = "f4") -> str:
 
 
 def _axes(plane: Plane) -> list[Axis]:
-    from ...landscapes.draw.decades import decades
-    from ...landscapes.draw.style import round_values
+    from ...landscapes.draw.style import decades, round_values
 
     found = list[Axis]()
     for label, places, scale in zip(plane.labels, (axis.tolist() for axis in plane.axes()), plane.scales, strict=True):

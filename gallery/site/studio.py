@@ -99,8 +99,8 @@ def draws(source: Path, rank: int) -> list[str]:
 def draw_slice(source: Path, folder: Path) -> None:
     """Draw a figure's slice for light and for dark."""
     from ...landscapes.draw.figures.contour import landscape_figure
+    from ...landscapes.draw.figures.multiples import thumbnail_figure
     from ...landscapes.draw.figures.profile import profile_figure
-    from ...landscapes.draw.figures.thumbnail import thumbnail_figure
     from ..league import save_both
 
     dataset = open_slice(source / STORE)

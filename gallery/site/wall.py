@@ -137,7 +137,7 @@ def _census_rows(census: Census) -> Iterator[Mapping[str, Any]]:
 
 def draw_wall(tiles: Sequence[Tile], data: Path, out: Path) -> None:
     """Draw the wall, and write its table."""
-    from ...landscapes.draw.figures.wall import Landscape, wall_figure
+    from ...landscapes.draw.figures.multiples import Landscape, wall_figure
 
     hung = [Landscape(tile.env, str(tile), open_slice(data / tile.figure / STORE)) for tile in tiles]
     save_both(wall_figure(hung), out / WALL_PICTURE)

@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 # The function "module:name" of the package that draws records of a class, imported when one is drawn. It takes the
 # record and the keyword `width`.
 FIGURES = {
-    "Card": "landscapes.draw.figures.card:card_figure",
-    "Census": "landscapes.draw.figures.census:census_figure",
+    "Card": "landscapes.draw.figures.multiples:card_figure",
+    "Census": "landscapes.draw.figures.multiples:census_figure",
     "ConvergenceRecord": "landscapes.draw.figures.convergence:convergence_figure",
     "Episode": "landscapes.draw.figures.contact:episode_figure",
     "ExtremesRecord": "landscapes.draw.figures.extremes:extremes_figure",

@@ -156,9 +156,9 @@ def default_samples(dim: int) -> int:
 
 
 def explore(
-    objective: Objective, design: Design, pieces: Checkpoint, *, follow: Callable[[int], None] = lambda done: None
+    objective: Objective, design: Design, checkpoint: Checkpoint, *, follow: Callable[[int], None] = lambda done: None
 ) -> Responses:
-    """Evaluate a design, pieces of it at a time; what `pieces` holds already is not evaluated again.
+    """Evaluate a design, pieces of it at a time; what `checkpoint` holds already is not evaluated again.
 
     `follow` hears how many episodes are done. Pairs are crossed of the parameters whose total indices are largest.
     """
@@ -166,7 +166,7 @@ def explore(
     done = 0
     first: list[dict[str, Any]] = []
     for number, rows in enumerate(groups):
-        first.append(_piece(pieces, f"moved-{number}", lambda rows=rows: _evaluate_moves(objective, design, rows)))  # type: ignore[misc]
+        first.append(_piece(checkpoint, f"moved-{number}", lambda rows=rows: _evaluate_moves(objective, design, rows)))  # type: ignore[misc]
         follow(done := done + len(rows) * (1 + LINE * design.space.dim))
     loss, grad, line, far = (np.concatenate([part[name] for part in first]) for name in ("loss", "grad", "line", "far"))
     alone = Responses(loss, grad, line, design.offsets, far, np.empty((len(loss), 0)), [])
@@ -175,7 +175,7 @@ def explore(
     cross = []
     for number, rows in enumerate(groups):
         evaluate_pairs = partial(_evaluate_pairs, objective, design, rows, pairs)
-        cross.append(_piece(pieces, f"crossed-{number}", evaluate_pairs)["loss"])
+        cross.append(_piece(checkpoint, f"crossed-{number}", evaluate_pairs)["loss"])
         follow(done := done + len(rows) * len(pairs))
     return Responses(loss, grad, line, design.offsets, far, np.concatenate(cross), pairs)
 
@@ -224,11 +224,11 @@ def _groups(objective: Objective, design: Design) -> list[range]:
     return [range(low, high) for low, high in pairwise(edges)]
 
 
-def _piece(pieces: Checkpoint, name: str, compute: Callable[[], dict[str, Array]]) -> dict[str, Array]:
-    found = pieces.load(name)
+def _piece(checkpoint: Checkpoint, name: str, compute: Callable[[], dict[str, Array]]) -> dict[str, Array]:
+    found = checkpoint.load(name)
     if found is None:
         found = compute()
-        pieces.save(name, **found)
+        checkpoint.save(name, **found)
     return found
 
 

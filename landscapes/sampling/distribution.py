@@ -13,13 +13,14 @@ import time
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, Future, wait
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import chain
 from pathlib import Path
 from typing import Any, TypeVar
 
 import cloudpickle
+import numpy as np
 import torch
 from jaxtyping import Float
 from numpy.typing import NDArray
@@ -27,10 +28,9 @@ from torch import Tensor
 
 from ..identity import StoreError, check_identity
 from ..objective import Evaluation, Objective, ObjectiveWrapper, Status
+from ..storage.arrays import Tile
 from ..storage.paths import place_of
 from ..storage.store import SliceStore
-from ..storage.tiles import Tile
-from .batches import evaluate_tiles
 from .memory import MemoryBound, free_memory
 
 T = TypeVar("T")
@@ -54,7 +54,7 @@ class FilledTile:
 
 
 @dataclass(frozen=True, eq=False)
-class Site:
+class TileWriter:
     """An objective, and the store that takes its evaluations.
 
     Sent to another process, it is the same objective made there by `made`, once, and kept, and the same store opened
@@ -65,8 +65,8 @@ class Site:
     store: SliceStore
     made: Callable[[], Objective] | None = None
 
-    def here(self) -> Site:
-        """Return the site as it is in this process."""
+    def here(self) -> TileWriter:
+        """Return the writer as it is in this process."""
         return self
 
     def fill(self, tiles: Sequence[Tile], batch: int, pending: Collection[Tile] | None = None) -> Iterator[FilledTile]:
@@ -89,19 +89,19 @@ class Site:
             raise ValueError(
                 f"{who} cannot be sent to another process ({error}); give sample made=, a function that makes it there"
             ) from error
-        return RemoteSite, (recipe, str(self.store.path), self.store.identity)
+        return WorkerTileWriter, (recipe, str(self.store.path), self.store.identity)
 
 
 @dataclass(frozen=True)
-class RemoteSite:
-    """A site in a process that it was sent to."""
+class WorkerTileWriter:
+    """A writer in a process that it was sent to."""
 
     recipe: bytes
     path: str
     identity: Mapping[str, Any]
 
-    def here(self) -> Site:
-        """Return the site with its objective, made where this process has not made it yet, and its store.
+    def here(self) -> TileWriter:
+        """Return the writer with its objective, made where this process has not made it yet, and its store.
 
         Raises StoreError where this process does not see the store, StoreMismatchError where it is another one.
         """
@@ -111,15 +111,15 @@ class RemoteSite:
             raise StoreError(f"a worker finds no {self.path}; workers need a file system that they share") from None
         store = open_store(self.path, at.st_ino, at.st_mtime_ns)
         check_identity(store.path, wanted=self.identity, found=store.identity)
-        return Site(make_objective(self.recipe), store)
+        return TileWriter(make_objective(self.recipe), store)
 
     def fill(self, tiles: Sequence[Tile], batch: int) -> Iterator[FilledTile]:
-        """Do what `Site.fill` does, but for tiles that a worker finished before it died."""
-        site = self.here()
-        found = {tile: site.store.statuses(tile) for tile in tiles}
-        error = site.store.error
+        """Do what `TileWriter.fill` does, but for tiles that a worker finished before it died."""
+        writer = self.here()
+        found = {tile: writer.store.statuses(tile) for tile in tiles}
+        error = writer.store.error
         yield from (FilledTile(tile, statuses, error=error) for tile, statuses in found.items() if statuses)
-        yield from site.fill(tiles, batch, {tile for tile, statuses in found.items() if not statuses})
+        yield from writer.fill(tiles, batch, {tile for tile, statuses in found.items() if not statuses})
 
 
 @dataclass(frozen=True)
@@ -210,9 +210,9 @@ class ReadBack:
 class Distributed(ObjectiveWrapper):
     """An objective whose points an executor's workers evaluate, each an equal part of a batch."""
 
-    def __init__(self, site: Site, executor: Executor) -> None:
-        super().__init__(site.objective)
-        self._site, self._executor = site, executor
+    def __init__(self, writer: TileWriter, executor: Executor) -> None:
+        super().__init__(writer.objective)
+        self._writer, self._executor = writer, executor
 
     def evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool = True) -> Evaluation:
         """Return losses, and gradients if asked, at points `x` in the parameters' own units.
@@ -220,7 +220,7 @@ class Distributed(ObjectiveWrapper):
         Raises WorkersLostError where nobody is left to evaluate them, and what the objective raises.
         """
         parts = torch.tensor_split(x, max(1, min(len(x), workers_of(self._executor))))
-        tasks = [(self._site, number, part, grad) for number, part in enumerate(parts)]
+        tasks = [(self._writer, number, part, grad) for number, part in enumerate(parts)]
         found = dict(run_tasks(self._executor, _evaluate, tasks))
         return Evaluation.join([found[number] for number in range(len(parts))], dim=x.shape[1], grad=grad)
 
@@ -229,8 +229,8 @@ def evaluator(
     objective: Objective, store: SliceStore, executor: Executor | None, made: Callable[[], Objective] | None
 ) -> Objective:
     """Return the objective of a slice as it is to be evaluated: here, or by an executor's workers."""
-    site = Site(MemoryBound(objective), store, made)
-    return site.objective if executor is None else Distributed(site, executor)
+    writer = TileWriter(MemoryBound(objective), store, made)
+    return writer.objective if executor is None else Distributed(writer, executor)
 
 
 def workers_of(executor: Executor) -> int:
@@ -241,10 +241,10 @@ def workers_of(executor: Executor) -> int:
     return int(getattr(executor, "_max_workers", 1))
 
 
-def distribute(site: Site, tiles: Sequence[Tile], batch: int, executor: Executor) -> Iterator[FilledTile]:
+def distribute(writer: TileWriter, tiles: Sequence[Tile], batch: int, executor: Executor) -> Iterator[FilledTile]:
     """Let an executor's workers fill tiles, group by group, and yield each tile when its group is done."""
-    groups = equal_groups(site.store, tiles, batch, workers_of(executor))
-    yield from chain.from_iterable(run_tasks(executor, _fill, [(site, group, batch) for group in groups]))
+    groups = equal_groups(writer.store, tiles, batch, workers_of(executor))
+    yield from chain.from_iterable(run_tasks(executor, _fill, [(writer, group, batch) for group in groups]))
 
 
 def run_tasks(executor: Executor, work: Callable[..., T], tasks: Iterable[Sequence[Any]]) -> Iterator[T]:
@@ -286,10 +286,94 @@ def _has_workers(executor: Executor) -> bool:
 
 
 def _evaluate(
-    site: Site | RemoteSite, number: int, x: Float[Tensor, "batch dim"], grad: bool
+    writer: TileWriter | WorkerTileWriter, number: int, x: Float[Tensor, "batch dim"], grad: bool
 ) -> tuple[int, Evaluation]:
-    return number, site.here().objective.evaluate(x, grad=grad)
+    return number, writer.here().objective.evaluate(x, grad=grad)
 
 
-def _fill(site: Site | RemoteSite, tiles: Sequence[Tile], batch: int) -> list[FilledTile]:
-    return list(site.fill(tiles, batch))
+def _fill(writer: TileWriter | WorkerTileWriter, tiles: Sequence[Tile], batch: int) -> list[FilledTile]:
+    return list(writer.fill(tiles, batch))
+
+
+def evaluate_tiles(
+    objective: Objective, store: SliceStore, tiles: Sequence[Tile], batch: int, pending: Collection[Tile]
+) -> Iterator[tuple[Tile, Evaluation]]:
+    """Evaluate the points of those tiles that are pending, in order; a point without gradient has one of NaN."""
+    kinds = [Batches(objective, store, tiles, batch, pending, grad).evaluations() for grad in (True, False)]
+    left = [tile for tile in tiles if tile in pending]
+    for tile, having, lacking in zip(left, *kinds, strict=True):
+        yield tile, _merge(having, lacking, torch.from_numpy(store.sloped(tile)), store)
+
+
+def _merge(having: Evaluation, lacking: Evaluation, sloped: Tensor, store: SliceStore) -> Evaluation:
+    """Put both kinds of a tile's points into the order of its points."""
+    dim = store.plane.dim
+    blank = replace(lacking, grad=torch.full((len(lacking.loss), dim), torch.nan, dtype=torch.float64))
+    order = torch.cat([sloped.nonzero(), (~sloped).nonzero()])[:, 0].argsort()
+    return Evaluation.join([having, blank], dim=dim, grad=store.grad).rows(order)
+
+
+@dataclass(frozen=True, eq=False)
+class Batches:
+    """The points of tiles that have a gradient, or with `grad` false those that have none, in batches.
+
+    Where all points are of one kind, a batch is whole tiles: `batch` points or more. Otherwise batches go on from tile
+    to tile, so that all are full but the last, however few points of the kind a tile has: they hold `batch` points, or
+    the least multiple of it that the points of any tile fit into.
+
+    Batches are the same however many of the tiles are `pending`, so that a run that goes on repeats them; each is
+    evaluated at the points of tiles that are.
+    """
+
+    objective: Objective
+    store: SliceStore
+    tiles: Sequence[Tile]
+    batch: int
+    pending: Collection[Tile]
+    grad: bool
+
+    def evaluations(self) -> Iterator[Evaluation]:
+        """Yield the evaluation of every pending tile's points of the kind, in order.
+
+        No more is evaluated ahead than the batch that a tile's last point is in.
+        """
+        batches, dim = self.points(), self.store.plane.dim
+        ahead, start = Evaluation.empty(dim, grad=self.grad), 0
+        for tile in self.tiles:
+            if tile not in self.pending:
+                continue
+            count = len(self._of(tile))
+            while len(ahead.loss) < start + count:
+                parts = [ahead.rows(slice(start, None)), self.objective.evaluate(next(batches), grad=self.grad)]
+                ahead, start = Evaluation.join(parts, dim=dim, grad=self.grad), 0
+            yield ahead.rows(slice(start, start + count))
+            start += count
+
+    def points(self) -> Iterator[Float[Tensor, "batch dim"]]:
+        """Yield the points of one batch after another."""
+        size, whole = self._size(), self.store.every == 1
+        parts, room = list[Tensor](), size
+        for tile in self.tiles:
+            left = self._of(tile)
+            while len(left):
+                here, left = np.split(left, [len(left) if whole else room])
+                if tile in self.pending:
+                    parts.append(self.store.points(tile)[here])
+                room -= len(here)
+                if room <= 0:
+                    if parts:
+                        yield torch.cat(parts)
+                    parts, room = [], size
+        if parts:
+            yield torch.cat(parts)
+
+    def _size(self) -> int:
+        """Return how many points a full batch has."""
+        if self.store.every == 1:
+            return self.batch
+        most = max((len(self._of(tile)) for tile in self.tiles), default=0)
+        return self.batch * max(1, -(-most // self.batch))
+
+    def _of(self, tile: Tile) -> NDArray[np.intp]:
+        """Return the numbers of a tile's points that are of the kind."""
+        return np.flatnonzero(self.store.sloped(tile) == self.grad)

@@ -17,11 +17,11 @@ from ..identity import check_identity, record_parameters, with_stride
 from ..objective import Objective, Status
 from ..plane import Plane
 from ..space import as_stride, as_whole
-from ..storage.disk import full, is_full
+from ..storage.arrays import Tile
+from ..storage.files import full, is_full
 from ..storage.store import SliceStore
-from ..storage.tiles import Tile
 from ..verification import verify_store
-from .distribution import FilledTile, ReadBack, Site, WorkersLostError, distribute
+from .distribution import FilledTile, ReadBack, TileWriter, WorkersLostError, distribute
 from .memory import MemoryBound
 
 
@@ -101,8 +101,8 @@ def sample(
 
     report()
     back = ReadBack(store)
-    site = Site(MemoryBound(objective), store, made)
-    with resumable(store, counts), closing(_fill(site, pending, batch, executor)) as tiles:
+    writer = TileWriter(MemoryBound(objective), store, made)
+    with resumable(store, counts), closing(_fill(writer, pending, batch, executor)) as tiles:
         for filled in tiles:
             for note in filled.notes:
                 warnings.warn(note, RuntimeWarning, stacklevel=2)
@@ -126,12 +126,12 @@ def describe(objective: Objective) -> dict[str, dict[str, Any]]:
 
 
 def _fill(
-    site: Site, pending: Sequence[Tile], batch: int, executor: Executor | None
+    writer: TileWriter, pending: Sequence[Tile], batch: int, executor: Executor | None
 ) -> Generator[FilledTile, None, None]:
     if executor is None:
-        yield from site.fill(site.store.tiles(), batch, pending)
+        yield from writer.fill(writer.store.tiles(), batch, pending)
     elif pending:
-        yield from distribute(site, pending, batch, executor)
+        yield from distribute(writer, pending, batch, executor)
 
 
 def _warn_of_damage(store: SliceStore, pending: Sequence[Tile]) -> None:

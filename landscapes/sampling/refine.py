@@ -122,7 +122,7 @@ def refine(
     store: SliceStore,
     refinement: Refinement,
     *,
-    pieces: Checkpoint | None = None,
+    checkpoint: Checkpoint | None = None,
     progress: Callable[[Progress], None] | None = None,
     executor: Executor | None = None,
     made: Callable[[], Objective] | None = None,
@@ -132,7 +132,7 @@ def refine(
     """Evaluate an objective where a slice needs it, and return the slice; the other points are INTERPOLATED.
 
     Their losses are NaN, and what is interpolated is the variable of its own, `interpolated`. Samples are the same bits
-    as in a slice that is sampled everywhere. What is in `pieces` is not evaluated again; they go when it is finished.
+    as in a slice that is sampled everywhere. What `checkpoint` holds is not evaluated again; it is removed at the end.
     `progress`, `executor`, `made` and `conclude` are those of `sample`.
 
     Raises StoreMismatchError where the store was made by other settings, ValueError for a budget that does not cover
@@ -149,7 +149,7 @@ def refine(
         batch = max(LEAST_BATCH, objective.preferred_batch)
         batch *= workers_of(executor) if executor else 1
         run = Refining(
-            evaluator(objective, store, executor, made), batch, plane, store, refinement, pieces, progress, seed
+            evaluator(objective, store, executor, made), batch, plane, store, refinement, checkpoint, progress, seed
         )
         with resumable(store, run.counts):
             run.go()
@@ -157,17 +157,17 @@ def refine(
         if conclude is not None:
             dataset = dataset.assign_attrs(conclude(dataset))
         store.finish(dataset)
-    if pieces is not None:
-        pieces.remove()
+    if checkpoint is not None:
+        checkpoint.remove()
     return dataset
 
 
-def partly_refined(store: SliceStore, pieces: Checkpoint) -> xr.Dataset:
+def partly_refined(store: SliceStore, checkpoint: Checkpoint) -> xr.Dataset:
     """Return what is sampled of a slice so far."""
     samples, empty = _Samples(store.shape, store.plane.dim), store.dataset()
     if store.ascending:
         return empty
-    samples.load(pieces)
+    samples.load(checkpoint)
     return samples.put_into(empty)
 
 
@@ -184,10 +184,10 @@ class _Samples:
         found: NDArray[np.bool_] = self.status != Status.MISSING
         return found
 
-    def load(self, pieces: Checkpoint) -> None:
-        """Take what is in the pieces."""
-        for name in pieces.names():
-            if piece := pieces.load(name):
+    def load(self, checkpoint: Checkpoint) -> None:
+        """Take what is in the checkpoint."""
+        for name in checkpoint.names():
+            if piece := checkpoint.load(name):
                 self.take(piece["at"], piece["loss"], piece["status"], piece.get("grad"))
 
     def take(self, at: Places, loss: Values, status: NDArray[np.int8], grad: Values | None) -> None:
@@ -213,19 +213,19 @@ class Refining:
         plane: Plane,
         store: SliceStore,
         refinement: Refinement,
-        pieces: Checkpoint | None,
+        checkpoint: Checkpoint | None,
         progress: Callable[[Progress], None] | None,
         seed: int,
     ) -> None:
         self.batch, self.counts = batch, Counter[Status]()
         self.objective, self.plane, self.store, self.refinement = objective, plane, store, refinement
-        self.pieces, self.progress, self.seed = pieces, progress, seed
+        self.checkpoint, self.progress, self.seed = checkpoint, progress, seed
         self.tree, self.kept = Quadtree(store.shape), _Samples(store.shape, plane.dim)
         self.samples = _Samples(store.shape, plane.dim)
         self.axes = plane.axes()
         self.errors, self.tests, self.resumed = np.zeros(0), 0, 0
-        if pieces is not None:
-            self.kept.load(pieces)
+        if checkpoint is not None:
+            self.kept.load(checkpoint)
             self.resumed = int(self.kept.sampled.sum())
 
     def go(self) -> None:
@@ -345,8 +345,8 @@ class Refining:
             arrays["grad"] = found.grad.numpy()
         self.samples.take(at, arrays["loss"], arrays["status"], arrays.get("grad"))
         self.store.keep_error(found.error)
-        if self.pieces is not None:
-            self.pieces.save("-".join(map(str, [len(at), *at[0]])), at=at, **arrays)
+        if self.checkpoint is not None:
+            self.checkpoint.save("-".join(map(str, [len(at), *at[0]])), at=at, **arrays)
         self._report()
 
     def _adopt(self, at: Places, kept: _Samples) -> None:

@@ -21,9 +21,7 @@ from ..identity import DamagedError, check_identity
 from ..objective import Evaluation, Objective, evaluate
 from ..plain import digest, plain_json, text
 from ..verification import POINTS, StoredPoints, verify
-from .files import discard, replacing, visible_files, write_json
-from .locks import check_free
-from .ownership import check_ours, refuse_others, remove
+from .files import check_free, check_ours, discard, refuse_others, remove, replacing, visible_files, write_json
 from .records import read_json, reading
 
 SETTINGS, PARTS, PROBES = "settings.json", "pieces", "probes"

@@ -15,9 +15,13 @@ import os
 import re
 import shutil
 import uuid
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager
+from itertools import islice
 from pathlib import Path
+from typing import TypeGuard
+
+from ..identity import StoreError
 
 MAKING = re.compile(r"\..+\.[0-9a-f]{32}\.making", re.DOTALL)  # the hidden folder of what is being made
 
@@ -169,3 +173,201 @@ def _clear(folder: Path) -> None:
             shutil.rmtree(folder, ignore_errors=True)
         finally:
             os.close(lock)
+
+
+Ours = Callable[[str], object]  # whether a file is of ours, by its path in the folder, with slashes
+LISTED_FILES = 3  # files that a refusal names
+HALF = r"\.[0-9a-f]{32}\.partial"  # the end of the name of a file that zarr has not written whole
+
+
+def store_files(arrays: Iterable[str], *others: str) -> Ours:
+    """Return what tells the files of a zarr store of these arrays, and `others` in its folder, from all else."""
+    names = "|".join(map(re.escape, arrays))
+    root, own = rf"zarr(?:\.json|{HALF})", "".join(f"|{re.escape(one)}" for one in others)
+    return re.compile(rf"{root}|(?:{names})/(?:{root}|c(?:/\d+)*(?:{HALF})?){own}").fullmatch
+
+
+def foreign_files(folder: Path, ours: Ours) -> Iterator[str]:
+    """Yield the files of a folder, at any depth, that are not `ours`, by their paths in it; a link never is."""
+    for path, name in _files(folder):
+        if path.is_symlink() or not (ours(name) or any(map(MAKING.fullmatch, Path(name).parts))):
+            yield name
+
+
+def check_ours(folder: Path, ours: Ours, what: str) -> None:
+    """Raise ValueError, naming some, where a folder that is to be replaced holds files that no such thing does."""
+    others = list(islice(foreign_files(folder, ours), LISTED_FILES + 1))
+    if others:
+        more = " and more" if len(others) > LISTED_FILES else ""
+        raise ValueError(
+            f"{folder} is not replaced, as it holds files that are not of {what}: "
+            f"{', '.join(others[:LISTED_FILES])}{more}; move them away, or write elsewhere with --out"
+        )
+
+
+def refuse_others(folder: Path, strange: Iterable[Path], what: str) -> None:
+    """Raise ValueError, naming some, where a folder that results are to go to holds files of something else."""
+    names = sorted(path.name for path in strange)
+    if names:
+        more = f" and {len(names) - LISTED_FILES} more" if len(names) > LISTED_FILES else ""
+        raise ValueError(
+            f"{folder} holds other files and no {what}: {', '.join(names[:LISTED_FILES])}{more}; "
+            "give --out a new or an empty folder"
+        )
+
+
+def has_lost_root(store: Path, ours: Ours) -> bool:
+    """Whether a zarr store has lost the file that says what it is, and everything else in it is of ours."""
+    try:
+        said = json.loads((store / "zarr.json").read_text())
+    except (OSError, ValueError):
+        said = None
+    known = isinstance(said, dict) and isinstance(said.get("attributes"), dict)
+    return not known and (store / "status").is_dir() and not any(foreign_files(store, ours))
+
+
+def remove(folder: Path, ours: Ours) -> None:
+    """Remove a folder, at once where everything in it is of ours; what is not stays where it is."""
+    if not any(foreign_files(folder, ours)):
+        discard(folder)
+        return
+    for path, name in _files(folder):
+        if ours(name) and not path.is_symlink():
+            path.unlink(missing_ok=True)
+
+
+def clear_halves(folder: Path) -> None:
+    """Remove from a store that nobody else writes to what zarr had not written whole when a process was killed."""
+    for path, name in _files(folder):
+        if re.search(rf"{HALF}$", name):
+            path.unlink(missing_ok=True)
+
+
+def _files(folder: Path) -> Iterator[tuple[Path, str]]:
+    """Yield the files of a folder at any depth, with their paths in it; a link to a folder is one of them.
+
+    A folder that another process removes meanwhile has none.
+    """
+
+    def unreadable(error: OSError) -> None:
+        if not isinstance(error, FileNotFoundError):
+            raise error
+
+    for parent, folders, files in os.walk(folder, onerror=unreadable):
+        folders.sort()
+        for name in sorted([*files, *(name for name in folders if Path(parent, name).is_symlink())]):
+            path = Path(parent, name)
+            yield path, path.relative_to(folder).as_posix()
+
+
+@contextmanager
+def holding(folder: Path, say: Callable[[str], object] = lambda text: None) -> Iterator[bool]:
+    """Hold a folder, and give whether it had to be waited for; where another process holds it, that is said first."""
+    waited = False
+    while True:
+        lock = _open(folder)
+        try:
+            if not _lock(lock, wait=False):
+                if not waited:
+                    say(f"another process is filling {folder}; waiting for it")
+                waited = True
+                _lock(lock, wait=True)
+            if _is_in_place(folder, lock):
+                yield waited
+                return
+        finally:
+            os.close(lock)
+
+
+def check_free(folder: Path) -> None:
+    """Raise StoreError where another process fills a folder that is to be begun anew."""
+    if not folder.is_dir():
+        return
+    lock = _open(folder)
+    try:
+        if not _lock(lock, wait=False):
+            raise StoreError(
+                f"{folder} is being filled by another process, so it is not begun anew; wait for it or stop it, or "
+                "write elsewhere with --out"
+            )
+    finally:
+        os.close(lock)
+
+
+def _open(folder: Path) -> int:
+    make_folder(folder)
+    return os.open(folder, os.O_RDONLY)
+
+
+def _lock(lock: int, *, wait: bool) -> bool:
+    """Take a lock, and say whether it is taken; Ctrl-C ends the waiting."""
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+    except BlockingIOError:
+        return False
+    except OSError:  # a file system without locks
+        return True
+    return True
+
+
+def _is_in_place(folder: Path, lock: int) -> bool:
+    """Whether the folder is still the one that was opened: another process may have removed it meanwhile."""
+    with contextlib.suppress(FileNotFoundError):
+        return folder.stat().st_ino == os.fstat(lock).st_ino
+    return False
+
+
+CODES = (errno.ENOSPC, errno.EDQUOT)
+FULL_DISK_WORDS = "No space left on device"  # of a program that writes for us, such as ffmpeg
+
+
+class DiskFullError(OSError):
+    """A disk is full; the message says what is kept of the job."""
+
+    def __str__(self) -> str:
+        return str(self.strerror)
+
+
+class UnwritableError(OSError):
+    """A folder that the system chose cannot be written to; the message says how it is moved."""
+
+    def __str__(self) -> str:
+        return str(self.strerror)
+
+
+@contextmanager
+def moved_by(variable: str, what: str) -> Iterator[None]:
+    """Raise UnwritableError where `what` cannot be kept, which says that an environment variable moves its folder."""
+    try:
+        yield
+    except OSError as error:
+        if is_full(error) or error.filename is None or error.strerror is None:
+            raise
+        why = f"{what} cannot be kept at {error.filename} ({error.strerror.lower()})"
+        said = f"{why}; set the environment variable {variable} to a folder that can be written to"
+        raise UnwritableError(error.errno, said) from error
+
+
+def is_full(error: BaseException) -> TypeGuard[OSError]:
+    """Whether an error comes of a disk or a quota that is full."""
+    return isinstance(error, OSError) and (error.errno in CODES or FULL_DISK_WORDS in str(error))
+
+
+def full(error: OSError, kept: str) -> DiskFullError:
+    """Return the error to raise for a full disk; `kept` says what of the job is."""
+    said = f"the disk is full; {kept}: make room, and the same command goes on from there"
+    return DiskFullError(error.errno or errno.ENOSPC, said)
+
+
+@contextmanager
+def until_full(kept: Callable[[], str]) -> Iterator[None]:
+    """Say what is `kept` where the disk is full, unless that is said already.
+
+    Raises DiskFullError then; every other error passes.
+    """
+    try:
+        yield
+    except OSError as error:
+        if isinstance(error, DiskFullError) or not is_full(error):
+            raise
+        raise full(error, kept()) from error

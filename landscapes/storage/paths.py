@@ -37,8 +37,7 @@ def refuse_missing(path: str | Path, what: str) -> None:
 
 def is_slice(path: Path) -> bool:
     """Say whether a slice of this format, finished or not, is at `path`."""
-    from .arrays import FORMAT
-    from .layout import open_group
+    from .arrays import FORMAT, open_group
 
     try:
         return open_group(place_of(path)).attrs.get("gradscape_slice") == FORMAT
@@ -50,7 +49,7 @@ def check_replaceable(store: Path) -> None:
     """Raise ValueError unless a folder is a slice's, its root damaged or not, and everything in it is of that."""
     from ..identity import StoreError
     from .arrays import FILES
-    from .ownership import check_ours, has_lost_root
+    from .files import check_ours, has_lost_root
 
     if not is_slice(store) and not has_lost_root(store, FILES):
         raise StoreError(f"{store} is no slice store, so it is not replaced; move it away or write elsewhere")

@@ -98,7 +98,7 @@ class Run:
         """
         if not self.data.sizes["evaluation"]:
             raise ValueError(f"{self._name()} has no episode to draw yet")
-        from ...landscapes.draw.figures.curve import run_figure
+        from ...landscapes.draw.figures.search import run_figure
 
         return run_figure(self.data, width=width)
 

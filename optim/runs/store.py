@@ -48,9 +48,16 @@ from ...landscapes.identity import (
 from ...landscapes.objective import Evaluation, Status, failed
 from ...landscapes.plain import plain_json
 from ...landscapes.space import ParameterSpace
-from ...landscapes.storage.files import placing, replacing, resolve
-from ...landscapes.storage.layout import FILL, consolidate, create_array, flags, open_group
-from ...landscapes.storage.ownership import check_ours, clear_halves, has_lost_root, store_files
+from ...landscapes.storage.arrays import FILL, consolidate, create_array, flags, open_group
+from ...landscapes.storage.files import (
+    check_ours,
+    clear_halves,
+    has_lost_root,
+    placing,
+    replacing,
+    resolve,
+    store_files,
+)
 from ..base import Kind
 from . import RUN as RUN
 from .run import Run

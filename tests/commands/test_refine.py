@@ -13,8 +13,8 @@ from gradscape.jobs.slice import SliceJob
 from gradscape.jobs.watch import Stopped, Watch
 from gradscape.landscapes.convert import to_json
 from gradscape.landscapes.draw.figures.contour import landscape_figure
+from gradscape.landscapes.draw.figures.multiples import thumbnail_figure
 from gradscape.landscapes.draw.figures.profile import profile_figure
-from gradscape.landscapes.draw.figures.thumbnail import thumbnail_figure
 from gradscape.landscapes.objective import Status
 from gradscape.landscapes.storage.store import open_slice
 

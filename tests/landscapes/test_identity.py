@@ -19,8 +19,8 @@ from gradscape.landscapes.identity import (
     stored_provenance,
 )
 from gradscape.landscapes.plane import Plane
+from gradscape.landscapes.storage.arrays import consolidate
 from gradscape.landscapes.storage.checkpoint import SETTINGS, Checkpoint
-from gradscape.landscapes.storage.layout import consolidate
 from gradscape.landscapes.storage.store import SliceStore, open_slice
 from gradscape.optim.registry import optimizer_class
 from gradscape.optim.runs.store import Journal, RunStore, digest_of

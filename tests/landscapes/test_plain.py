@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from gradscape.landscapes.plain import finite, plain, plain_json
+from gradscape.landscapes.plain import finite, jsonable, plain_json
 from gradscape.landscapes.statistics import Estimate
 
 
@@ -29,15 +29,15 @@ def test_whatever_is_measured_becomes_strict_json():
         "flag": True,
         "whole": 4,
     }
-    assert plain(found) == wanted
-    assert json.loads(json.dumps(plain(found), allow_nan=False)) == wanted
-    assert isinstance(plain(4), int)
+    assert jsonable(found) == wanted
+    assert json.loads(json.dumps(jsonable(found), allow_nan=False)) == wanted
+    assert isinstance(jsonable(4), int)
     assert finite(float("inf")) is None
 
 
 def test_what_json_does_not_know_is_refused():
     with pytest.raises(TypeError, match="set has no form in JSON"):
-        plain({"a": {1, 2}})
+        jsonable({"a": {1, 2}})
     with pytest.raises(ValueError, match="a run's identity must be plain JSON"):
         plain_json({"a": float("nan")}, "a run's identity")
     assert plain_json({"a": (1, 2)}, "settings") == {"a": [1, 2]}

@@ -16,7 +16,7 @@ from ...identity import plane_of
 from ...measures.ruggedness import box_slopes
 from ...objective import has_loss
 from .. import style
-from . import contour, page, panel
+from . import contour, page
 
 if TYPE_CHECKING:
     from ...measures.slice_comparison import SliceComparison
@@ -50,7 +50,7 @@ def _draw_maps(found: SliceComparison, width: float | None) -> tuple[page.Pictur
     panels = 4 if found.slopes else 3
     sheet = style.Sheet.of(width, pitch=PITCH, columns=2, least=LEAST)
     picture = page.Picture(sheet, -(-panels // sheet.columns) * sheet.pitch)
-    axes, both = panel.grid(picture, panels, share=True), _where_either_failed(found)
+    axes, both = page.grid(picture, panels, share=True), _where_either_failed(found)
     entries = _loss_maps(axes, found)
     _difference_map(axes[2], found)
     entries += _farthest(axes[2], found)
@@ -58,7 +58,7 @@ def _draw_maps(found: SliceComparison, width: float | None) -> tuple[page.Pictur
         _cosine_map(axes[3], found.data[0], found.cosine)
     for ax, dataset in zip(axes, (*found.data, both, both), strict=False):
         contour.frame(ax, dataset, plane_of(dataset))
-        panel.name_outer(ax, *plane_of(dataset).labels)
+        page.name_outer(ax, *plane_of(dataset).labels)
     return picture, [*entries, *_failures(both)]
 
 
@@ -68,8 +68,8 @@ def _loss_maps(axes: list[Axes], found: SliceComparison) -> list[Artist]:
     for ax, letter, name, dataset in zip(axes, "AB", (found.a, found.b), found.data, strict=False):
         drawn = contour.cell_map(ax, dataset, dataset["loss"].to_numpy(), scale, style.LOSS_MAP)
         entries += contour.lowest_sample(ax, dataset, f"lowest sample of {letter}")
-        panel.caption(ax, f"{letter}: {name}")
-        panel.colour_bar(ax, drawn, page.loss_name(dataset), scale)
+        page.caption(ax, f"{letter}: {name}")
+        page.colour_bar(ax, drawn, page.loss_name(dataset), scale)
     return entries
 
 
@@ -81,8 +81,8 @@ def _difference_map(ax: Axes, found: SliceComparison) -> None:
     values, power = _in_powers(found)
     scale = style.Scale.symmetric(values)
     drawn = contour.cell_map(ax, found.data[0], values, scale, style.DIFFERENCE_MAP)
-    panel.caption(ax, "difference of losses, B \N{MINUS SIGN} A")
-    panel.colour_bar(ax, drawn, _name("difference", power, found.loss_unit), scale)
+    page.caption(ax, "difference of losses, B \N{MINUS SIGN} A")
+    page.colour_bar(ax, drawn, _name("difference", power, found.loss_unit), scale)
 
 
 def _in_powers(found: SliceComparison) -> tuple[NDArray[np.float64], str]:
@@ -103,8 +103,8 @@ def _name(what: str, power: str, unit: str) -> str:
 def _cosine_map(ax: Axes, dataset: xr.Dataset, cosine: xr.DataArray) -> None:
     scale, colours = style.Scale.linear(-1.0, 1.0), style.COSINE["cmap"]
     drawn = contour.cell_map(ax, dataset, cosine.to_numpy(), scale, colours)
-    panel.caption(ax, "gradients of A against B")
-    panel.colour_bar(ax, drawn, "cosine of gradients", scale)
+    page.caption(ax, "gradients of A against B")
+    page.colour_bar(ax, drawn, "cosine of gradients", scale)
 
 
 def _farthest(ax: Axes, found: SliceComparison) -> list[Artist]:
@@ -124,21 +124,21 @@ def _draw_lines(found: SliceComparison, width: float | None) -> tuple[page.Pictu
     picture = page.Picture(sheet, panels * height + 1.6)
     axes = list(picture.subplots(panels, 1, sharex=True, squeeze=False)[:, 0])
     entries = _curves(axes[0], found, [one["loss"].to_numpy() for one in found.data])
-    panel.name_axes(axes[0], y=page.loss_name(found.data[0]))
+    page.name_axes(axes[0], y=page.loss_name(found.data[0]))
     look = sheet.look(style.stroke(found.points))
     values, power = _in_powers(found)
     axes[1].plot(found.difference["u"], values, color=style.INK, **look)
-    panel.name_axes(axes[1], y=_name("B \N{MINUS SIGN} A", power, found.loss_unit))
+    page.name_axes(axes[1], y=_name("B \N{MINUS SIGN} A", power, found.loss_unit))
     if found.slopes:
         _curves(axes[2], found, [box_slopes(one)[:, 0] for one in found.data])
-        panel.name_axes(axes[2], y=f"slope [{found.loss_unit or 'loss'} per side]")
+        page.name_axes(axes[2], y=f"slope [{found.loss_unit or 'loss'} per side]")
     for ax in axes:
-        panel.dress(ax, plane)
+        page.dress(ax, plane)
         ax.set_box_aspect(height / (sheet.width - ROOM * sheet.type))
         ax.set_xlim(float(plane.lower[0]), float(plane.upper[0]))
     for ax in axes[1:]:
         ax.axhline(0, color=style.FAINT, linewidth=0.8 * sheet.weight, zorder=0.5)
-    panel.name_axes(axes[-1], plane.labels[0])
+    page.name_axes(axes[-1], plane.labels[0])
     picture.align_ylabels(axes)
     return picture, [*entries, *_failures(_where_either_failed(found))]
 

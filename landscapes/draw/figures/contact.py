@@ -12,7 +12,7 @@ from matplotlib.patheffects import withStroke
 
 from .. import style
 from ..render import replay
-from . import page, panel, typesetting
+from . import page
 
 if TYPE_CHECKING:
     from ...episode import Episode
@@ -70,12 +70,12 @@ def episode_figure(
         said.append("target")
     sheet = style.Sheet.of(width, pitch=PITCH, columns=len(shown), least=LEAST)
     picture = page.Picture(sheet, -(-len(shown) // sheet.columns) * sheet.pitch)
-    for ax, pixels, text in zip(panel.grid(picture, len(shown)), shown, said, strict=True):
+    for ax, pixels, text in zip(page.grid(picture, len(shown)), shown, said, strict=True):
         ax.imshow(pixels, interpolation="antialiased", aspect="auto")
         ax.set_box_aspect(pixels.shape[0] / pixels.shape[1])
         ax.set(xticks=[], yticks=[])
         ax.spines[:].set(color=style.FAINT, linewidth=0.6 * sheet.weight)
-        panel.name_axes(ax, text)
+        page.name_axes(ax, text)
     shot = replay.Shot.of(episode.viewpoint(), replay.HEIGHT)
     _draw_scale(picture.axes[0], shot)
     _write(picture, caption, f"Scale: {style.number(shot.bar)} m at the middle of the view; what is nearer is larger.")
@@ -99,11 +99,11 @@ def _draw_scale(ax: Axes, shot: replay.Shot) -> None:
 def _write(picture: page.Picture, caption: Caption, scale: str) -> None:
     """Write title and outcome over the frames; parameters, as many as two lines hold, and provenance under them."""
     sheet = picture.sheet
-    room = sheet.width - 2 * typesetting.MARGIN
+    room = sheet.width - 2 * page.MARGIN
     if over := " · ".join(filter(None, (caption.title, caption.outcome))):
         page.entitle(picture, over)
     lines = [_fit_parameters(caption, room, sheet.small), scale, caption.provenance]
-    under = "\n".join(typesetting.wrap_text(line, room, sheet.small) for line in lines if line)
+    under = "\n".join(page.wrap_text(line, room, sheet.small) for line in lines if line)
     picture.supxlabel(under, size=sheet.small, color=style.QUIET, parse_math=False)
 
 
@@ -111,5 +111,5 @@ def _fit_parameters(caption: Caption, room: float, size: float) -> str:
     """Return the parameters, shortened to what two lines hold."""
     counts: Sequence[int] = range(len(caption.values), 0, -1)
     said = (caption.parameters(shown) for shown in counts)
-    whole = (text for text in said if not typesetting.wrap_text(text, room, size).endswith(typesetting.MORE))
+    whole = (text for text in said if not page.wrap_text(text, room, size).endswith(page.MORE))
     return next(whole, "")

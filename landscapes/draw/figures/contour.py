@@ -22,7 +22,7 @@ from ...lattice import own_cells, with_gradients
 from ...objective import Status
 from ...plane import Plane
 from .. import style
-from . import page, panel
+from . import page
 
 Grid = NDArray[np.float64]
 
@@ -47,12 +47,12 @@ def landscape_figure(dataset: xr.Dataset, *, width: float | None = None) -> page
     panels = 2 if "grad" in dataset else 1
     sheet = style.Sheet.of(width, pitch=PITCH, panels=panels)
     picture = page.Picture(sheet, panels / sheet.columns * sheet.pitch)
-    axes = panel.grid(picture, panels, share=True)
+    axes = page.grid(picture, panels, share=True)
     entries = loss_panel(axes[0], in_unit(dataset))
     entries += arrow_panel(axes[1], dataset) if panels == 2 else []
     for ax in axes:
         frame(ax, dataset, plane)
-        panel.name_outer(ax, *plane.labels)
+        page.name_outer(ax, *plane.labels)
     page.head(picture, axes[0], dataset)
     page.finish(picture, [*entries, *page.failure_key(dataset), *page.sampling_key(dataset)])
     return picture
@@ -60,11 +60,11 @@ def landscape_figure(dataset: xr.Dataset, *, width: float | None = None) -> page
 
 def frame(ax: Axes, dataset: xr.Dataset, plane: Plane) -> None:
     """Give a panel over a slice its limits, its ticks and its failures."""
-    panel.dress(ax, plane)
+    page.dress(ax, plane)
     ax.set_box_aspect(1)
     ax.set_xlim(*_limits(plane, 0))
     ax.set_ylim(*_limits(plane, 1))
-    panel.name_axes(ax, y=plane.labels[1])
+    page.name_axes(ax, y=plane.labels[1])
     for kind, look in style.STATUS_LOOKS.items():
         _shade(ax, dataset, kind, look)
 
@@ -108,7 +108,7 @@ def lowest_sample(ax: Axes, dataset: xr.Dataset, said: str = "lowest sample") ->
 def loss_map(ax: Axes, dataset: xr.Dataset, scale: style.Scale) -> None:
     """Draw every sample's loss as the colour of its cell, with the colour bar; of a refined slice cells differ."""
     mesh = cell_map(ax, dataset, own_cells(dataset)["loss"].to_numpy(), scale, style.LOSS_MAP)
-    panel.colour_bar(ax, mesh, page.loss_name(dataset), scale)
+    page.colour_bar(ax, mesh, page.loss_name(dataset), scale)
 
 
 def cell_map(ax: Axes, dataset: xr.Dataset, values: Grid, scale: style.Scale, colours: Colormap) -> QuadMesh:
@@ -139,7 +139,7 @@ def arrow_panel(ax: Axes, dataset: xr.Dataset, scale: style.Scale | None = None)
         cmap=style.SLOPE_MAP, norm=scale.norm, pivot="mid", angles="xy", scale_units="xy", scale=1.0, **style.ARROW,
         clip_on=False, in_layout=False,  # one at the border reaches half its length beyond it
     )  # fmt: skip
-    bar = panel.colour_bar(ax, quiver, label, scale)
+    bar = page.colour_bar(ax, quiver, label, scale)
     bar.ax.set_visible(bool(seen.any()))  # hidden rather than left out, so that both panels keep their width
     entries: list[Artist] = [*page.gradient_key(dataset)]
     if entries:

@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from .. import style
-from . import page, panel
+from . import page
 
 if TYPE_CHECKING:
     from ....studies.convergence import ConvergenceRecord, Move, SettingConvergence
@@ -45,7 +45,7 @@ def convergence_figure(found: ConvergenceRecord, *, width: float | None = None) 
     count = len(drawn) + bool(found.distributions)
     sheet = style.Sheet.of(width, pitch=PITCH, columns=min(2, max(1, count)), panels=max(1, count))
     picture = page.Picture(sheet, sheet.width)
-    axes = panel.grid(picture, max(1, count))
+    axes = page.grid(picture, max(1, count))
     flat = sheet.columns == 1 and count > COLUMN
     for ax in axes:
         ax.set_box_aspect(FLAT if flat else SHAPE)
@@ -61,7 +61,7 @@ def convergence_figure(found: ConvergenceRecord, *, width: float | None = None) 
 
 
 def _draw_setting(ax: Axes, one: SettingConvergence, found: ConvergenceRecord, entries: dict[str, Artist]) -> None:
-    panel.dress(ax)
+    page.dress(ax)
     sheet, look = page.sheet_of(ax), style.VARIANTS[one.setting]
     for kind, alpha in (("p95", 0.45), ("median", 1.0)):
         name = "95th percentile" if kind == "p95" else "median over the points"
@@ -72,9 +72,9 @@ def _draw_setting(ax: Axes, one: SettingConvergence, found: ConvergenceRecord, e
     _draw_design(ax, one, entries)
     _draw_levels(ax, one, found, entries)
     for axis in (ax.xaxis, ax.yaxis):  # whose ends are known now
-        panel.log_axis(axis)
-    panel.name_axes(ax, WIDTHS[one.setting], "loss moves [share of the spread]" if found.spread else "loss moves")
-    panel.caption(ax, _title(one))
+        page.log_axis(axis)
+    page.name_axes(ax, WIDTHS[one.setting], "loss moves [share of the spread]" if found.spread else "loss moves")
+    page.caption(ax, _title(one))
 
 
 def _draw_moves(ax: Axes, moves: Sequence[Move], kind: str, look: dict[str, object]) -> None:
@@ -154,7 +154,7 @@ def _draw_distributions(ax: Axes, found: ConvergenceRecord, entries: dict[str, A
     """Draw Wasserstein's distance of each fidelity's losses over neighbourhoods from the reference's, and the noise."""
     apart = found.distributions
     assert apart is not None
-    panel.dress(ax)
+    page.dress(ax)
     sheet = page.sheet_of(ax)
     look = sheet.look(style.VARIANT_MARK | {"color": style.LOSS_LINE, "marker": "o"})
     for place, one in enumerate(apart.compared):
@@ -170,8 +170,8 @@ def _draw_distributions(ax: Axes, found: ConvergenceRecord, entries: dict[str, A
     ax.set_yticks(range(len(apart.compared)), [one.name.removeprefix("reference-") for one in apart.compared])
     ax.set_xlim(left=0)
     ax.margins(y=0.15)
-    panel.name_axes(ax, "Wasserstein's distance from the reference [share of the spread]")
-    panel.caption(ax, f"losses over {apart.neighbourhoods} neighbourhoods")
+    page.name_axes(ax, "Wasserstein's distance from the reference [share of the spread]")
+    page.caption(ax, f"losses over {apart.neighbourhoods} neighbourhoods")
 
 
 def _provenance(found: ConvergenceRecord) -> str:

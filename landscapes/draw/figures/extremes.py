@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ...objective import Status
 from .. import style
-from . import page, panel
+from . import page
 
 if TYPE_CHECKING:
     from ....studies.extremes import ExtremesRecord, Limit, StabilityMap
@@ -49,7 +49,7 @@ def extremes_figure(found: ExtremesRecord, *, width: float | None = None) -> pag
     columns = 1 + max(map(len, rows))
     sheet = style.Sheet.of(width, pitch=PITCH, columns=columns, least=MIN_PANEL)
     picture = page.Picture(sheet, len(rows) * math.ceil(columns / sheet.columns) * sheet.pitch)
-    axes = iter(panel.grid(picture, sum(1 + len(maps) for maps in rows)))
+    axes = iter(page.grid(picture, sum(1 + len(maps) for maps in rows)))
     entries: dict[str, Artist] = {}
     for precision, maps in zip(found.precisions, rows, strict=True):
         limits = [one for one in found.limits if one.precision == precision]
@@ -70,7 +70,7 @@ def _provenance(found: ExtremesRecord) -> str:
 def _draw_errors(ax: Axes, limits: Sequence[Limit], tolerance: float, precision: str) -> dict[str, Artist]:
     """Draw the error of each setting's stable values over the factor it is changed by; return the legend's entries."""
     sheet, entries = page.sheet_of(ax), dict[str, Artist]()
-    panel.dress(ax)
+    page.dress(ax)
     drawn = [limit for limit in limits if _has_factor(limit)]
     looks = _looks(list(dict.fromkeys(limit.setting for limit in drawn)))
     for limit in drawn:
@@ -89,7 +89,7 @@ def _draw_errors(ax: Axes, limits: Sequence[Limit], tolerance: float, precision:
         ax.set_xlim(min(reach) / REACH, max(reach) * REACH)
     ax.set_ylim(LOWEST, HIGHEST)
     for axis in (ax.xaxis, ax.yaxis):
-        panel.log_axis(axis)
+        page.log_axis(axis)
     ax.yaxis.set_major_locator(FixedLocator([10.0**power for power in range(-4, 5, 2)]))
     _dress_errors(ax, tolerance, precision)
     line = sheet.look(style.REFERENCE_LINE)
@@ -107,8 +107,8 @@ def _dress_errors(ax: Axes, tolerance: float, precision: str) -> None:
     ax.axhline(100 * tolerance, **page.sheet_of(ax).look(style.REFERENCE_LINE))
     ax.axvline(1.0, color=style.FAINT, linewidth=0.8 * page.sheet_of(ax).weight, zorder=0)
     ax.set_box_aspect(1)
-    panel.name_axes(ax, "times what the scene has", "loss error, 95 % of the points [% of the spread]")
-    panel.caption(ax, f"{precision}: errors before it fails")
+    page.name_axes(ax, "times what the scene has", "loss error, 95 % of the points [% of the spread]")
+    page.caption(ax, f"{precision}: errors before it fails")
 
 
 def _has_factor(limit: Limit) -> bool:
@@ -143,14 +143,14 @@ def _draw_map(ax: Axes, found: StabilityMap) -> dict[str, Artist]:
     star = sheet.look(style.LOWEST_MARK)
     ax.plot(*([one] for one in found.base), **star, gid="base", zorder=4)
     entries["base"] = Line2D([], [], **star, label="what the scene has")
-    panel.dress(ax)
+    page.dress(ax)
     for axis, limits, values in ((ax.xaxis, edges[0], found.xs), (ax.yaxis, edges[1], found.ys)):
         (ax.set_xlim if axis is ax.xaxis else ax.set_ylim)(float(limits[0]), float(limits[-1]))
         if min(values) > 0:
-            panel.log_axis(axis)
+            page.log_axis(axis)
     ax.set_box_aspect(1)
-    panel.name_axes(ax, *(_label(name, unit) for name, unit in zip((found.x, found.y), found.units, strict=True)))
-    panel.caption(ax, f"{found.precision}: {found.x} against {found.y}")
+    page.name_axes(ax, *(_label(name, unit) for name, unit in zip((found.x, found.y), found.units, strict=True)))
+    page.caption(ax, f"{found.precision}: {found.x} against {found.y}")
     return entries
 
 

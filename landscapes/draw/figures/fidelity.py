@@ -13,7 +13,7 @@ from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
 from .. import style
-from . import labels, page, panel
+from . import page
 
 if TYPE_CHECKING:
     from ....studies.fidelity import FidelityRecord, MeasuredVariant
@@ -74,7 +74,7 @@ class _Drawing:
         record = self.record
         picture = page.Picture(sheet, sheet.width)
         ax = picture.subplots()
-        panel.dress(ax)
+        page.dress(ax)
         ax.set_box_aspect(SHAPE if sheet.zoom > 0.75 else NARROW)
         self._limit(ax)
         entries = [*self._draw_front(ax), *self._draw_variants(ax), *self._draw_chosen(ax)]
@@ -82,7 +82,7 @@ class _Drawing:
         unit = f" [{record.loss_unit}]" if record.loss_unit else ""
         what = "loss error, 95th percentile"
         how = f"{what} [% of the losses' spread]" if self.relative else what + unit
-        panel.name_axes(ax, f"time of an episode with gradient [{self.unit}]", how)
+        page.name_axes(ax, f"time of an episode with gradient [{self.unit}]", how)
         self._write_head(picture, ax)
         numbers = {name: str(number) for number, name in enumerate(keyed, start=1)}
         page.finish(picture, [*entries, *self._number_entries(sheet, numbers)], columns=3)
@@ -177,19 +177,17 @@ class _Drawing:
         sheet = page.sheet_of(ax)
         lines = [line for line in ax.lines if line.get_gid()]
         clear, rather = (
-            np.concatenate(
-                [labels.NOTHING, *(_outline(line) for line in lines if (line.get_gid() == INTERVAL) == soft)]
-            )
+            np.concatenate([page.NOTHING, *(_outline(line) for line in lines if (line.get_gid() == INTERVAL) == soft)])
             for soft in (False, True)
         )
         worth = {*self.record.front, *self.chosen.values()}
         rows = [row for row in self.rows if row.changed != "mixed" or row.name in worth]
         rows.sort(key=lambda row: (row.name not in numbers, row.changed != "named"))
         names = [
-            labels.Name(numbers.get(row.name, short_name(row)), (self._time(row), self._error(row))) for row in rows
+            page.Label(numbers.get(row.name, short_name(row)), (self._time(row), self._error(row))) for row in rows
         ]
         gaps = [gap * sheet.type for gap in GAPS]
-        left = labels.place(ax, names, clear, rather=rather, size=sheet.small, gaps=gaps)
+        left = page.place_labels(ax, names, clear, rather=rather, size=sheet.small, gaps=gaps)
         return [rows[number].name for number in left]
 
     def _write_head(self, picture: page.Picture, ax: Axes) -> None:

@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
 from .. import style
-from . import labels, page, panel
+from . import page
 
 if TYPE_CHECKING:
     from ....studies.model import MeasuredPart, ModelRecord
@@ -46,12 +46,12 @@ def _draw(study: ModelRecord, sheet: style.Sheet, keyed: Sequence[str]) -> tuple
     """Draw the picture, with the `keyed` parts named by number; return it and the names that found no room."""
     picture = page.Picture(sheet, sheet.width)
     ax = picture.subplots()
-    panel.dress(ax)
+    page.dress(ax)
     ax.set_box_aspect(SHAPE if sheet.zoom > 0.75 else NARROW)
     places = _limits(ax, study)
     entries = [*_draw_parts(ax, study, places), *_draw_lines(ax, study)]
     unit = "% of the losses' spread" if study.spread else study.loss_unit
-    panel.name_axes(
+    page.name_axes(
         ax,
         "time saved by the change [% of an episode with gradient]",
         "change of the loss, 95th percentile" + (f" [{unit}]" if unit else ""),
@@ -151,11 +151,11 @@ def _name(ax: Axes, study: ModelRecord, numbers: dict[str, str], places: dict[st
     """
     sheet = page.sheet_of(ax)
     clear = np.array(list(places.values())).reshape(-1, 2)
-    rather = np.concatenate([labels.NOTHING, *(_along(ax, line) for line in ax.lines)])
+    rather = np.concatenate([page.NOTHING, *(_along(ax, line) for line in ax.lines)])
     parts = sorted(study.parts, key=lambda part: part.name not in numbers)
-    names = [labels.Name(numbers.get(part.name, part.name), places[part.name]) for part in parts]
+    names = [page.Label(numbers.get(part.name, part.name), places[part.name]) for part in parts]
     gaps = [gap * sheet.type for gap in GAPS]
-    left = labels.place(ax, names, clear, rather=rather, size=sheet.small, gaps=gaps)
+    left = page.place_labels(ax, names, clear, rather=rather, size=sheet.small, gaps=gaps)
     return [parts[number].name for number in left]
 
 

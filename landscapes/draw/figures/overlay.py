@@ -20,7 +20,7 @@ from ...objective import failed
 from ...overlay import IMPROVEMENTS_OF, improvements, run_name
 from ...plane import Plane
 from .. import style
-from . import contour, labels, page, panel
+from . import contour, page
 
 Runs = Sequence[xr.Dataset]
 PITCH = 5.4  # room of a panel on a screen [inch]
@@ -44,11 +44,11 @@ def overlay_figure(dataset: xr.Dataset, runs: Runs, *, width: float | None = Non
     plane, reach = plane_of(dataset), farthest_distance(runs)
     sheet = style.Sheet.of(width, pitch=PITCH, columns=2)
     picture = page.Picture(sheet, 2 / sheet.columns * sheet.pitch)
-    over, against = panel.grid(picture, 2)
+    over, against = page.grid(picture, 2)
     scale = joint_scale(dataset, runs)
     contour.loss_map(over, dataset, scale)
     contour.frame(over, dataset, plane)
-    panel.name_axes(over, plane.labels[0])
+    page.name_axes(over, plane.labels[0])
     for run in sorted(runs, key=lambda run: -run.sizes["evaluation"]):
         _draw_run(over, run, plane, scale, reach, _count(runs))
         _join_improvements(over, run, plane, len(runs))
@@ -149,10 +149,10 @@ def _number_improvements(ax: Axes, runs: Runs, plane: Plane) -> None:
     rows = [improvements(run)[::-1] for run in runs]
     turns = range(max(map(len, rows), default=0))
     picked = [(number, own[turn]) for turn in turns for number, own in enumerate(rows) if turn < len(own)][:FEW]
-    names = [labels.Name(str(_episode(runs[number], row)), tuple(places[number][row])) for number, row in picked]
+    names = [page.Label(str(_episode(runs[number], row)), tuple(places[number][row])) for number, row in picked]
     clear = np.concatenate([place[own] for place, own in zip(places, rows, strict=True)])
     size = page.sheet_of(ax).small
-    labels.place(ax, names, clear, size=size, gaps=(0.7 * size,), gid="episode")
+    page.place_labels(ax, names, clear, size=size, gaps=(0.7 * size,), gid="episode")
 
 
 def _episode(run: xr.Dataset, row: int) -> int:
@@ -162,7 +162,7 @@ def _episode(run: xr.Dataset, row: int) -> int:
 
 def _draw_against(ax: Axes, dataset: xr.Dataset, runs: Runs, reach: float) -> None:
     """Draw the loss of every point against that of the sample beneath it."""
-    panel.dress(ax)
+    page.dress(ax)
     ax.set_box_aspect(1)
     sheet = page.sheet_of(ax)
     pairs = [np.stack([run["beneath"], run["loss"]]) for run in runs]
@@ -177,7 +177,7 @@ def _draw_against(ax: Axes, dataset: xr.Dataset, runs: Runs, reach: float) -> No
             ax.scatter(beneath[at], loss[at], s=areas[at], marker=style.POINT_MARKS[name]["marker"], gid=name, **look)
     unit = dataset["loss"].attrs.get("units", "")
     per = f" [{unit}]" if unit else ""
-    panel.name_axes(ax, f"loss of the sample beneath{per}", f"loss of the point itself{per}")
+    page.name_axes(ax, f"loss of the sample beneath{per}", f"loss of the point itself{per}")
     off = int(((values < low) | (values > high)).sum())
     said = f"{len(values) // 2} of {_count(runs)} points have a loss, and so has the sample beneath"
     page.remark(ax, said + (f"; {off} values off scale" if off else ""))

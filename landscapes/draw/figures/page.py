@@ -1,9 +1,15 @@
-"""The page of a matplotlib picture: its size, title, provenance, legend and files."""
+"""The page of a matplotlib picture: title, panels, legend and labels in the sizes of its sheet, layout and files."""
 
 from __future__ import annotations
 
+import math
+import textwrap
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -12,19 +18,28 @@ import xarray as xr
 from matplotlib import rc_context
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
+from matplotlib.cm import ScalarMappable
+from matplotlib.colorbar import Colorbar
 from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import Patch
+from matplotlib.textpath import text_to_path
+from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, MaxNLocator, NullFormatter
+from numpy.typing import NDArray
 
 from ...identity import PACKAGE, VERSIONS, simulator_parts, stored_identity, stored_provenance
 from ...lattice import with_gradients
 from ...measures.undersampled import Undersampled
 from ...objective import Status
+from ...plane import Plane
 from ...sampling.refine import Refined
+from ...space import LOG10
 from ...storage.files import print_width, replacing, visible_files
 from .. import style
 from ..figure import Picture as Picture
-from .typesetting import MARGIN, settle, title_room, wrap_text
+from ..style import mark_decades
 
 HANDLE = 4.5  # room of a legend's sign, in the height of its type
 # Type in a PDF can be selected and searched, its font goes with it. SVG cannot carry one: there type is outlines, which
@@ -200,3 +215,345 @@ def save_prints(draw: Callable[[float], Figure], path: Path, widths: Sequence[fl
             names.append(f"{path.stem}-{width:g}mm.{kind}")
             save(figure, path.with_name(names[-1]))
     return names
+
+
+NARROW = 1.8  # room of a panel that has fewer ticks [inch]
+FEW = 1.0, 1.5  # decades of a logarithmic axis that has more ticks than one in each, in a narrow panel and in another
+DECADES = 3, 6  # of one that has a tick in each
+
+
+def grid(picture: Picture, panels: int, *, share: bool = False) -> list[Axes]:
+    """Return so many panels, as many side by side as the sheet has columns; they may share their window."""
+    columns = min(panels, picture.sheet.columns)
+    rows = -(-panels // columns)
+    every = list(picture.subplots(rows, columns, sharex=share, sharey=share, squeeze=False).flat)
+    for empty in every[panels:]:
+        empty.remove()
+    return every[:panels]
+
+
+def dress(ax: Axes, plane: Plane | None = None) -> None:
+    """Give a panel its ticks and frame; over a plane, or a line, logarithmic parameters have decades."""
+    sheet = sheet_of(ax)
+    ax.tick_params(which="both", **_ticks(sheet))
+    ax.tick_params(which="minor", length=2 * sheet.type)
+    ax.spines[:].set(color=style.QUIET, linewidth=max(0.4, 0.6 * sheet.weight))
+    for axis in (ax.xaxis, ax.yaxis):
+        axis.set_major_locator(MaxNLocator(5 if sheet.pitch > NARROW else 3))
+    for number, scale in enumerate(plane.scales if plane else ()):
+        if scale == LOG10:
+            mark_decades((ax.xaxis, ax.yaxis)[number], DECADES[sheet.pitch > NARROW])
+
+
+def log_axis(axis: Axis) -> None:
+    """Make an axis logarithmic, with decades alone where a panel has no room for more."""
+    style.log_axis(axis)
+    low, high = sorted(axis.get_view_interval())
+    decades, wide = math.log10(high / low), sheet_of(axis.axes).pitch > NARROW
+    if decades > FEW[wide]:
+        every = math.ceil(decades / DECADES[wide])
+        powers = range(math.ceil(math.log10(low)), math.floor(math.log10(high)) + 1)
+        axis.set_major_locator(FixedLocator([10.0**power for power in powers if power % every == 0]))
+        axis.set_major_formatter(FuncFormatter(lambda value, _: style.power(value, 3)))
+    elif not wide:
+        axis.set_major_locator(LogLocator(subs=(1, 2, 5), numticks=9))
+
+
+def name_axes(ax: Axes, x: str | None = None, y: str | None = None) -> None:
+    """Label the axes."""
+    for axis, said in ((ax.xaxis, x), (ax.yaxis, y)):
+        if said is not None:
+            _name(ax, axis, said, (lambda: title_room(ax)) if axis is ax.xaxis else (lambda: side_room(ax)))
+
+
+def name_outer(ax: Axes, x: str, y: str) -> None:
+    """Label the axes of one of several panels over the same plane, once for a row and once for a column."""
+    spec = ax.get_subplotspec()
+    assert spec is not None  # as `grid` made it
+    ax.label_outer()
+    name_axes(ax, x if spec.is_last_row() else "", y if spec.is_first_col() else "")
+
+
+def _name(ax: Axes, axis: Axis, said: str, room: Callable[[], float]) -> None:
+    axis.set_label_text(said, size=sheet_of(ax).label, color=style.INK, parse_math=False)
+    picture_of(ax).fitted[axis.label] = said, room
+
+
+def caption(ax: Axes, text: str) -> None:
+    """Write what a panel shows over it."""
+    write_over(ax, text, size=sheet_of(ax).label, color=style.INK)
+
+
+def colour_bar(
+    ax: Axes,
+    drawn: ScalarMappable,
+    label: str,
+    scale: style.Scale | None = None,
+    *,
+    beside: Sequence[Axes] = (),
+    **how: Any,
+) -> Colorbar:
+    """Put a colour bar beside a panel, or several, with plain numbers where the scale is logarithmic."""
+    sheet = sheet_of(ax)
+    place: dict[str, Any] = {
+        "fraction": 0.05, "pad": 0.02, "extend": scale.extend if scale else "neither",
+        "use_gridspec": False,  # the panel keeps its place in the grid, from which the page is laid out
+    }  # fmt: skip
+    bar = ax.figure.colorbar(drawn, ax=[*beside] or ax, **place | how)
+    lying = bar.orientation == "horizontal"
+    _name(ax, bar.long_axis, label, (lambda: title_room(ax)) if lying else (lambda: side_room(ax)))
+    bar.ax.tick_params(which="both", **_ticks(sheet))
+    bar.ax.tick_params(which="minor", length=2 * sheet.type)
+    bar.outline.set(edgecolor=style.QUIET, linewidth=max(0.4, 0.6 * sheet.weight))
+    if scale and scale.logarithmic:
+        bar.long_axis.set_major_locator(FixedLocator(scale.ticks()))
+        bar.long_axis.set_major_formatter(FuncFormatter(lambda value, _: style.power(value)))
+        bar.long_axis.set_minor_formatter(NullFormatter())
+    return bar
+
+
+def _ticks(sheet: style.Sheet) -> dict[str, Any]:
+    return {
+        "labelsize": sheet.tick, "color": style.QUIET, "labelcolor": style.INK, "length": 3 * sheet.type,
+        "width": max(0.4, 0.8 * sheet.weight), "pad": 3.5 * sheet.type,
+    }  # fmt: skip
+
+
+MARGIN = 0.1  # between type and the edge of the page [inch]
+HINTED = 1.06  # small type whose letters are moved to whole pixels is up to so much wider
+MORE, MIN_LINE = " …", 3  # what stands for the rest of a text; characters of a line
+BESIDE = 1.2  # length of what is written up a panel's side, against it, at most
+AMPLE = 3.0  # height to begin with that no legend or title uses up [inch]
+NEARLY, TURNS = 0.02, 8  # as high as it has to be [inch]; most attempts at it
+
+
+def settle(picture: Picture) -> None:
+    """Make the page as high as what stands on it, panels as wide as they may be in their proportions; then keep it.
+
+    Meanwhile panels fill the room they have: the layout takes what a panel leaves of it for its margins'.
+    """
+    shapes = {ax: shape for ax in picture.axes if (shape := ax.get_box_aspect()) and ax.get_subplotspec()}
+    for ax in shapes:  # a colour bar has no place in the grid: it goes with its panel
+        ax.set_box_aspect(None)
+    _set_height(picture, picture.get_figheight() + AMPLE)
+    for turn in range(TURNS):
+        if turn < TURNS / 2:  # or lines might break now here, now there
+            _wrap(picture)
+        _lay_out(picture)
+        if abs(lack := _missing_height(picture, shapes)) < NEARLY:
+            break
+        _set_height(picture, picture.get_figheight() + lack)
+    for ax, shape in shapes.items():
+        ax.set_box_aspect(shape)
+        ax.apply_aspect()
+
+
+def _set_height(picture: Picture, height: float) -> None:
+    """Set the height of the page to whole pixels of a screen [inch]."""
+    picture.set_figheight(round(height * style.DPI) / style.DPI)
+
+
+def _lay_out(picture: Picture) -> None:
+    """Place the panels, by matplotlib's constrained layout.
+
+    It measures a panel, most of its work, several times in one place, a shared colour bar once for each of its panels;
+    each time it asks either axis for its ticks and their boxes up to eight times.
+    """
+    with ExitStack() as kept:
+        for ax in picture.axes:
+            _ask_once(ax, "get_tightbbox", ax, kept)
+            for axis, name in product((ax.xaxis, ax.yaxis), ("_update_ticks", "_get_ticklabel_bboxes")):
+                _ask_once(axis, name, ax, kept)
+        ConstrainedLayoutEngine().execute(picture)
+
+
+def _ask_once(artist: Artist, name: str, ax: Axes, kept: ExitStack) -> None:
+    """Let a method of a panel, or of its axis, be run anew only where the panel has moved, until `kept` is closed."""
+    ask: Callable[..., Any] | None = getattr(artist, name, None)
+    if ask is None:  # a matplotlib that has no such method is only slower
+        return
+    known: dict[str, Any] = {}
+
+    def answer(*about: Any, **how: Any) -> Any:
+        if known.get("place") != ax.bbox.bounds:
+            known["answer"] = ask(*about, **how)
+            known["place"] = ax.bbox.bounds  # afterwards: measuring a panel gives it its proportions
+        return known["answer"]
+
+    setattr(artist, name, answer)
+    kept.callback(delattr, artist, name)
+
+
+def _missing_height(picture: Picture, shapes: Mapping[Axes, float]) -> float:
+    """Return how much higher the page should be for its panels to have their shapes, height against width [inch]."""
+    width, height = picture.get_size_inches()
+    rows: dict[int, float] = {}
+    for ax, shape in shapes.items():
+        room, spec = ax.get_position(), ax.get_subplotspec()
+        assert spec is not None  # as the panels were chosen
+        row, need = spec.rowspan.start, shape * room.width * width - room.height * height
+        rows[row] = max(need, rows.get(row, need))
+    return float(sum(rows.values()))
+
+
+def _wrap(picture: Picture) -> None:
+    for text, (said, room) in picture.fitted.items():
+        size = float(text.get_fontsize())
+        text.set_text("\n".join(wrap_text(line, room(), size) for line in said.split("\n")))
+
+
+def title_room(ax: Axes) -> float:
+    """Return how wide what is written about a panel's middle may be, for the columns it has of the page [inch]."""
+    spec, box, (width, _) = ax.get_subplotspec(), ax.get_position(), _page_size(ax)
+    if spec is None:
+        return width
+    columns = spec.get_gridspec().ncols
+    middle = (box.x0 + box.x1) / 2
+    aside = min(middle - spec.colspan.start / columns, spec.colspan.stop / columns - middle)
+    return float(2 * width * aside - MARGIN)
+
+
+def side_room(ax: Axes) -> float:
+    """Return how long what is written up a panel's side may be [inch]."""
+    return float(BESIDE * ax.get_position().height * _page_size(ax)[1])
+
+
+def _page_size(ax: Axes) -> tuple[float, float]:
+    page = ax.get_figure(root=True)
+    assert page is not None  # panels are on one
+    width, height = page.get_size_inches()
+    return float(width), float(height)
+
+
+@lru_cache(1024)  # a page is laid out several times, with the same texts
+def wrap_text(text: str, width: float, size: float, *, lines: int = 2) -> str:
+    """Break a text in a type size [pt] into so many lines of a width [inch] at most, about equally long."""
+    broken, fits = [text], len(text)
+    while fits > MIN_LINE and (most := max(text_width(line, size) for line in broken)) > width:
+        fits = min(fits - 1, int(1.1 * fits * width / most))
+        broken = _break_lines(text, max(fits, MIN_LINE), lines)
+    shorter = broken
+    while fits > MIN_LINE and len(shorter) == len(broken) > 1 and not shorter[-1].endswith(MORE):
+        broken, fits = shorter, fits - 1
+        shorter = _break_lines(text, fits, lines)
+    return "\n".join(broken)
+
+
+def _break_lines(text: str, fits: int, lines: int) -> list[str]:
+    return textwrap.wrap(text, fits, max_lines=lines, placeholder=MORE, break_on_hyphens=False) or [text]
+
+
+@lru_cache(4096)
+def text_width(text: str, size: float) -> float:
+    """Return how much room type of a size [pt] takes at most [inch], on a screen or on paper."""
+    width, _, _ = text_to_path.get_text_width_height_descent(text, FontProperties(size=size), ismath=False)
+    return HINTED * float(width) / 72
+
+
+Grid = NDArray[np.float64]
+
+SIDES = (  # right, up: where a name may stand, in the order tried; from the second gap on all of them
+    *((0, 1), (1, 0), (0, -1), (-1, 0), (1, 1), (1, -1), (-1, -1), (-1, 1)),
+    *((0.5, 1), (1, 0.5), (1, -0.5), (0.5, -1), (-0.5, -1), (-1, -0.5), (-1, 0.5), (-0.5, 1)),
+)
+NEAR_SIDES = 8  # of the sides
+NOTHING: Grid = np.zeros((0, 2))
+ROOM = 1.15  # of a line, in the size of its type
+
+
+@dataclass(frozen=True)
+class Label:
+    """A text, and the place in a panel that it names [data]."""
+
+    text: str
+    at: tuple[float, float]
+
+
+def place_labels(
+    ax: Axes,
+    names: Sequence[Label],
+    clear: Grid,
+    *,
+    rather: Grid = NOTHING,
+    size: float,
+    gaps: Sequence[float],
+    gid: str = "name",
+) -> list[int]:
+    """Write names beside their places, the first of them first, and return the numbers of those with no room.
+
+    A name stands in the panel, `gaps` [pt] away from its place, the first that will do, and covers neither another name
+    nor any of the points to keep `clear` of, shape (point, 2) [data], nor, if that can be, those to keep clear of
+    `rather`. It is nearer to its place than to another's; from the second gap on a line leads there instead. The panel
+    must have its final place on the page.
+    """
+    dot = ax.figure.dpi / 72
+    origins = ax.transData.transform(np.array([name.at for name in names]).reshape(-1, 2))
+    points = [ax.transData.transform(some.reshape(-1, 2)) for some in (np.concatenate([clear, rather]), clear)]
+    crowd = _Crowd.of(ax, origins, margin=dot)
+    left = []
+    for number, name in enumerate(names):
+        half = np.array([text_width(name.text, size) * 72, ROOM * size]) * dot / 2
+        for avoided, (far, gap), side in product(points, enumerate(gaps), SIDES):
+            shift = np.array(side) * (half + gap * dot)
+            if not far and side not in SIDES[:NEAR_SIDES]:
+                continue
+            if crowd.takes(number, origins[number] + shift, half, avoided, led=far > 0):
+                _write(ax, name, shift / dot, size, led=far > 0, gid=gid)
+                break
+        else:
+            left.append(number)
+    return left
+
+
+def _write(ax: Axes, name: Label, shift: Grid, size: float, *, led: bool, gid: str) -> None:
+    text = ax.annotate(
+        name.text, name.at, (float(shift[0]), float(shift[1])), textcoords="offset points", ha="center", va="center",
+        size=size, arrowprops=style.LEADER if led else None, parse_math=False, gid=gid, **style.NAME_TEXT,
+    )  # fmt: skip
+    text.set_in_layout(False)  # it has found its room
+
+
+@dataclass(eq=False)
+class _Crowd:
+    """What is taken of a panel [pixel]: its frame, places that are named, boxes of names, lines to them."""
+
+    frame: Grid  # two corners
+    origins: Grid
+    boxes: Grid  # middle and half the sides of each, shape (box, 4)
+    lines: Grid  # points along them
+
+    @classmethod
+    def of(cls, ax: Axes, origins: Grid, *, margin: float) -> _Crowd:
+        box = ax.get_window_extent()
+        frame = np.array([[box.x0 + margin, box.y0 + margin], [box.x1 - margin, box.y1 - margin]])
+        return cls(frame, origins, np.zeros((0, 4)), NOTHING)
+
+    def takes(self, number: int, middle: Grid, half: Grid, points: Grid, *, led: bool) -> bool:
+        """Take a box for a place, and the line that leads there, if neither points nor anything else is in its way."""
+        if (middle - half < self.frame[0]).any() or (middle + half > self.frame[1]).any():
+            return False
+        apart = np.abs(self.boxes[:, :2] - middle) - self.boxes[:, 2:] - half
+        covered = np.abs(np.concatenate([points, self.origins, self.lines]) - middle) < half
+        if (apart < 0).all(axis=1).any() or covered.all(axis=1).any():
+            return False
+        away = np.linalg.norm(np.maximum(np.abs(self.origins - middle) - half, 0), axis=1)
+        others = np.delete(np.arange(len(away)), number)
+        if not led and (away[others] <= away[number]).any():
+            return False
+        path = self._path(self.origins[number], middle, half) if led else self.lines[:0]
+        crossed = np.abs(path[:, None] - self.boxes[None, :, :2]) < self.boxes[None, :, 2:]
+        near = np.linalg.norm(self.origins[others] - self.origins[number], axis=1) < 2 * half[1]
+        passed = self.origins[others[~near]]  # those that its own place all but covers it cannot pass
+        reach = np.linalg.norm(path[:, None] - passed, axis=-1)
+        if crossed.all(axis=-1).any() or (reach < half[1]).any():
+            return False
+        self.boxes = np.concatenate([self.boxes, np.concatenate([middle, half])[None]])
+        self.lines = np.concatenate([self.lines, path])
+        return True
+
+    @staticmethod
+    def _path(origin: Grid, middle: Grid, half: Grid) -> Grid:
+        """Return points from a place to a box, without those in it."""
+        path = origin + np.linspace(0.05, 1.0, 48)[:, None] * (middle - origin)
+        found: Grid = path[(np.abs(path - middle) >= half).any(axis=1)]
+        return found

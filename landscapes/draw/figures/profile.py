@@ -19,7 +19,7 @@ from ...lattice import sampled_line, with_gradients
 from ...objective import Status
 from ...plane import Plane
 from .. import style
-from . import page, panel, typesetting
+from . import page
 
 WIDTH, LOSS, SLOPE, ROOM = 8.0, 2.6, 2.2, 1.2  # of the page, height of the panels, room beside them [inch]
 STRIP = 2.7  # height of a strip of event counts, in that of its type
@@ -56,7 +56,7 @@ def profile_figure(
         _frame(ax, dataset, plane)
     for strip, (name, counts) in zip(strips, counted.items(), strict=True):
         _draw_strip(strip, panels, places, name, counts)
-    panel.name_axes(panels[-1], plane.labels[0])
+    page.name_axes(panels[-1], plane.labels[0])
     picture.align_ylabels(panels)
     page.head(picture, [*strips, *panels][0], whole)
     page.finish(picture, [*entries, *page.failure_key(whole), *page.sampling_key(whole)])
@@ -76,7 +76,7 @@ def _draw_loss(ax: Axes, dataset: xr.Dataset) -> list[Artist]:
     u, loss = dataset["u"].to_numpy(), dataset["loss"].to_numpy()
     sheet = page.sheet_of(ax)
     ax.plot(u, loss, color=style.LOSS_LINE, **sheet.look(style.stroke(len(u))))
-    panel.name_axes(ax, y=page.loss_name(dataset))
+    page.name_axes(ax, y=page.loss_name(dataset))
     if not np.isfinite(loss).any():
         return []
     lowest = int(np.nanargmin(loss))
@@ -99,7 +99,7 @@ def _draw_slope(ax: Axes, dataset: xr.Dataset, plane: Plane) -> list[Artist]:
     )
     low, high = style.span_of_line(slope, differences)
     ax.set_ylim(low, high)
-    panel.name_axes(ax, y=_slope_label(plane, dataset["loss"].attrs.get("units", "")))
+    page.name_axes(ax, y=_slope_label(plane, dataset["loss"].attrs.get("units", "")))
     for drawn, values in ((line, slopes), (behind, differences)):
         if off := int(((values < low) | (values > high)).sum()):
             drawn.set_label(f"{drawn.get_label()} ({off} off scale)")
@@ -125,7 +125,7 @@ def _slope_label(plane: Plane, loss_unit: str) -> str:
 
 
 def _frame(ax: Axes, dataset: xr.Dataset, plane: Plane) -> None:
-    panel.dress(ax, plane)
+    page.dress(ax, plane)
     ax.set_xlim(float(plane.lower[0]), float(plane.upper[0]))
     for kind, look in style.STATUS_LOOKS.items():
         _shade(ax, dataset, kind, look)
@@ -153,7 +153,7 @@ def _draw_strip(strip: Axes, panels: list[Axes], u: NDArray[np.float64], name: s
     for number, ((low, high), label) in enumerate(zip(pairwise(edges), labels, strict=True)):
         strip.axvspan(low, high, color=style.BAND[number % 2], linewidth=0)
         room = (high - low) / (u[-1] - u[0]) * (sheet.width - ROOM * sheet.type)
-        if room > typesetting.text_width(str(label), sheet.small) + sheet.small / 72:
+        if room > page.text_width(str(label), sheet.small) + sheet.small / 72:
             strip.text((low + high) / 2, 0.5, str(label), size=sheet.small, color=style.INK, ha="center", va="center")
     for edge in edges[1:-1]:
         for ax in panels:

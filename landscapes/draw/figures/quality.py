@@ -20,7 +20,7 @@ from ...lattice import with_gradients
 from ...measures.gradient_quality import GradientQuality, disagreement, find_bias, scale_table
 from ...measures.ruggedness import box_slopes
 from .. import style
-from . import contour, page, panel
+from . import contour, page
 
 PITCH, LEAST = 4.4, 40.0  # room of a panel: on a screen [inch], and at least in print [mm]
 BELOW = 2.0  # room of a panel that has its colour bar under it [inch]
@@ -71,7 +71,7 @@ def _share_names(axes: dict[str, Axes], rows: Sequence[Sequence[str]], kind: Seq
     for row in rows:
         for left, name in pairwise(row):
             if left in kind and name in kind and axes[left].get_ylim() == axes[name].get_ylim():
-                panel.name_axes(axes[name], y="")
+                page.name_axes(axes[name], y="")
                 axes[name].tick_params(labelleft=False)
 
 
@@ -88,10 +88,10 @@ def _cosine_map(ax: Axes, dataset: xr.Dataset, found: xr.Dataset, *, last: bool)
     ax.set_facecolor(style.NO_SLOPE["facecolor"])
     drawn = ax.pcolormesh(*contour.cell_edges(some), np.ma.masked_invalid(cosine), rasterized=True, **style.COSINE)
     contour.frame(ax, dataset, plane)
-    panel.name_axes(ax, plane.labels[0])
+    page.name_axes(ax, plane.labels[0])
     seen = cosine[np.isfinite(cosine)]
     mean = f"mean cosine {style.number(float(seen.mean()), '.2f')}" if seen.size else "none above the noise"
-    panel.caption(ax, f"differences over {_percent(found['scale'])} of the box\n{mean}")
+    page.caption(ax, f"differences over {_percent(found['scale'])} of the box\n{mean}")
     if last:
         _bar(ax, drawn, "cosine of gradient and difference")
 
@@ -99,7 +99,7 @@ def _cosine_map(ax: Axes, dataset: xr.Dataset, found: xr.Dataset, *, last: bool)
 def _bar(ax: Axes, drawn: ScalarMappable, label: str) -> None:
     """Put a colour bar beside a panel, or under it where there is little room beside."""
     below: dict[str, Any] = {"location": "bottom", "fraction": 0.06, "pad": 0.04}
-    panel.colour_bar(ax, drawn, label, **(below if page.sheet_of(ax).pitch < BELOW else {}))
+    page.colour_bar(ax, drawn, label, **(below if page.sheet_of(ax).pitch < BELOW else {}))
 
 
 def _slope_lines(ax: Axes, dataset: xr.Dataset) -> list[Artist]:
@@ -110,11 +110,11 @@ def _slope_lines(ax: Axes, dataset: xr.Dataset) -> list[Artist]:
     look = page.sheet_of(ax).look(style.stroke(len(u)))
     lines = ax.plot(u, difference, color=style.LOSS_LINE, **look, label="difference over two samples")
     lines += ax.plot(u, slope, color=style.SLOPE_LINE, **look, label="gradient", alpha=0.8)
-    panel.dress(ax, plane)
+    page.dress(ax, plane)
     ax.set_box_aspect(FLAT)
     ax.set_xlim(float(u[0]), float(u[-1]))
     ax.set_ylim(*style.span_of_line(difference, slope))
-    panel.name_axes(ax, plane.labels[0], _slope_label(dataset))
+    page.name_axes(ax, plane.labels[0], _slope_label(dataset))
     return list(lines)
 
 
@@ -136,7 +136,7 @@ def _scales(ax: Axes, steps: xr.Dataset, samples: xr.Dataset) -> list[Artist]:
             ax.errorbar(scale, value, reach, **look)
             del look["capsize"]
             entries.append(Line2D([], [], **look, label=f"{label}, {where}"))
-    panel.dress(ax)
+    page.dress(ax)
     ax.set_xscale("log")
     every = 1 if sheet.pitch > 3.0 else 2
     ax.xaxis.set_major_locator(FixedLocator([10.0**power for power in range(-6, 0)][1 % every :: every]))
@@ -145,8 +145,8 @@ def _scales(ax: Axes, steps: xr.Dataset, samples: xr.Dataset) -> list[Artist]:
     ax.set_ylim(-1.05, 1.05)
     ax.axhline(0, color=style.FAINT, linewidth=0.8 * sheet.weight, zorder=0)
     ax.set_box_aspect(1)
-    panel.name_axes(ax, "width of the difference / box", "cosine; share pointing uphill")
-    panel.caption(ax, "gradient against differences,\nby scale")
+    page.name_axes(ax, "width of the difference / box", "cosine; share pointing uphill")
+    page.caption(ax, "gradient against differences,\nby scale")
     return entries
 
 
@@ -160,9 +160,9 @@ def _disagreement_map(ax: Axes, dataset: xr.Dataset, smooth: xr.Dataset, number:
         np.ma.masked_invalid(apart.reshape(side, side)), extent=(low[0], high[0], low[1], high[1]), **style.DISAGREEMENT
     )
     ax.plot(*place[sure].T, **page.sheet_of(ax).look(style.BIASED))
-    panel.dress(ax, plane)
+    page.dress(ax, plane)
     ax.set_box_aspect(1)
-    panel.name_axes(ax, *plane.labels)
+    page.name_axes(ax, *plane.labels)
     _say_smoothing(ax, smooth, number, sure)
     if number == len(ORDERS) - 1:
         _bar(ax, drawn, "|first \N{MINUS SIGN} zeroth order| / sum of both")
@@ -180,16 +180,16 @@ def _two_orders(ax: Axes, dataset: xr.Dataset, smooth: xr.Dataset, number: int) 
         entries.append(Line2D([], [], **look, label=f"{name} order"))
     sure = find_bias(smooth).isel(width=number).to_numpy()
     ax.plot(place[sure], found["first"].to_numpy()[sure, 0], **sheet.look(style.BIASED), zorder=4)
-    panel.dress(ax, plane)
+    page.dress(ax, plane)
     ax.set_box_aspect(1)
-    panel.name_axes(ax, plane.labels[0], _slope_label(dataset))
+    page.name_axes(ax, plane.labels[0], _slope_label(dataset))
     _say_smoothing(ax, smooth, number, sure)
     return entries
 
 
 def _say_smoothing(ax: Axes, smooth: xr.Dataset, number: int, sure: np.ndarray[Any, Any]) -> None:
     width = _percent(smooth["width"][number])
-    panel.caption(ax, f"smoothed over {width} of the box\nfirst order biased at {int(sure.sum())} of {len(sure)}")
+    page.caption(ax, f"smoothed over {width} of the box\nfirst order biased at {int(sure.sum())} of {len(sure)}")
 
 
 def _slope_label(dataset: xr.Dataset) -> str:

@@ -13,7 +13,7 @@ import xarray as xr
 
 from ...identity import plane_of
 from .. import film, style
-from . import contour, page, panel, typesetting
+from . import contour, page
 
 DPI = 120
 PITCH = 6.25  # room of a panel with its colour bar on a screen [inch]
@@ -130,7 +130,7 @@ def frame_figure(sweep: Sweep, number: int, scales: Scales, *, width: float | No
     plane = plane_of(dataset)
     for ax in axes:
         contour.frame(ax, dataset, plane)
-        panel.name_axes(ax, plane.labels[0])
+        page.name_axes(ax, plane.labels[0])
     _draw_range(picture, layout, sweep, sweep.values[number])
     _write(picture, layout, dataset)
     legend = picture.legend(
@@ -146,11 +146,11 @@ def frame_figure(sweep: Sweep, number: int, scales: Scales, *, width: float | No
 def _write(picture: page.Picture, layout: Layout, dataset: xr.Dataset) -> None:
     """Write title and provenance."""
     sheet, left = layout.sheet, LEFT * layout.sheet.type
-    room = sheet.width - left - typesetting.MARGIN
+    room = sheet.width - left - page.MARGIN
     x, y, *_ = layout.box(left, layout.height - 0.36 * sheet.type, 0.0, 0.0)
     picture.text(x, y, page.title(dataset), size=sheet.title, color=style.INK, parse_math=False)
     x, y, *_ = layout.box(left, 0.08, 0.0, 0.0)
-    said = typesetting.wrap_text(page.provenance(dataset), room, sheet.small)
+    said = page.wrap_text(page.provenance(dataset), room, sheet.small)
     picture.text(x, y, said, size=sheet.small, color=style.QUIET, parse_math=False)
 
 

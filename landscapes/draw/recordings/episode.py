@@ -17,10 +17,10 @@ import torch
 from matplotlib.colors import to_rgba
 from numpy.typing import NDArray
 
-from ..render import materials
+from ..render import solids
 from ..render.replay import LONGEST, is_still
 from ..render.solids import mesh
-from .recording import recording
+from .runs import recording
 
 if TYPE_CHECKING:
     from ...episode import Episode, Part, View
@@ -83,7 +83,7 @@ def _at(part: Part, frame: int) -> rr.AsComponents:
             return _surface(mesh(part, frame), color)
         case "lump":
             every = max(1, math.ceil(part.at.shape[0] * len(at) / MOST))
-            clear = materials.look(part).get("opacity", 1.0) < 1.0
+            clear = solids.look(part).get("opacity", 1.0) < 1.0
             radius = part.size[0] * GRAIN * every ** (1 / 3) * (CLEAR if clear else 1.0)
             return rr.Points3D(at[::every], radii=radius, colors=color[:3])
         case "path":
@@ -109,7 +109,7 @@ def _surface(surface: pv.PolyData, color: NDArray[np.uint8]) -> rr.Mesh3D:
 
 
 def _color(part: Part) -> NDArray[np.uint8]:
-    look = materials.look(part)
+    look = solids.look(part)
     found: NDArray[np.uint8] = np.rint(255 * np.array(to_rgba(look["color"], look.get("opacity", 1.0)))).astype(
         np.uint8
     )
@@ -121,7 +121,7 @@ def _ground(view: View) -> rr.Mesh3D:
     half = EXTENT * np.linalg.norm(high - low) / 2
     corners = (low + high) / 2 + half * np.array([[-1, 0, -1], [-1, 0, 1], [1, 0, 1], [1, 0, -1]])
     corners[:, 1] = view.ground
-    color = np.rint(255 * np.array(to_rgba(materials.GROUND))).astype(np.uint8)
+    color = np.rint(255 * np.array(to_rgba(solids.GROUND))).astype(np.uint8)
     return rr.Mesh3D(
         vertex_positions=corners,
         triangle_indices=[[0, 1, 2], [0, 2, 3]],
@@ -135,7 +135,7 @@ def _blueprint(view: View, title: str, duration: float) -> rrb.Blueprint:
     center, eye = (low + high) / 2, np.array(view.eye) / np.linalg.norm(view.eye)
     place = center + FAR * np.linalg.norm(high - low) * eye
     controls = rrb.EyeControls3D(position=place, look_target=center, eye_up=(0.0, 1.0, 0.0))
-    background = np.rint(255 * np.array(to_rgba(materials.BACKGROUND))).astype(np.uint8)
+    background = np.rint(255 * np.array(to_rgba(solids.BACKGROUND))).astype(np.uint8)
     space = rrb.Spatial3DView(
         name=title, origin=SCENE, eye_controls=controls, background=rrb.Background(color=background), line_grid=False
     )

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,12 +20,13 @@ from ...identity import plane_of
 from ...objective import failed
 from ...overlay import improvements
 from ...plane import Plane
+from ...storage.files import replacing
 from .. import style
 from ..figures import contour, page
 from ..figures.overlay import by_kind, farthest_distance, half_widths, joint_scale
+from ..figures.sweep import RATES, Scales, Sweep
 from ..render import relief
 from ..render.relief import HEIGHT, SIDE
-from .recording import recording
 
 Runs = Sequence[xr.Dataset]
 Grid = NDArray[np.float64]
@@ -298,4 +300,93 @@ def _row(run: xr.Dataset) -> str:
 def _digest(dataset: xr.Dataset, runs: Runs) -> str:
     """Return a name that equal recordings share."""
     arrays = [dataset["loss"], *(run[name] for run in runs for name in ("x", "loss"))]
+    return hashlib.sha256(b"".join(np.ascontiguousarray(array).tobytes() for array in arrays)).hexdigest()[:16]
+
+
+@contextmanager
+def recording(name: str, path: Path, blueprint: rrb.Blueprint) -> Iterator[rr.RecordingStream]:
+    """Give a stream to log to, and write the recording, with the view it opens in, to `path` at the end.
+
+    `name` is that of the application too, since a viewer keeps one blueprint for each. No clock is recorded, and none
+    says what is put together into a chunk, so that equal logs give equal recordings. It is gathered in memory: on a
+    full disk rerun's own files end in the middle without an error, and their closing waits for ever.
+    """
+    stream = rr.RecordingStream(
+        f"gradscape-{name}", recording_id=name, send_properties=False, batcher_config=rr.ChunkBatcherConfig.NEVER()
+    )
+    stream.set_log_time_enabled(False)
+    kept = stream.memory_recording()
+    stream.send_blueprint(blueprint, make_active=False)
+    yield stream
+    with replacing(path) as partial:
+        partial.write_bytes(kept.drain_as_bytes())
+
+
+def save_sweep(sweep: Sweep, path: Path) -> None:
+    """Write the slices as surfaces on a rerun timeline named after what moves, numbered like the frames from 0."""
+    scales, first = Scales.of(sweep), sweep.slices[0]
+    scene = Scene.of(first, [], scales.loss)
+    with recording(_digest_sweep(sweep), path, _blueprint_sweep(sweep, scene)) as kept:
+        log_axes(kept, scene, first)
+        about = rr.TextDocument(_about_sweep(sweep, scales), media_type=rr.MediaType.MARKDOWN)
+        kept.log("about", about, static=True, strict=True)
+        for number, dataset in enumerate(sweep.slices):
+            kept.set_time(sweep.name, sequence=number)
+            kept.log(SURFACE, surface(scene, dataset), strict=True)
+            if scales.slope:
+                kept.log(ARROWS, descent_arrows(scene, dataset, scales.slope), strict=True)
+            kept.log("landscape/value", _label(sweep, scene, number), strict=True)
+            if np.isfinite(dataset["loss"]).any():
+                kept.log("lowest", rr.Scalars(float(dataset["loss"].min())), strict=True)
+
+
+def _label(sweep: Sweep, scene: Scene, number: int) -> rr.Points3D:
+    place = scene.stand.place(180.0, SIDE / 2, HEIGHT)
+    said = f"{sweep.name} = {sweep.write_value(sweep.values[number])}"
+    return rr.Points3D([place], labels=[said], show_labels=True, colors=rgba(style.MID_GREY), radii=DOT)
+
+
+def _blueprint_sweep(sweep: Sweep, scene: Scene) -> rrb.Blueprint:
+    space = rrb.Spatial3DView(
+        name=page.title(sweep.slices[0]), origin="landscape", eye_controls=scene.eye, line_grid=False
+    )
+    curve = rrb.TimeSeriesView(
+        name="lowest loss of each frame", origin="lowest", plot_legend=rrb.PlotLegend(visible=False)
+    )
+    about = rrb.TextDocumentView(name="about", origin="about")
+    return rrb.Blueprint(
+        rrb.Horizontal(space, rrb.Vertical(curve, about), column_shares=[2.2, 1.0]),
+        rrb.TimePanel(timeline=sweep.name, state="expanded", fps=RATES[-1], loop_mode="all"),
+        collapse_panels=True,
+    )
+
+
+def _about_sweep(sweep: Sweep, scales: Scales) -> str:
+    """Say in Markdown what is to be seen, and where it comes from."""
+    low, high = map(style.number, scales.loss.ends)
+    kind = "logarithmic" if scales.loss.logarithmic else "linear"
+    lines = [
+        f"# {page.title(sweep.slices[0])}\n",
+        f"One surface for each value of {sweep.label}, by number on the timeline. Height and colour: loss from {low} "
+        f"to {high}, {kind}, the same in all frames; beyond it the surface is cut off. Holes failed.\n",
+        f"| frame | {sweep.name} | lowest loss | failed |",
+        "|---|---|---|---|",
+        *(_row_sweep(sweep, number) for number in range(len(sweep.slices))),
+        "",
+        page.provenance(sweep.slices[0]),
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _row_sweep(sweep: Sweep, number: int) -> str:
+    dataset = sweep.slices[number]
+    least = dataset["loss"].min().item()
+    said = style.number(least) if np.isfinite(least) else "none"
+    lost = int(failed(dataset["status"]).sum())
+    return f"| {number} | {sweep.write_value(sweep.values[number])} | {said} | {lost} |"
+
+
+def _digest_sweep(sweep: Sweep) -> str:
+    """Return a name that equal recordings share."""
+    arrays: list[NDArray[np.float64]] = [np.asarray(sweep.values), *(one["loss"].to_numpy() for one in sweep.slices)]
     return hashlib.sha256(b"".join(np.ascontiguousarray(array).tobytes() for array in arrays)).hexdigest()[:16]

@@ -13,8 +13,8 @@ from ...lattice import own_cells
 from ...plane import Plane
 from ...space import LOG10
 from .. import style
-from ..decades import decades, write_power
 from ..figures import contour
+from ..style import decades, write_power
 
 Grid = NDArray[np.float64]
 

@@ -17,10 +17,10 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial import cKDTree
 
 from .. import style
-from ..figures import typesetting
+from ..figures import page
 from ..film import picture as picture_of
 from ..film import save_film
-from . import materials
+from . import solids
 from .solids import Grid, mesh, off_screen
 
 if TYPE_CHECKING:
@@ -60,12 +60,12 @@ def add_title(pictures: Iterable[Picture], title: str) -> Iterator[Picture]:
 
 def _strip(title: str, width: int) -> Picture:
     """Return a title on the background of a picture so wide [pixel]."""
-    figure = Figure(figsize=(width / STRIP_DPI, STRIP), facecolor=materials.BACKGROUND)
+    figure = Figure(figsize=(width / STRIP_DPI, STRIP), facecolor=solids.BACKGROUND)
     FigureCanvasAgg(figure)
-    room = width / STRIP_DPI - 2 * typesetting.MARGIN
-    fits = typesetting.text_width(title, style.Sheet.label) < room
+    room = width / STRIP_DPI - 2 * page.MARGIN
+    fits = page.text_width(title, style.Sheet.label) < room
     size = style.Sheet.label if fits else style.Sheet.small  # of which there is room for two lines
-    said, left = typesetting.wrap_text(title, room, size), typesetting.MARGIN * STRIP_DPI / width
+    said, left = page.wrap_text(title, room, size), page.MARGIN * STRIP_DPI / width
     figure.text(left, 0.5, said, size=size, color=style.INK, va="center", parse_math=False)
     return picture_of(figure, dpi=STRIP_DPI)
 
@@ -100,10 +100,10 @@ def frames(episode: Episode, chosen: Sequence[int], *, height: int = HEIGHT, mar
             _place(plotter, moving, [mesh(part, frame) for part in moving], "moving")
             _place(plotter, goal_parts(episode), [missed_surface(goal, bodies, frame) for goal in goals], "sought")
             if view.ground is not None:
-                _lay_ground(plotter, view, [mesh(part, frame) for part in episode.parts if materials.solid(part)])
+                _lay_ground(plotter, view, [mesh(part, frame) for part in episode.parts if solids.solid(part)])
             if marked:
                 said = f"{style.number(float(episode.time[frame]), '.3g')} s"
-                _stamp(plotter, said, "time", materials.INSET)
+                _stamp(plotter, said, "time", solids.INSET)
             plotter.render()
             picture = np.array(plotter.screenshot(return_img=True))
             if marked:
@@ -130,13 +130,13 @@ class Shot:
         wide, tall = (np.ptp((corners - center) @ side) for side in (right, up))
         width = round(height * float(np.clip(wide / tall, *LIKELY))) // 2 * 2
         half = 1.06 * max(tall, wide * height / width) / 2
-        far = half / np.tan(np.radians(materials.ANGLE) / 2) + np.ptp((corners - center) @ eye) / 2
+        far = half / np.tan(np.radians(solids.ANGLE) / 2) + np.ptp((corners - center) @ eye) / 2
         return cls(center, float(far), float(half), (width, height))
 
     @property
     def metre(self) -> float:
         """How long a metre is at the middle of the view [pixel]."""
-        return float(self.size[1] / 2 / (self.far * np.tan(np.radians(materials.ANGLE) / 2)))
+        return float(self.size[1] / 2 / (self.far * np.tan(np.radians(solids.ANGLE) / 2)))
 
     @property
     def bar(self) -> float:
@@ -152,12 +152,12 @@ def _stage(view: View, shot: Shot) -> Iterator[pv.Plotter]:
     center, (_, _, eye) = shot.center, axes(view)
     diagonal = float(np.linalg.norm(np.array(view.upper) - np.array(view.lower)))
     with off_screen(shot.size) as plotter:
-        for direction, strength in materials.LIGHTS:
+        for direction, strength in solids.LIGHTS:
             light = pv.Light(position=tuple(center + direction), focal_point=tuple(center), intensity=strength)
             light.positional = False
             plotter.add_light(light)
         plotter.camera.position, plotter.camera.focal_point = tuple(center + shot.far * eye), tuple(center)
-        plotter.camera.up, plotter.camera.view_angle = (0.0, 1.0, 0.0), materials.ANGLE
+        plotter.camera.up, plotter.camera.view_angle = (0.0, 1.0, 0.0), solids.ANGLE
         plotter.camera.clipping_range = (shot.far / 20, 20 * shot.far)
         plotter.enable_ssao(radius=diagonal / 14, bias=0.002 * shot.half / 1.06, kernel_size=64, blur=True)
         plotter.enable_anti_aliasing("ssaa")
@@ -166,23 +166,23 @@ def _stage(view: View, shot: Shot) -> Iterator[pv.Plotter]:
 
 def _write_scale(plotter: pv.Plotter, shot: Shot) -> None:
     """Write how long the scale's bar is, over its place at the lower right; it may be the wider of the two."""
-    right, lift = materials.INSET
-    over = (shot.size[0] - right, lift + 2 * materials.THICK)
+    right, lift = solids.INSET
+    over = (shot.size[0] - right, lift + 2 * solids.THICK)
     _stamp(plotter, f"{style.number(shot.bar)} m", "scale", over).justification_horizontal = "right"
 
 
 def _stamp(plotter: pv.Plotter, said: str, name: str, position: tuple[int, int]) -> pv.TextProperty:
     """Write on a picture, on a ground that lets little through, and return how it is written."""
-    actor = plotter.add_text(said, name=name, position=position, **materials.STAMP)
-    actor.prop.background_color, actor.prop.background_opacity = materials.BACKGROUND, materials.VEIL
+    actor = plotter.add_text(said, name=name, position=position, **solids.STAMP)
+    actor.prop.background_color, actor.prop.background_opacity = solids.BACKGROUND, solids.VEIL
     return actor.prop
 
 
 def _draw_bar(picture: Picture, shot: Shot) -> None:
     """Draw the scale's bar into a picture, at its lower right."""
-    right, bottom = (size - inset for size, inset in zip(shot.size, materials.INSET, strict=True))
-    color = pv.Color(materials.STAMP["color"]).int_rgb
-    picture[bottom - materials.THICK : bottom, right - round(shot.bar * shot.metre) : right] = color
+    right, bottom = (size - inset for size, inset in zip(shot.size, solids.INSET, strict=True))
+    color = pv.Color(solids.STAMP["color"]).int_rgb
+    picture[bottom - solids.THICK : bottom, right - round(shot.bar * shot.metre) : right] = color
 
 
 def axes(view: View) -> tuple[Grid, Grid, Grid]:
@@ -208,12 +208,12 @@ def missed_surface(goal: pv.PolyData, bodies: Sequence[Part], frame: int) -> pv.
 
 def _place(plotter: pv.Plotter, parts: Sequence[Part], surfaces: Sequence[pv.PolyData], label: str) -> None:
     for number, (part, surface) in enumerate(zip(parts, surfaces, strict=True)):
-        look = materials.look(part)
+        look = solids.look(part)
         if "side" in surface.point_data:
-            look["scalars"], look["cmap"] = "side", [materials.BACK[part.material], look.pop("color")]
+            look["scalars"], look["cmap"] = "side", [solids.BACK[part.material], look.pop("color")]
             look["show_scalar_bar"] = False
-        elif part.material in materials.BACK:
-            look["backface_params"] = {**look, "color": materials.BACK[part.material]}
+        elif part.material in solids.BACK:
+            look["backface_params"] = {**look, "color": solids.BACK[part.material]}
         smooth = part.shape != "box" and part.material != "sugar"
         name = f"{label} {number}"
         if not surface.n_cells:
@@ -239,8 +239,8 @@ def _lay_ground(plotter: pv.Plotter, view: View, solids: Sequence[pv.PolyData]) 
     dark = _shadow(solids, view.ground, x, z)
     away = np.hypot((x[:, None] - center[0]) / half, (z[None, :] - center[2]) / half)
     fade = np.clip((away - 0.45) / 0.5, 0.0, 1.0)[..., None]
-    ground, background = (np.array(pv.Color(name).float_rgb) for name in (materials.GROUND, materials.BACKGROUND))
-    color = ground * (1 - materials.SHADOW * dark[..., None]) * (1 - fade) + background * fade
+    ground, background = (np.array(pv.Color(name).float_rgb) for name in (solids.GROUND, solids.BACKGROUND))
+    color = ground * (1 - solids.SHADOW * dark[..., None]) * (1 - fade) + background * fade
     grid = pv.StructuredGrid(*np.meshgrid(x, [view.ground], z, indexing="ij"))
     rgb = (255 * color).round().astype(np.uint8).transpose(1, 0, 2).reshape(-1, 3)
     plotter.add_mesh(
@@ -252,7 +252,7 @@ def _shadow(solids: Sequence[pv.PolyData], ground: float, x: Grid, z: Grid) -> G
     """Return how much of the key light solids take from the ground, shape (x, z), 0 to 1."""
     spots = np.concatenate([_scatter_points(solid) for solid in solids if solid.n_cells] or [np.zeros((0, 3))])
     lift = spots[:, 1:2] - ground
-    shift = np.array(materials.KEY)
+    shift = np.array(solids.KEY)
     feet = (spots - lift * shift / shift[1])[lift[:, 0] > 0]
     edges = [np.append(axis, 2 * axis[-1] - axis[-2]) - (axis[1] - axis[0]) / 2 for axis in (x, z)]
     hits, *_ = np.histogram2d(feet[:, 0], feet[:, 2], bins=edges)

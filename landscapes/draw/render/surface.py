@@ -22,7 +22,7 @@ from ...lattice import own_cells
 from ...objective import has_loss
 from ...storage.files import replacing
 from .. import style
-from ..figures import page, panel
+from ..figures import page
 from ..figures.overlay import by_kind, joint_scale
 from . import relief
 from .relief import FOCUS, HEIGHT, SIDE, Relief, Stand
@@ -95,7 +95,7 @@ def surface_figure(dataset: xr.Dataset, runs: Runs = (), *, width: float | None 
         _label(ax, dataset, shown)
     page.head(picture, ax, dataset)
     scale = shown.relief.scale
-    panel.colour_bar(
+    page.colour_bar(
         ax,
         ScalarMappable(scale.norm, style.LOSS_MAP),
         page.loss_name(dataset),

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gradscape.landscapes.convert import from_json, to_json
-from gradscape.landscapes.draw.figures.card import opposing
+from gradscape.landscapes.draw.figures.multiples import opposing
 from gradscape.landscapes.measures.card import Card, Grade, count_outcomes, first_finding
 
 from ..draw.figures.records import card

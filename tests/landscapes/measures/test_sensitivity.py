@@ -26,8 +26,8 @@ def found_in(
 
 def explored(objective: Objective, folder: Path, *, samples: int) -> Responses:
     design = Design.sobol(objective.space, samples, seed=0)
-    pieces = Checkpoint.open(folder, {"samples": samples}, what="pairs")
-    return explore(objective, design, pieces)
+    checkpoint = Checkpoint.open(folder, {"samples": samples}, what="pairs")
+    return explore(objective, design, checkpoint)
 
 
 def test_ishigamis_indices_are_the_closed_ones(tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ from gradscape.landscapes.identity import StoreError
 from gradscape.landscapes.objective import Evaluation, Objective, Status
 from gradscape.landscapes.plane import Plane
 from gradscape.landscapes.sampling import distribution as spread
-from gradscape.landscapes.sampling.distribution import Site, WorkersLostError, equal_groups
+from gradscape.landscapes.sampling.distribution import TileWriter, WorkersLostError, equal_groups
 from gradscape.landscapes.sampling.fill import sample
 from gradscape.landscapes.sampling.memory import MemoryBound
 from gradscape.landscapes.space import ParameterSpace
@@ -232,7 +232,7 @@ def test_workers_that_never_come_back_are_given_up(tmp_path, clock, monkeypatch)
 
 def test_a_worker_of_another_store_or_without_the_file_system_says_so(tmp_path):
     store = store_at(tmp_path / "s.zarr")
-    make, arguments = Site(
+    make, arguments = TileWriter(
         MemoryBound(from_torch(wave, SPACE)), store, functools.partial(from_torch, wave, SPACE)
     ).__reduce__()
     remote = make(*arguments)
@@ -247,8 +247,8 @@ def test_a_worker_of_another_store_or_without_the_file_system_says_so(tmp_path):
 def test_a_batch_that_was_half_done_by_a_worker_that_died_is_not_done_again(tmp_path):
     store = store_at(tmp_path / "s.zarr")
     first = store.tiles()[0]
-    list(Site(MemoryBound(from_torch(wave, SPACE)), store).fill([first], 16))
-    make, arguments = Site(MemoryBound(Broken()), store).__reduce__()
+    list(TileWriter(MemoryBound(from_torch(wave, SPACE)), store).fill([first], 16))
+    make, arguments = TileWriter(MemoryBound(Broken()), store).__reduce__()
     remote = make(*arguments)
     assert [filled.tile for filled in remote.fill([first], 16)] == [first]  # found: evaluated it would break
     with pytest.raises(RuntimeError, match="broken cable"):
@@ -289,13 +289,15 @@ def test_what_workers_wrote_and_never_appears_is_an_error(tmp_path, hidden, cloc
 
 
 def test_a_worker_keeps_a_store_open_until_another_lies_there(tmp_path):
-    site = Site(MemoryBound(from_torch(wave, SPACE)), store_at(tmp_path / "s.zarr"), lambda: from_torch(wave, SPACE))
-    remote = pickle.loads(pickle.dumps(site))
-    tiles = site.store.tiles()
+    writer = TileWriter(
+        MemoryBound(from_torch(wave, SPACE)), store_at(tmp_path / "s.zarr"), lambda: from_torch(wave, SPACE)
+    )
+    remote = pickle.loads(pickle.dumps(writer))
+    tiles = writer.store.tiles()
     assert list(remote.fill(tiles[:1], 16))
     assert remote.here().store is remote.here().store
-    shutil.rmtree(site.store.place)
-    again = store_at(site.store.path)
+    shutil.rmtree(writer.store.place)
+    again = store_at(writer.store.path)
     assert list(remote.fill(tiles[:1], 16))
     assert again.statuses(tiles[0])
 

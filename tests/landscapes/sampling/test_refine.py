@@ -197,7 +197,7 @@ def runs(objective: Objective, path: Path, over: Plane, **how: Any) -> Iterator[
     while True:
         store = SliceStore.open_or_create(path, over, SPACE, identity={"objective": "stopping"})
         try:
-            yield refine(objective, over, store, Refinement(0.02), pieces=Checkpoint(path.parent / "pieces"), **how)
+            yield refine(objective, over, store, Refinement(0.02), checkpoint=Checkpoint(path.parent / "pieces"), **how)
         except KeyboardInterrupt:
             yield None
 

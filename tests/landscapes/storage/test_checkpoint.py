@@ -12,7 +12,7 @@ from gradscape.envs.adapters import from_torch
 from gradscape.landscapes.identity import DamagedError, StoreError, StoreMismatchError
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.landscapes.storage.checkpoint import Checkpoint
-from gradscape.landscapes.storage.locks import holding
+from gradscape.landscapes.storage.files import holding
 
 SPACE = ParameterSpace({"x": (-1, 1), "y": (-1, 1)})
 BOWL, CUP = (from_torch(lambda x, k=k: (k * x**2).sum(dim=1), SPACE, name="bowl") for k in (1.0, 2.0))

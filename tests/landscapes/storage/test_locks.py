@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from gradscape.landscapes.identity import StoreError
-from gradscape.landscapes.storage.locks import check_free, holding
+from gradscape.landscapes.storage.files import check_free, holding
 
 
 def test_a_second_one_says_that_it_waits_and_goes_on_then(tmp_path: Path) -> None:

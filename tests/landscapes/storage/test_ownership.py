@@ -18,8 +18,7 @@ from gradscape.landscapes.plane import Plane
 from gradscape.landscapes.sampling.fill import sample
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.landscapes.storage.checkpoint import Checkpoint
-from gradscape.landscapes.storage.files import discard, placing, replacing, tidy
-from gradscape.landscapes.storage.ownership import remove
+from gradscape.landscapes.storage.files import discard, placing, remove, replacing, tidy
 from gradscape.landscapes.storage.paths import filling_path
 from gradscape.landscapes.storage.store import SliceStore
 
@@ -122,31 +121,31 @@ def test_settings_of_something_else_are_no_study(said: str, force: bool, tmp_pat
 
 
 def test_a_study_with_anything_else_among_its_pieces_is_not_begun_anew(tmp_path: Path) -> None:
-    pieces = Checkpoint.open(tmp_path, {"seed": 0}, what="pairs")
-    pieces.save("one", loss=torch.zeros(2).numpy())
+    checkpoint = Checkpoint.open(tmp_path, {"seed": 0}, what="pairs")
+    checkpoint.save("one", loss=torch.zeros(2).numpy())
     (tmp_path / "pieces/queen.obj").write_text("precious")
     with pytest.raises(ValueError, match=r"holds files that are not of a pairs: queen\.obj; move"):
         Checkpoint.open(tmp_path, {"seed": 1}, what="pairs", force=True)
-    assert pieces.count() == 1
+    assert checkpoint.count() == 1
     (tmp_path / "pieces/queen.obj").unlink()
     assert Checkpoint.open(tmp_path, {"seed": 1}, what="pairs", force=True).count() == 0
 
 
 @pytest.mark.parametrize("content", [b"", b"PK", None])
 def test_a_damaged_piece_is_said_and_computed_again(content: bytes | None, tmp_path: Path) -> None:
-    pieces = Checkpoint.open(tmp_path, {"seed": 0}, what="pairs")
-    pieces.save("one", loss=torch.arange(99).numpy())
+    checkpoint = Checkpoint.open(tmp_path, {"seed": 0}, what="pairs")
+    checkpoint.save("one", loss=torch.arange(99).numpy())
     (file,) = (tmp_path / "pieces").iterdir()
     torn = file.read_bytes()
     file.write_bytes(torn[: len(torn) // 2] + b"?" + torn[len(torn) // 2 + 1 :] if content is None else content)
     with pytest.warns(RuntimeWarning, match=rf"{file} is damaged \(.+\); it is computed again"):
-        assert pieces.load("one") is None
+        assert checkpoint.load("one") is None
 
 
 def test_pieces_in_each_others_place_are_computed_again(tmp_path: Path) -> None:
-    pieces = Checkpoint.open(tmp_path, {"seed": 0}, what="pairs")
+    checkpoint = Checkpoint.open(tmp_path, {"seed": 0}, what="pairs")
     for name in ("one", "two"):
-        pieces.save(name, loss=np.arange(3.0))
+        checkpoint.save(name, loss=np.arange(3.0))
     files = [tmp_path / f"pieces/{name}.npz" for name in ("one", "two")]
     contents = [file.read_bytes() for file in files]
     for file, content in zip(files, reversed(contents), strict=True):
@@ -155,7 +154,7 @@ def test_pieces_in_each_others_place_are_computed_again(tmp_path: Path) -> None:
         with pytest.warns(
             RuntimeWarning, match=rf"{name}\.npz is damaged \(it is another part\); it is computed again"
         ):
-            assert pieces.load(name) is None
+            assert checkpoint.load(name) is None
 
 
 def test_what_a_living_process_makes_is_held_and_nobody_clears_it_away(tmp_path: Path) -> None:

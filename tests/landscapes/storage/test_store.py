@@ -14,7 +14,7 @@ import xarray as xr
 from gradscape.landscapes.identity import StoreError, plane_of
 from gradscape.landscapes.objective import Evaluation, Status
 from gradscape.landscapes.plane import Plane
-from gradscape.landscapes.storage.layout import consolidate
+from gradscape.landscapes.storage.arrays import consolidate
 from gradscape.landscapes.storage.paths import corner, filling_path
 from gradscape.landscapes.storage.store import SliceStore, open_slice
 

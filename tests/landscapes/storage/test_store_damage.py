@@ -59,7 +59,7 @@ def test_a_damaged_chunk_costs_exactly_its_tile(tmp_path, damage):
 
 @pytest.mark.parametrize("place", [filling_path, Path])
 def test_chunks_in_each_others_place_are_missing_and_not_taken_for_right(tmp_path, monkeypatch, place):
-    monkeypatch.setattr("gradscape.landscapes.storage.layout.SIDE", 4)  # so that a finished slice has several, too
+    monkeypatch.setattr("gradscape.landscapes.storage.arrays.SIDE", 4)  # so that a finished slice has several, too
     path = tmp_path / "s.zarr"
     (fill(make(path)) if place is filling_path else finished(path))
     whole, swapped = open_slice(path), 0

@@ -4,8 +4,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gradscape.landscapes.storage import tiles as tiling
-from gradscape.landscapes.storage.tiles import _offsets, coarse_to_fine, tile_side
+from gradscape.landscapes.storage import arrays
+from gradscape.landscapes.storage.arrays import _offsets, coarse_to_fine, tile_side
 
 POINTS = st.integers(2, 600)
 FEW = settings(max_examples=40)
@@ -66,8 +66,8 @@ def test_the_order_is_that_of_the_slices_that_are_stored(sizes):
 
 def test_the_order_of_many_points_takes_a_few_steps_for_each(monkeypatch):
     steps = itertools.count()
-    push = tiling.heappush
-    monkeypatch.setattr(tiling, "heappush", lambda *given: (next(steps), push(*given)))
+    push = arrays.heappush
+    monkeypatch.setattr(arrays, "heappush", lambda *given: (next(steps), push(*given)))
     points = 10**5
     assert sorted(coarse_to_fine(points, tile_side(points))) == list(range(points))
     assert next(steps) <= 2 * points

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from gradscape.landscapes.draw.figures.curve import run_figure
+from gradscape.landscapes.draw.figures.search import run_figure
 from gradscape.landscapes.objective import Status
 
 KINDS = {"flag_values": [0, 1, 2, 3, 4], "flag_meanings": "random population descent acquisition policy"}

@@ -7,7 +7,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.patches import Rectangle
 
 from gradscape.landscapes.draw import style
-from gradscape.landscapes.draw.figures.league import league_figure
+from gradscape.landscapes.draw.figures.search import league_figure
 
 METHODS = ["bo-leap", "cma-es-gradient", "descents", "random"]
 RANK = np.array([[1.0, 2.25, 3.0, 3.75], [1.5, np.nan, 1.5, 3.0], [1.25, 2.25, 2.25, 3.4]])

@@ -15,26 +15,28 @@ from matplotlib import rcParams
 from matplotlib.text import Text
 
 from gradscape.landscapes import draw
-from gradscape.landscapes.draw.figures import page, typesetting
-from gradscape.landscapes.draw.figures.card import card_figure
-from gradscape.landscapes.draw.figures.census import census_figure
-from gradscape.landscapes.draw.figures.companions import CompanionSlice, companions_figure
+from gradscape.landscapes.draw.figures import page
 from gradscape.landscapes.draw.figures.comparison import comparison_figure
 from gradscape.landscapes.draw.figures.contact import Caption, episode_figure
 from gradscape.landscapes.draw.figures.contour import landscape_figure
 from gradscape.landscapes.draw.figures.convergence import convergence_figure
-from gradscape.landscapes.draw.figures.curve import run_figure
 from gradscape.landscapes.draw.figures.extremes import extremes_figure
 from gradscape.landscapes.draw.figures.fidelity import fidelity_figure
-from gradscape.landscapes.draw.figures.league import league_figure
 from gradscape.landscapes.draw.figures.model import model_figure
+from gradscape.landscapes.draw.figures.multiples import (
+    CompanionSlice,
+    Landscape,
+    card_figure,
+    census_figure,
+    companions_figure,
+    thumbnail_figure,
+    wall_figure,
+)
 from gradscape.landscapes.draw.figures.overlay import overlay_figure
 from gradscape.landscapes.draw.figures.profile import profile_figure
 from gradscape.landscapes.draw.figures.quality import quality_figure
-from gradscape.landscapes.draw.figures.race import race_figure
+from gradscape.landscapes.draw.figures.search import league_figure, race_figure, run_figure
 from gradscape.landscapes.draw.figures.sweep import Scales, frame_figure
-from gradscape.landscapes.draw.figures.thumbnail import thumbnail_figure
-from gradscape.landscapes.draw.figures.wall import Landscape, wall_figure
 from gradscape.landscapes.draw.render.surface import surface_figure
 from gradscape.landscapes.episode import Episode, Part, View
 from gradscape.landscapes.measures import gradient_quality as gradients
@@ -283,7 +285,7 @@ def test_prints_are_named_by_their_width_and_those_there_are_drawn_anew(tmp_path
 
 def test_a_text_is_wrapped_by_its_width() -> None:
     for width in (1.0, 2.5, 6.0):
-        lines = typesetting.wrap_text(COMMAND, width, 7.0, lines=3).split("\n")
-        assert max(typesetting.text_width(line, 7.0) for line in lines) <= width
+        lines = page.wrap_text(COMMAND, width, 7.0, lines=3).split("\n")
+        assert max(page.text_width(line, 7.0) for line in lines) <= width
         assert len(lines) <= 3
-    assert typesetting.wrap_text("short", 6.0, 7.0) == "short"
+    assert page.wrap_text("short", 6.0, 7.0) == "short"

@@ -7,8 +7,7 @@ import pytest
 from matplotlib.text import Text
 
 from gradscape.landscapes.draw import style
-from gradscape.landscapes.draw.figures.labels import Name, place
-from gradscape.landscapes.draw.figures.page import Picture
+from gradscape.landscapes.draw.figures.page import Label, Picture, place_labels
 from gradscape.landscapes.draw.figures.quality import quality_figure
 from gradscape.landscapes.sampling.fill import sample
 
@@ -79,8 +78,8 @@ def test_names_stand_beside_their_places_and_cover_nothing() -> None:
     ax, random = panel(), np.random.default_rng(0)
     places = random.uniform(0.1, 0.9, (20, 2))
     clear = np.concatenate([places, random.uniform(0, 1, (200, 2))])
-    names = [Name(f"name {number}", tuple(at)) for number, at in enumerate(places)]
-    left = place(ax, names, clear, size=7.0, gaps=(6.0, 12.0, 20.0, 30.0))
+    names = [Label(f"name {number}", tuple(at)) for number, at in enumerate(places)]
+    left = place_labels(ax, names, clear, size=7.0, gaps=(6.0, 12.0, 20.0, 30.0))
     assert len(ax.texts) + len(left) == len(names)
     assert len(ax.texts) >= 10
     ax.figure.canvas.draw()
@@ -95,8 +94,8 @@ def test_names_stand_beside_their_places_and_cover_nothing() -> None:
 def test_a_name_without_a_line_is_nearest_to_what_it_names() -> None:
     ax = panel()
     places = np.array([[0.5, 0.5], [0.53, 0.5], [0.5, 0.54], [0.53, 0.54]])
-    names = [Name(f"name {number}", tuple(at)) for number, at in enumerate(places)]
-    assert place(ax, names, places, size=7.0, gaps=(6.0, 12.0, 20.0, 30.0)) == []
+    names = [Label(f"name {number}", tuple(at)) for number, at in enumerate(places)]
+    assert place_labels(ax, names, places, size=7.0, gaps=(6.0, 12.0, 20.0, 30.0)) == []
     for number, text in enumerate(ax.texts):
         if text.arrow_patch is None:
             box = text.get_window_extent()
@@ -107,6 +106,6 @@ def test_a_name_without_a_line_is_nearest_to_what_it_names() -> None:
 
 def test_where_there_is_no_room_there_is_no_name() -> None:
     ax = panel(side=1.0)
-    names = [Name("a long name", (0.5, 0.5))] * 5
-    left = place(ax, names, np.array([[0.5, 0.5]]), size=7.0, gaps=(6.0,))
+    names = [Label("a long name", (0.5, 0.5))] * 5
+    left = place_labels(ax, names, np.array([[0.5, 0.5]]), size=7.0, gaps=(6.0,))
     assert len(left) >= 4

@@ -6,7 +6,7 @@ import xarray as xr
 from matplotlib.colors import to_rgba
 
 from gradscape.landscapes.draw import style
-from gradscape.landscapes.draw.figures.race import race_figure
+from gradscape.landscapes.draw.figures.search import race_figure
 from gradscape.optim.registry import methods
 
 NAN = np.nan

@@ -15,7 +15,7 @@ from rerun.chunk import RrdReader
 
 from gradscape.landscapes.draw.figures.sweep import Scales, Sweep, frame_figure, save_films
 from gradscape.landscapes.draw.film import picture, save_film
-from gradscape.landscapes.draw.recordings.sweep import save_stream
+from gradscape.landscapes.draw.recordings.runs import save_sweep
 from gradscape.landscapes.objective import Evaluation, Objective, Status
 from gradscape.landscapes.plane import Plane
 from gradscape.landscapes.sampling.fill import sample
@@ -111,7 +111,7 @@ def test_a_film_that_cannot_be_written_says_why_and_leaves_nothing(tmp_path: Pat
 
 
 def test_the_scene_has_a_surface_for_each_value_on_a_timeline_of_that_name(tmp_path: Path) -> None:
-    save_stream(SWEEP, tmp_path / "sweep.rrd")
+    save_sweep(SWEEP, tmp_path / "sweep.rrd")
     rows = {"/landscape/surface": [], "/landscape/value": [], "/lowest": []}
     for chunk in RrdReader(tmp_path / "sweep.rrd").stream().to_chunks():
         if chunk.entity_path in rows:

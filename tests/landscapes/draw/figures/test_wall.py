@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from matplotlib.colors import Normalize
 
-from gradscape.landscapes.draw.figures.wall import Landscape, wall_figure
+from gradscape.landscapes.draw.figures.multiples import Landscape, wall_figure
 from gradscape.landscapes.draw.style import LOSS_MAP
 
 from .test_contour import DATASET

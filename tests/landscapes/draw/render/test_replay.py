@@ -16,7 +16,7 @@ from gradscape.envs.mpm.fluid import TANK_HEIGHT, TANK_WIDTH
 from gradscape.envs.outlines import rotate_about, skin, triangles
 from gradscape.envs.registry import BUILTIN, make
 from gradscape.landscapes.draw.figures.contact import Caption, episode_figure, save_sheet
-from gradscape.landscapes.draw.render import materials
+from gradscape.landscapes.draw.render import solids
 from gradscape.landscapes.draw.render.replay import Shot, add_title, axes, frames, missed_surface, save_replay
 from gradscape.landscapes.draw.render.solids import lump, mesh
 from gradscape.landscapes.episode import Episode, Part, View
@@ -74,7 +74,7 @@ def pixel(view: View, point: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     """Return the column and row of a point through a pinhole that sees the view's box whole, with 6 % to spare."""
     right, up, eye = axes(view)
     corners, center = _corners(view), (np.array(view.lower) + view.upper) / 2
-    tangent = np.tan(np.radians(materials.ANGLE) / 2)
+    tangent = np.tan(np.radians(solids.ANGLE) / 2)
     half = max(np.ptp(corners @ up), np.ptp(corners @ right) * shape[0] / shape[1]) / 2
     distance = 1.06 * half / tangent + np.ptp(corners @ eye) / 2 - (point - center) @ eye
     scale = shape[0] / 2 / (distance * tangent)
@@ -165,7 +165,7 @@ def test_a_scale_is_as_long_as_it_says_at_the_middle_of_the_view() -> None:
     assert columns.max() - columns.min() + 1 == pytest.approx(shot.bar * shot.metre, abs=5)
     (marked,) = frames(episode, [0], height=300)
     changed = np.nonzero((marked != plain).any(axis=2))
-    bar = changed[1][changed[0] == 300 - materials.INSET[1] - 1]  # its lowest row
+    bar = changed[1][changed[0] == 300 - solids.INSET[1] - 1]  # its lowest row
     assert np.ptp(bar) + 1 == round(shot.bar * shot.metre)
     (titled,) = add_title([marked], "a title that is longer than its picture is wide: loss 1 m")
     strip, below = np.split(titled, [len(titled) - 300])

@@ -1,0 +1,330 @@
+"""Small multiples: the slices of a census, a card, a wall, or cuts through other points, side by side (matplotlib)."""
+
+from __future__ import annotations
+
+import math
+import textwrap
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import groupby, zip_longest
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.image import AxesImage
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from numpy.typing import NDArray
+
+from ...identity import plane_of
+from ...lattice import own_cells, sampled_line
+from .. import style
+from ..figure import Picture
+from . import page
+
+if TYPE_CHECKING:
+    from ...measures.card import Card, CardSlice, Grade
+    from ...measures.census import Census
+
+
+PITCH, LEAST = 3.6, 40.0  # room of a panel: on a screen [inch], and at least in print [mm]
+TALL = 1.05  # height of a row of panels, in that of their room
+
+
+@dataclass(frozen=True, eq=False)
+class CompanionSlice:
+    """The losses of a cut through a named point, of shape (v, u), or (u) of a line; NaN where an episode failed."""
+
+    through: str
+    loss: NDArray[Any]
+
+    def title(self) -> str:
+        """Say where it goes through and what its losses range over."""
+        finite = self.loss[np.isfinite(self.loss)]
+        ends = (
+            [f"{end:.3g}".replace("-", "\N{MINUS SIGN}") for end in (finite.min(), finite.max())] if finite.size else []
+        )
+        return f"through {spoken(self.through)}\n{' to '.join(ends) or 'all failed'}"
+
+
+def spoken(through: str) -> str:
+    """Say the name of a point as a sentence has it."""
+    kind, _, name = through.partition(":")
+    if kind == "center":
+        return "the centre"
+    return f"the example {name}" if kind == "example" else f"random point {name}" if kind == "random" else through
+
+
+def companions_figure(
+    cuts: Sequence[CompanionSlice], dataset: xr.Dataset, *, width: float | None = None
+) -> page.Picture:
+    """Draw cuts side by side on one scale; the first is the slice `dataset` itself, whose axes all have.
+
+    What failed is grey. Raises ValueError where the page is too narrow or too wide.
+    """
+    sheet = style.Sheet.of(width, pitch=PITCH, columns=len(cuts), least=LEAST)
+    rows = -(-len(cuts) // sheet.columns)
+    picture = page.Picture(sheet, rows * TALL * sheet.pitch)
+    axes = page.grid(picture, len(cuts), share=True)
+    scale = style.Scale.of_loss(np.concatenate([cut.loss.ravel().astype(float) for cut in cuts]))
+    plane = plane_of(dataset)
+    y = plane.labels[1] if plane.rank == 2 else page.loss_name(dataset)
+    for ax, cut in zip(axes, cuts, strict=True):
+        _draw(ax, cut, dataset, scale)
+        page.dress(ax, plane)
+        if plane.rank == 1 and scale.logarithmic:
+            page.log_axis(ax.yaxis)
+        page.caption(ax, cut.title())
+        page.name_outer(ax, plane.labels[0], y)
+    if plane.rank == 2:
+        page.colour_bar(axes[0], axes[0].images[0], page.loss_name(dataset), scale, beside=axes)
+    page.finish(picture, [])
+    return picture
+
+
+def _draw(ax: Axes, cut: CompanionSlice, dataset: xr.Dataset, scale: style.Scale) -> None:
+    plane = plane_of(dataset)
+    ax.set_box_aspect(1)
+    ends = [(float(low), float(high)) for low, high in zip(plane.lower, plane.upper, strict=True)]
+    if plane.rank == 1:
+        ax.plot(np.linspace(*ends[0], cut.loss.size), cut.loss, color=style.LOSS_LINE)
+        return
+    ax.set_facecolor(style.UNSAMPLED)
+    half = [(high - low) / (count - 1) / 2 for (low, high), count in zip(ends, cut.loss.shape[::-1], strict=True)]
+    (left, right), (bottom, top) = ((low - pad, high + pad) for (low, high), pad in zip(ends, half, strict=True))
+    _map(ax, cut.loss, scale, (left, right, bottom, top))
+    ax.set(xlim=ends[0], ylim=ends[1])
+
+
+CENSUS_PITCH, ACROSS = 8.0, 8  # room on a screen [inch]; slices side by side
+FOOT = 4  # words that the legend has, the most frequent first
+
+
+def census_figure(census: Census, *, width: float | None = None) -> page.Picture:
+    """Draw the losses of every slice on one scale, the least rugged first, row by row.
+
+    Slices are ordered by the share of steps that turn back. What failed or lies outside the box is grey. The legend
+    says which share of the slices each word fits.
+
+    Raises ValueError where the page is too narrow or too wide.
+    """
+    sheet = style.Sheet.of(width, pitch=CENSUS_PITCH)
+    across = min(ACROSS, math.ceil(math.sqrt(len(census.slices))))
+    rows = -(-len(census.slices) // across)
+    picture = page.Picture(sheet, sheet.width * rows / across)
+    axes = list(picture.subplots(rows, across, squeeze=False).flat)
+    scale = style.Scale.of_loss(np.asarray(census.losses, dtype=float))
+    for ax, number in zip(axes, census.order, strict=False):
+        _frame(ax, shape=1.0)
+        drawn = _map(ax, census.losses[number], scale)
+    for empty in axes[len(census.slices) :]:
+        empty.set_axis_off()
+    unit = f" [{census.loss_unit}]" if census.loss_unit else ""
+    page.colour_bar(axes[0], drawn, f"loss{unit}", scale, beside=axes)
+    many = f"{len(census.slices)} slices, the least rugged first"
+    page.entitle(picture, f"{census.env} · census at {census.fidelity} · {many}")
+    page.finish(picture, _words(census), columns=2, heading=_made(census))
+    return picture
+
+
+def _made(census: Census) -> str:
+    known = (census.identity.get("device"), census.provenance.get("created"), census.command)
+    return " · ".join(str(one) for one in known if one)
+
+
+def _words(census: Census) -> list[Patch]:
+    """Return legend entries without a sign that say how often each word fits, the most frequent first."""
+    shares = sorted(census.words.items(), key=lambda one: -one[1].value)
+    said = [
+        f"{word}: {100 * share.value:.0f} % ({100 * share.low:.0f} to {100 * share.high:.0f})"
+        for word, share in shares
+        if share.value > 0
+    ]
+    return [Patch(visible=False, label=text) for text in said[: 2 * FOOT]]
+
+
+WALL_PITCH, WALL_ACROSS, WALL_LEAST = 2.2, 6, 28.0  # room of a landscape [inch]; so many in a row; in print [mm]
+LINE = 25  # letters in a line under a landscape
+
+
+@dataclass(frozen=True, eq=False)
+class Landscape:
+    """A slice on the wall, what it is of, and what that is like."""
+
+    name: str
+    said: str
+    dataset: xr.Dataset
+
+
+def wall_figure(landscapes: Sequence[Landscape], *, width: float | None = None) -> page.Picture:
+    """Draw the losses of slices side by side, each on a scale of its own from its lowest, dark, to its highest, light.
+
+    Under a plane are its axes, and under each its words. What is not OK is grey. A line is drawn as one, its loss
+    upwards.
+
+    Raises ValueError where there is no slice, or the page is too narrow or too wide.
+    """
+    if not landscapes:
+        raise ValueError("a wall needs a landscape at least; got none")
+    sheet = style.Sheet.of(
+        width, pitch=WALL_PITCH, columns=min(WALL_ACROSS, len(landscapes)), panels=len(landscapes), least=WALL_LEAST
+    )
+    rows = -(-len(landscapes) // sheet.columns)
+    picture = page.Picture(sheet, 1.15 * rows * sheet.pitch)
+    for ax, one in zip(page.grid(picture, len(landscapes)), landscapes, strict=True):
+        _draw_wall(ax, one.dataset)
+        page.caption(ax, one.name)
+        said = "\n".join(textwrap.wrap(one.said.replace(" %", "\N{NO-BREAK SPACE}%"), LINE)) or " "
+        ax.set_xlabel(said, size=sheet.small, color=style.QUIET, parse_math=False)
+    page.entitle(picture, "Losses, each on its own scale: dark is low, light is high")
+    page.finish(picture, [])
+    return picture
+
+
+def _draw_wall(ax: Axes, dataset: xr.Dataset) -> None:
+    _frame(ax, shape=0.75)
+    if plane_of(dataset).rank == 1:
+        line = sampled_line(dataset)
+        ax.plot(line["u"], line["loss"], color=style.LOSS_LINE, linewidth=1.1)
+        ax.set_facecolor("white")
+        return
+    loss = own_cells(dataset)["loss"].to_numpy()
+    _map(ax, loss, style.Scale.of_loss(loss))
+
+
+CARD_PITCH, CARD_ACROSS, SHAPE = (
+    2.5,
+    6,
+    1.35,
+)  # room of a map on a screen [inch]; so many in a row; height of a row for that
+FEWEST = 3  # for the legend below
+CARD_LEAST = 27.0  # room of a map in print [mm]
+ARROWS = 9  # most along each axis of a map
+LENGTH = 0.09  # of an arrow, as a share of a side
+OPPOSED = "#ff6b3d"  # legible on all of the map
+OUTCOMES = {"passes": "#1b7837", "fails": "#b2182b", "not installed": style.QUIET}  # and the words themselves
+
+
+def card_figure(card: Card, *, width: float | None = None) -> page.Picture:
+    """Draw the losses and the direction of steepest descent by the gradient of every engine, scene by scene.
+
+    Maps of a scene share a colour scale. An arrow is orange where the gradient opposes the slope between neighbouring
+    samples, and white elsewhere; which share of all samples does stands over the map.
+
+    Raises ValueError where the page is too narrow or too wide.
+    """
+    most = max(Counter(one.scene for one in card.grades).values())
+    sheet = style.Sheet.of(width, pitch=CARD_PITCH, columns=min(CARD_ACROSS, max(FEWEST, most)), least=CARD_LEAST)
+    rows = _rows(card, sheet.columns)
+    picture = page.Picture(sheet, SHAPE * sheet.pitch * len(rows))
+    axes = picture.subplots(len(rows), sheet.columns, squeeze=False)
+    for scene, group in groupby(zip(rows, axes, strict=True), key=lambda one: card.grades[one[0][0]].scene):
+        _draw_scene(scene, [place for row, places in group for place in zip_longest(row, places)], card)
+    page.entitle(picture, "Report card of gradients")
+    made = f"{card.created} · {card.device} · {', '.join(card.engines())}"
+    page.finish(picture, _legend(sheet), heading=made)
+    return picture
+
+
+def _rows(card: Card, columns: int) -> list[list[int]]:
+    """Return the numbers of the grades in each row of maps; every scene begins one."""
+    scenes = [list(group) for _, group in groupby(range(len(card.grades)), key=lambda k: card.grades[k].scene)]
+    return [scene[start : start + columns] for scene in scenes for start in range(0, len(scene), columns)]
+
+
+def _draw_scene(scene: str, places: Sequence[tuple[int | None, Axes]], card: Card) -> None:
+    """Draw the maps of a scene side by side, with their colour bar."""
+    cuts = [card.slices[number] for number, _ in places if number is not None and number in card.slices]
+    scale = style.Scale.of_loss(np.concatenate([cut.loss.ravel() for cut in cuts] or [np.zeros(1)]))
+    for number, ax in places:
+        if number is None:
+            ax.set_axis_off()
+        else:
+            _draw_map(ax, card.grades[number], card.slices.get(number), scale)
+    if cuts:
+        unit = f" [{cuts[0].loss_unit}]" if cuts[0].loss_unit else ""
+        shown = ScalarMappable(scale.norm, style.LOSS_MAP)
+        page.colour_bar(places[0][1], shown, f"{scene}: loss{unit}", scale, beside=[ax for _, ax in places], aspect=12)
+
+
+def _draw_map(ax: Axes, grade: Grade, cut: CardSlice | None, scale: style.Scale) -> None:
+    sheet, look = page.sheet_of(ax), OUTCOMES[grade.outcome]
+    _frame(ax, shape=1.0, color=look, linewidth=1.6 * sheet.weight)
+    said = grade.engine.replace(", ", ",\n") + f"\n{grade.outcome}"
+    if cut is not None:
+        opposed, share = opposing(cut)
+        said += f"; {share:.0%} oppose" if np.isfinite(share) else ""
+        _map(ax, cut.loss, scale, (0, 1, 0, 1))
+        _draw_arrows(ax, cut, opposed)
+        page.name_axes(ax, *cut.labels)
+        for label in (ax.xaxis.label, ax.yaxis.label):
+            label.set_fontsize(sheet.small)
+    ax.set_title(said, size=sheet.small, color=look, parse_math=False)
+
+
+def _draw_arrows(ax: Axes, cut: CardSlice, opposed: NDArray[np.bool_]) -> None:
+    rows, columns = (np.arange(count)[:: -(-count // ARROWS)] for count in cut.loss.shape)
+    at = np.ix_(rows, columns)
+    slope = cut.slope[at]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        step = -LENGTH * slope / np.linalg.norm(slope, axis=-1, keepdims=True)
+    x, y = np.meshgrid((columns + 0.5) / cut.loss.shape[1], (rows + 0.5) / cut.loss.shape[0])
+    seen = np.isfinite(step).all(axis=-1)
+    colours = np.where(opposed[at][seen], OPPOSED, "white")
+    ax.quiver(
+        x[seen], y[seen], step[seen, 0], step[seen, 1], color=colours, pivot="mid", angles="xy", scale_units="xy",
+        scale=1.0, **style.ARROW | {"width": 0.009},
+    )  # fmt: skip
+
+
+def opposing(cut: CardSlice) -> tuple[NDArray[np.bool_], float]:
+    """Return where the gradient opposes the slope between neighbouring samples, and the share of those with both."""
+    between = np.stack(np.gradient(cut.loss)[::-1], axis=-1) * (np.array(cut.loss.shape[::-1]) - 1)
+    along = (between * cut.slope).sum(axis=-1)
+    known = np.isfinite(along) & (np.linalg.norm(cut.slope, axis=-1) > 0)
+    return known & (along < 0), float((along[known] < 0).mean()) if known.any() else np.nan
+
+
+def _legend(sheet: style.Sheet) -> list[Line2D]:
+    look: dict[str, Any] = {"linestyle": "none", "marker": r"$\rightarrow$", "markersize": 11 * sheet.type}
+    return [
+        Line2D([], [], color=style.QUIET, label="steepest descent by the gradient (white on the map)", **look),
+        Line2D([], [], color=OPPOSED, label="where it opposes the slope between neighbouring samples", **look),
+    ]
+
+
+WIDTH, THUMBNAIL_SHAPE = 2.4, 0.75  # of the page [inch]; its height, against its width
+
+
+def thumbnail_figure(dataset: xr.Dataset, *, width: float | None = None) -> Picture:
+    """Draw the losses of a slice over the whole of a small page; what is not OK is left grey."""
+    sheet = style.Sheet.of(width, pitch=WIDTH)
+    picture = Picture(sheet, THUMBNAIL_SHAPE * sheet.width)
+    ax = picture.add_axes((0, 0, 1, 1))
+    ax.set_axis_off()
+    picture.set_facecolor(style.UNSAMPLED)
+    dataset = sampled_line(dataset) if plane_of(dataset).rank == 1 else own_cells(dataset)
+    loss = dataset["loss"].to_numpy()
+    if plane_of(dataset).rank == 1:
+        ax.plot(dataset["u"], loss, color=style.LOSS_LINE, linewidth=1.2)
+        return picture
+    _map(ax, loss, style.Scale.of_loss(loss)).set_interpolation("antialiased")
+    return picture
+
+
+def _frame(ax: Axes, *, shape: float, color: str = style.QUIET, linewidth: float = 0.4) -> None:
+    """Leave a panel without ticks; `shape` is its height against its width, and what has no loss is grey."""
+    ax.set(xticks=[], yticks=[], facecolor=style.UNSAMPLED)
+    ax.set_box_aspect(shape)
+    ax.spines[:].set(color=color, linewidth=linewidth)
+
+
+def _map(
+    ax: Axes, loss: NDArray[Any], scale: style.Scale, extent: tuple[float, float, float, float] | None = None
+) -> AxesImage:
+    """Draw losses, shape (v, u), one flat cell for each, with nothing where there is none."""
+    look: dict[str, Any] = {"origin": "lower", "aspect": "auto", "interpolation": "nearest", "extent": extent}
+    return ax.imshow(np.ma.masked_invalid(loss), cmap=style.LOSS_MAP, norm=scale.norm, **look)
