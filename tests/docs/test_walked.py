@@ -7,6 +7,7 @@ import inspect
 import re
 from dataclasses import replace
 from pathlib import Path
+from pydoc import locate
 from typing import get_overloads
 
 import pytest
@@ -80,6 +81,7 @@ def test_the_interface_lists_every_public_name_and_what_functions_return() -> No
     text = (ROOT / "docs/interface.md").read_text()
     listed = re.findall(r"^   (gradscape\.\S+)$", text, flags=re.MULTILINE)
     assert {f"gradscape.{name}" for name in PUBLIC} == {name for name in listed if name.count(".") == 1}
+    assert [name for name in listed if locate(name) is None] == []
     functions = [one for one in PUBLIC.values() if not inspect.isclass(one)]
     annotated = [str(inspect.signature(one).return_annotation) for public in functions
                  for one in (public, *get_overloads(public))]  # fmt: skip
