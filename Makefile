@@ -1,4 +1,5 @@
-# `make demo` draws a first landscape, `make test` runs every test; both set up .venv by themselves.
+# `make demo` draws a first landscape, `make test` runs the tests of a few minutes, `make test-all` all but nightly ones;
+# each sets up .venv by itself.
 # Needs CPython 3.11 to 3.14; name an interpreter with PYTHON=..., and with VENV=... where its environment goes:
 # `make test PYTHON=python3.13 VENV=.venv-3.13`. The engine Taichi has no wheels past 3.12.
 PYTHON ?= $(firstword $(foreach p,python3.11 python3.12 python3.13 python3.14 python3,$(if $(shell $(p) -c 'import sys; print((3, 11) <= sys.version_info < (3, 15) or "")' 2>/dev/null | grep True),$(p))))
@@ -18,16 +19,23 @@ endif
 # A gallery that was built (`landscape gallery build`) becomes a part of the documentation.
 GALLERY ?= out/gallery
 
-.PHONY: demo test wheel docs setup setup-test setup-docs check clean
+.PHONY: demo test test-all wheel docs setup setup-test setup-docs check clean
 
 demo: setup
 	$(BIN)/landscape slice fluid --dims 6 8 --resolution 14
 
 # Two workers have two cores: a second thread of each would only wait for the other worker's. Each takes tests that are
 # next to one another, which share what they make. The many processes that tests start compile the sources once.
+# Kernels that were compiled stay in the caches of Warp, Taichi and JAX for the next run.
 unexport PYTHONDONTWRITEBYTECODE
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal
+TESTS ?=
+
 test: setup-test
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal
+	$(PYTEST) -m "not (slow or e2e or browser or docs or nightly)" $(TESTS)
+
+test-all: setup-test
+	$(PYTEST) $(TESTS)
 
 # Builds the wheel, installs it with all it needs into an empty environment, and tries it there; tests borrow the rest.
 wheel: setup-test

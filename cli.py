@@ -80,6 +80,8 @@ class Option:
     help: str
     type: Any
     required: bool
+    default: str
+    """What is taken where none is typed, empty where help does not say."""
 
 
 @dataclass(frozen=True)
@@ -127,7 +129,13 @@ class Verb:
         app = App(name="verb", default_command=self.command(), help_flags=(), version_flags=())
         listed = app.assemble_argument_collection(default_parameter=WORDS, parse_docstring=True)
         return [
-            Option(tuple(one.names), one.parameter.help or "", one.hint, bool(one.required))
+            Option(
+                tuple(one.names),
+                one.parameter.help or "",
+                one.hint,
+                bool(one.required),
+                "" if one.required or not one.show_default else str(one.field_info.default),
+            )
             for one in listed
             if one.names
         ]

@@ -31,12 +31,14 @@ version = release = gradscape.__version__
 
 extensions = [
     "myst_nb",
-    "sphinx.ext.autodoc",
+    "sphinx.ext.autosummary",
+    "sphinx.ext.napoleon",
     "sphinxcontrib.bibtex",
     "sphinx_copybutton",
     "docs.pages.extension",
 ]
-exclude_patterns = ["example_package", "**/__pycache__"]
+exclude_patterns = ["example_package", "templates", "**/__pycache__"]
+templates_path = ["templates"]
 bibtex_bibfiles = ["references.bib"]
 bibtex_reference_style = "author_year"
 
@@ -58,7 +60,9 @@ autodoc_preserve_defaults = True
 autodoc_typehints = "signature"
 maximum_signature_line_length = 60
 python_display_short_literal_types = True
-default_role = "literal"
+autosummary_imported_members = True
+napoleon_google_docstring = False
+default_role = "literal"  # one backtick on each side is code, as in Markdown
 
 html_theme = "pydata_sphinx_theme"
 html_title = f"gradscape {version}"

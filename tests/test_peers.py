@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import shlex
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -98,7 +99,9 @@ def test_a_peer_that_is_not_there_is_refused_by_name(capsys):
 )
 def test_a_peer_that_breaks_off_is_reported(tmp_path: Path, program, said):
     python = tmp_path / "python"
-    python.write_text(f"#!{sys.executable}\n{program}\n")
+    (tmp_path / "program.py").write_text(program)
+    script = shlex.join([sys.executable, str(tmp_path / "program.py")])
+    python.write_text(f"#!/bin/sh\nexec {script}\n")  # a line of #! ends at the first space of a path
     python.chmod(0o755)
     assert driver.measure(python, "genesis_mpm", [], 0.5 if "sleep" in program else 60)["failed"] == said
 

@@ -56,7 +56,7 @@ gallery serve
 VERBS = {tuple(words.split()): verb for words, verb in verbs().items() if words not in ("info", "plan")}
 WORDS = {verb: next(words for line in BASE if (words := line.split())[: len(verb)] == [*verb]) for verb in VERBS}
 PATHS = [  # of what a verb says that it is a file or a folder
-    pytest.param(verb, option, id=f"{' '.join(verb)} {option.names[0]}")
+    (verb, option)
     for verb, one in VERBS.items()
     for option in one.options
     if re.search(r"(?i)file|folder", option.help)
@@ -87,29 +87,23 @@ def said_with(verb: tuple[str, ...], option: Option, value: str) -> list[str]:
     return [*words[:at], value, *words[at + 1 :]]
 
 
-@pytest.mark.parametrize(("verb", "param"), PATHS)
-def test_a_path_nobody_meant_ends_with_a_message(
-    run: Callable[..., Said], desk: Path, verb: tuple[str, ...], param: Option
-) -> None:
-    for value in HOSTILE:
-        done = run(*said_with(verb, param, value), cwd=desk)
-        assert done.returncode in (0, 1, 2, 130), done.stderr
-        assert done.returncode == 0 or done.stderr.strip()
-        assert "\\[" not in done.stdout + done.stderr
+def test_a_path_nobody_meant_ends_with_a_message(run: Callable[..., Said], desk: Path) -> None:
+    for words in (said_with(verb, option, value) for verb, option in PATHS for value in HOSTILE):
+        done = run(*words, cwd=desk)
+        assert done.returncode in (0, 1, 2, 130), (words, done.stderr)
+        assert done.returncode == 0 or done.stderr.strip(), words
+        assert "\\[" not in done.stdout + done.stderr, words
 
 
-@pytest.mark.parametrize(
-    "verb", [verb for verb in VERBS if any(one.names == ("--set",) for one in VERBS[verb].options)]
-)
-def test_an_option_of_a_scene_is_not_called_as_what_every_scene_has(
-    run: Callable[..., Said], desk: Path, verb: tuple[str, ...]
-) -> None:
+def test_an_option_of_a_scene_is_not_called_as_what_every_scene_has(run: Callable[..., Said], desk: Path) -> None:
     """Whatever `make` and a scene's class take themselves, and are given by the verb's own options."""
-    for name in sorted({*signature(make).parameters, *signature(Environment.__init__).parameters}):
-        done = run(*WORDS[verb], "--set", f"{name}=1", cwd=desk)
-        assert done.returncode == 2
-        assert len(done.stderr.splitlines()) == 1
-        assert name in done.stderr
+    names = sorted({*signature(make).parameters, *signature(Environment.__init__).parameters})
+    setting = [verb for verb, one in VERBS.items() if any(option.names == ("--set",) for option in one.options)]
+    for words in ([*WORDS[verb], "--set", f"{name}=1"] for verb in setting for name in names):
+        done = run(*words, cwd=desk)
+        assert done.returncode == 2, words
+        assert len(done.stderr.splitlines()) == 1, words
+        assert words[-1].removesuffix("=1") in done.stderr, words
     assert [one.name for one in desk.iterdir()] == ["loop"]
 
 

@@ -1,32 +1,89 @@
-"""The Sphinx extension: writes the pages that are walked, mends links between folders, and takes the gallery in."""
+"""The Sphinx extension: writes the pages that are made of the package and its data, lets links between folders lead to
+pages, takes the gallery in, and writes formulas as MathML, which asks for no script and which screen readers read.
+"""
 
 from __future__ import annotations
 
+import re
 import shutil
+import tomllib
+from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
+from typing import Any
 
+from docutils import nodes
+from docutils.utils.math.latex2mathml import tex2mathml
 from sphinx.application import Sphinx
+from sphinx.writers.html5 import HTML5Translator
 
-from . import mathml
-from .included import lead_to_pages
-from .interface import tidy_shapes, to_rst
-from .walked import write_pages
+from . import commands, reproduction, scenes
+from .kept import Kept
+from .pictures import draw_slice
+from .text import render
 
 ROOT = Path(__file__).resolve().parents[2]
+INCLUDED = {  # what stands at the repository's root, and the page that shows it
+    "README.md": "index.md",
+    "BENCHMARKS.md": "benchmarks.md",
+    "CHANGELOG.md": "changelog.md",
+    "CONTRIBUTING.md": "contributing.md",
+}
+
+
+def pages(kept: Kept, pictures: Path) -> dict[str, str]:
+    """Return all pages by their paths under `generated/`; pictures are drawn into a folder."""
+    wall = render("wall.md", kept=kept, draw=partial(draw_slice, folder=pictures))
+    licence = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["license"]
+    figures = render("figures.md", kept=kept, licence=licence, drawn=pictures_of_pages())
+    return (
+        commands.pages()
+        | scenes.pages(kept, pictures)
+        | reproduction.pages(kept, pictures)
+        | {"wall.md": wall, "figures.md": figures}
+    )
+
+
+def pictures_of_pages() -> dict[str, tuple[list[str], str]]:
+    """Return the pages that show each picture of `docs`, and the command that made it."""
+    texts = {file.name: file.read_text() for file in sorted((ROOT / "docs").glob("*.md"))}
+    texts |= {here: (ROOT / name).read_text() for name, here in INCLUDED.items()}
+    made = tomllib.loads((ROOT / "docs/pictures.toml").read_text())
+    return {
+        name: ([page for page, text in texts.items() if re.search(rf"\((docs/)?{re.escape(name)}\)", text)], command)
+        for name, command in sorted(made.items())
+    }
+
+
+def write_pages(app: Sphinx) -> None:
+    """Write the pages into a folder that holds nothing else but pictures and the interface; old ones go."""
+    if app.config.walked:
+        folder = Path(app.srcdir) / "generated"
+        write(pages(Kept.read(gallery=gallery_site(app)), folder / "pictures"), folder)
+
+
+def write(pages: Mapping[str, str], folder: Path) -> None:
+    """Write pages into a folder, and remove others; an equal page is left as it is, and is not built again."""
+    for old in folder.rglob("*.md"):
+        if old.relative_to(folder).as_posix() not in pages:
+            old.unlink()
+    for name, text in pages.items():
+        file = folder / name
+        if not file.exists() or file.read_text() != text:
+            file.parent.mkdir(parents=True, exist_ok=True)
+            file.write_text(text)
 
 
 def mend_links(app: Sphinx, docname: str, source: list[str]) -> None:
-    """Let links lead to pages of the site."""
-    source[0] = lead_to_pages(source[0])
+    """Let links to files of the root, and to the example package, lead to the pages that show them."""
+    for name, here in INCLUDED.items():
+        source[0] = re.sub(rf"\]\(((?:\.\./)*)\.\./{re.escape(name)}", rf"](\g<1>{here}", source[0])
+    source[0] = source[0].replace("](example_package)", "](example.md)")
 
 
-def take_gallery(app: Sphinx, error: Exception | None) -> None:
-    """Put the gallery's site beside the pages, in the place of an earlier one; nothing where there is none."""
-    if error is None and app.builder.format == "html":
-        place = Path(app.outdir) / "gallery"
-        shutil.rmtree(place, ignore_errors=True)
-        if found := gallery_site(app):
-            shutil.copytree(found, place)
+def tidy_shapes(app: Sphinx, what: str, name: str, one: Any, options: Any, said: str | None, back: str | None) -> Any:
+    """Leave out the blank that tells a linter that a shape's only axis is no name that it should know."""
+    return tuple(text and text.replace("' ", "'") for text in (said, back))
 
 
 def gallery_site(app: Sphinx) -> Path | None:
@@ -35,20 +92,34 @@ def gallery_site(app: Sphinx) -> Path | None:
     return named if (named / "manifest.json").is_file() else None
 
 
-def walk(app: Sphinx) -> None:
-    """Write what is walked."""
-    if app.config.walked:
-        write_pages(Path(app.srcdir) / "generated", gallery=gallery_site(app))
+def take_gallery(app: Sphinx, error: Exception | None) -> None:
+    """Copy the gallery's site to the pages, instead of an earlier one; nothing where there is none."""
+    if error is None and app.builder.format == "html":
+        place = Path(app.outdir) / "gallery"
+        shutil.rmtree(place, ignore_errors=True)
+        if found := gallery_site(app):
+            shutil.copytree(found, place)
+
+
+def write_inline(writer: HTML5Translator, node: nodes.math) -> None:
+    """Write a formula of a line."""
+    writer.body.append(tex2mathml(node.astext()))
+    raise nodes.SkipNode
+
+
+def write_block(writer: HTML5Translator, node: nodes.math_block) -> None:
+    """Write a formula that stands by itself."""
+    writer.body.append(f'<div class="formula">{tex2mathml(node.astext(), as_block=True)}</div>')
+    raise nodes.SkipNode
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
     """Say what the extension adds."""
     app.add_config_value("gallery_site", "out/gallery", "html")
     app.add_config_value("walked", True, "env")
-    app.connect("builder-inited", walk)
-    app.connect("autodoc-process-docstring", to_rst)
+    app.connect("builder-inited", write_pages)
     app.connect("autodoc-process-signature", tidy_shapes)
     app.connect("source-read", mend_links)
     app.connect("build-finished", take_gallery)
-    mathml.setup(app)
+    app.add_html_math_renderer("mathml", inline_renderers=(write_inline, None), block_renderers=(write_block, None))
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
@@ -22,35 +22,21 @@ from gradscape.optim.league import League
 NOT_MEASURED = "not measured yet"
 
 
-@dataclass(frozen=True)
 class KeptFigure:
     """A figure of the gallery with what there is of it under `root`: its slice and its report, None where not."""
 
-    figure: Figure
-    root: Path = DATA
+    def __init__(self, figure: Figure, root: Path = DATA) -> None:
+        self.figure, self.root = figure, root
+        self.folder = root / figure.id
+        store = self.folder / STORE
+        self.slice = Slice(open_slice(store), self.folder) if is_slice(store) else None
+        self.report = Report.read(self.folder) if (self.folder / REPORT.files[0]).exists() else None
 
     @property
-    def folder(self) -> Path:
-        """Where its data are."""
-        return self.root / self.figure.id
-
-    @cached_property
-    def slice(self) -> Slice | None:
-        """Its samples."""
-        return Slice(open_slice(self.folder / STORE), self.folder) if is_slice(self.folder / STORE) else None
-
-    @cached_property
-    def report(self) -> Report | None:
-        """What was measured of it."""
-        return Report.read(self.folder) if (self.folder / REPORT.files[0]).exists() else None
-
-    @cached_property
     def current(self) -> bool:
         """Whether its samples are of the scene's model as it is now."""
-        if self.slice is None:
-            return False
-        known = self.slice.identity
-        return bool(known["model_version"] == environment_class(self.figure.env).version_on(known["engine"]))
+        known = self.slice.identity if self.slice else None
+        return bool(known and known["model_version"] == environment_class(self.figure.env).version_on(known["engine"]))
 
     @property
     def losses(self) -> tuple[float, float] | None:
@@ -58,6 +44,16 @@ class KeptFigure:
         if self.slice is None or not bool(self.slice.data["loss"].notnull().any()):
             return None
         return float(self.slice.data["loss"].min()), float(self.slice.data["loss"].max())
+
+    @property
+    def axes(self) -> str:
+        """What its slice varies."""
+        return " and ".join(self.slice.plane.labels) if self.slice else ""
+
+    @property
+    def words(self) -> str:
+        """The words that were measured of it."""
+        return ", ".join(self.report.words) if self.report else NOT_MEASURED
 
 
 @dataclass(frozen=True)
@@ -67,7 +63,7 @@ class Kept:
     figures: Sequence[KeptFigure]
     paper: Paper
     league: League | None
-    gallery: Path | None = field(default=None)
+    gallery: Path | None = None
 
     @classmethod
     def read(cls, root: Path = DATA, *, gallery: Path | None = None) -> Kept:

@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
-
-import xarray as xr
 
 from gradscape.envs.registry import make
 from gradscape.gallery.files import STORE, dark_name
@@ -20,61 +16,36 @@ from gradscape.landscapes.sampling.fill import sample
 
 from .kept import KeptFigure
 
-if TYPE_CHECKING:
-    from gradscape.landscapes.draw.figures.page import Picture
-
 FUNCTION_RESOLUTION = 48
-CODE = [Path(place) for place in draw.__path__]
 
 
-def draw_slice(kept: KeptFigure, folder: Path, *, small: bool = False) -> str:
-    """Draw a figure's slice, if a picture of it is not there already, and return the picture's name."""
+def draw_slice(kept: KeptFigure, folder: Path, *, small: bool = False) -> dict[str, str]:
+    """Draw a figure's slice, if its pictures are not there already, and return their names."""
     assert kept.slice is not None
-    name = f"{kept.figure.id}{'-small' if small else ''}.png"
-    _refresh(folder / name, _newest(kept.folder / STORE), lambda: _picture(kept.slice.data, small=small))
-    return name
+    name, data = f"{kept.figure.id}{'-small' if small else ''}.png", kept.slice.data
+    if _is_old(folder / name, kept.folder / STORE):
+        full = landscape_figure if len(data["loss"].dims) == 2 else profile_figure
+        save_both((thumbnail_figure if small else full)(data), folder / name)
+    return _both(name)
 
 
-def draw_function(env: str, folder: Path) -> str:
-    """Sample a test function over its first two parameters, draw it, and return the picture's name."""
-    name = f"{env}.png"
-
-    def sampled() -> Picture:
+def draw_function(env: str, folder: Path) -> dict[str, str]:
+    """Sample a test function over its first two parameters, draw it, and return the names of the pictures."""
+    if _is_old(folder / f"{env}.png"):
         objective = make(env, device="cpu")
         plane = Plane.through(objective.space, objective.space.center, (0, 1), resolution=FUNCTION_RESOLUTION)
-        return landscape_figure(sample(objective, plane))
-
-    _refresh(folder / name, 0.0, sampled)
-    return name
+        save_both(landscape_figure(sample(objective, plane)), folder / f"{env}.png")
+    return _both(f"{env}.png")
 
 
-def shown(name: str, alt: str, up: str, *, look: str = "", leads: str = "") -> str:
-    """Return the Markdown that shows a picture on pages of either kind; `up` leads to where pages are walked.
-
-    `look` is a class of the style sheet, and `leads` where a click on it leads.
-    """
-    target = f":target: {leads}\n" if leads else ""
-    lines = [
-        f"```{{image}} {up}pictures/{file}\n:alt: {alt}\n:class: {f'{look} only-{kind}'.strip()}\n{target}```"
-        for kind, file in (("light", name), ("dark", dark_name(name)))
-    ]
-    return "\n\n".join(lines)
+def _both(name: str) -> dict[str, str]:
+    return {"light": name, "dark": dark_name(name)}
 
 
-def _picture(data: xr.Dataset, *, small: bool) -> Picture:
-    if small:
-        return thumbnail_figure(data)
-    return (landscape_figure if len(data["loss"].dims) == 2 else profile_figure)(data)
-
-
-def _refresh(file: Path, since: float, drawn: Callable[[], Picture]) -> None:
-    """Draw a picture where there is none that is younger than its data and the code that draws."""
-    newest = max(since, *map(_newest, CODE))
-    pair = (file, file.with_name(dark_name(file.name)))
-    if not all(one.exists() and one.stat().st_mtime > newest for one in pair):
-        file.parent.mkdir(parents=True, exist_ok=True)
-        save_both(drawn(), file)
-
-
-def _newest(folder: Path) -> float:
-    return max(one.stat().st_mtime for one in folder.rglob("*") if "__pycache__" not in one.parts)
+def _is_old(picture: Path, *data: Path) -> bool:
+    """Say whether a picture is not there, or is older than its data or the code that draws."""
+    picture.parent.mkdir(parents=True, exist_ok=True)
+    sources = [file for folder in (*data, *map(Path, draw.__path__)) for file in folder.rglob("[!_]*")]
+    newest = max(file.stat().st_mtime for file in sources)
+    pair = (picture, picture.with_name(dark_name(picture.name)))
+    return not all(one.exists() and one.stat().st_mtime > newest for one in pair)

@@ -1,9 +1,13 @@
-"""Docstrings and help texts as Markdown: what they have in backticks is code, and nothing else is marked up."""
+"""Pages are templates of Markdown, and texts of the package go into them with only what is in backticks as code."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 CODE = re.compile(r"(`[^`]+`)")
 SPECIAL = re.compile(r"([\\*_\[\]<>$#|{}~])")
@@ -20,22 +24,19 @@ def cell(text: str) -> str:
     return " ".join(re.sub(r"(?<!\\)\|", r"\\|", prose(text)).split())
 
 
-def code(text: str) -> str:
-    """Return what stands between backticks in a cell of a table: its bars end no cell."""
-    return text.replace("|", "\\|")
-
-
 def table(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """Return a table of cells that are Markdown already."""
     lines = [headings, ["---"] * len(headings), *rows]
     return "".join(f"| {' | '.join(row)} |\n" for row in lines)
 
 
-def page(title: str, *parts: str) -> str:
-    """Return a page: its title, and what it holds, each part parted by an empty line; empty ones are left out."""
-    return "\n\n".join([f"# {title}", *(part.strip("\n") for part in parts if part.strip())]) + "\n"
+TEMPLATES = Environment(
+    loader=FileSystemLoader(Path(__file__).parents[1] / "templates"),
+    undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True,
+)  # fmt: skip
+TEMPLATES.filters |= {"prose": prose, "cell": cell, "code": lambda text: text.replace("|", "\\|")}
 
 
-def contents(entries: Iterable[str], *, options: Sequence[str] = (":maxdepth: 1",)) -> str:
-    """Return a table of contents of pages, by their paths from the page it stands on."""
-    return "\n".join(["```{toctree}", *options, "", *entries, "```"])
+def render(template: str, **shown: Any) -> str:
+    """Return the page that a template, such as "wall.md", makes of what is shown on it."""
+    return TEMPLATES.get_template(f"{template}.jinja").render(shown)

@@ -7,12 +7,14 @@ import inspect
 import re
 from dataclasses import replace
 from pathlib import Path
+from pydoc import locate
+from typing import get_overloads
 
 import pytest
-from docs.pages import commands, interface, package, pictures, provenance, reproduction, scenes, wall
+from docs.pages import commands, extension, pictures, reproduction, scenes
 from docs.pages.kept import NOT_MEASURED, Kept, KeptFigure
 from docs.pages.text import prose
-from docs.pages.walked import write_pages
+from gradscape.envs.function import DEFAULTS
 from hypothesis import given
 from hypothesis import strategies as st
 from markdown_it import MarkdownIt
@@ -34,17 +36,13 @@ REPORTED = "bounce-y"  # a figure whose report is kept
 
 
 VERBS = verbs()
+FOREIGN = {"DataFrame", "Dataset", "None", "Any", "Kind", "Path"}  # and type variables
 PUBLIC = {name: getattr(gradscape, name) for name in gradscape.__all__ if not name.startswith("__")}
 
 
 @pytest.fixture(scope="module")
 def kept() -> Kept:
     return Kept.read()
-
-
-@pytest.fixture(scope="module")
-def api() -> dict[str, str]:
-    return interface.pages()
 
 
 @pytest.fixture(scope="module")
@@ -64,15 +62,12 @@ def shown(text: str) -> str:
     return " ".join(html.unescape(re.sub(r"<[^>]+>", "", rendered)).split())
 
 
-@pytest.mark.parametrize("name", VERBS)
-def test_every_command_has_a_page_with_all_its_options(verb_pages: dict[str, str], name: str) -> None:
-    text = verb_pages[f"commands/{name.replace(' ', '-')}.md"]
-    verb = VERBS[name]
-    assert [
-        one for param in verb.params if not param.hidden for one in param.opts if one[0] == "-" and one not in text
-    ] == []
-    assert " ".join(verb.help.split("\n\n")[0].split()) in shown(text)
-    assert f"$ landscape {name}" in text
+def test_every_command_has_a_page_with_all_its_options(verb_pages: dict[str, str]) -> None:
+    for name, verb in VERBS.items():
+        text = verb_pages[f"commands/{name.replace(' ', '-')}.md"]
+        assert [word for option in verb.options for word in option.names if word not in text] == [], name
+        assert " ".join(verb.help().split("\n\n")[0].split()).replace("`", "") in shown(text)
+        assert f"$ landscape {name}" in text
 
 
 def test_the_page_of_commands_lists_them_and_nothing_else(verb_pages: dict[str, str]) -> None:
@@ -81,25 +76,18 @@ def test_the_page_of_commands_lists_them_and_nothing_else(verb_pages: dict[str, 
     assert all(f"({Path(file).name})" in verb_pages["commands/index.md"] for file in files)
 
 
-@pytest.mark.parametrize("name", PUBLIC)
-def test_every_public_name_has_a_page_and_a_line(api: dict[str, str], name: str) -> None:
-    kind = "classes" if inspect.isclass(PUBLIC[name]) else "functions"
-    directive = "autoclass" if kind == "classes" else "autofunction"
-    assert f".. {directive}:: gradscape.{name}\n" in api[f"api/{kind}/{name}.md"]
-    first = " ".join((inspect.getdoc(PUBLIC[name]) or "").split("\n\n")[0].split()).replace("`", "")
-    assert first in shown(api["api/index.md"])
-
-
-def test_what_functions_return_is_documented_though_it_is_not_public(api: dict[str, str]) -> None:
-    assert {f"api/records/{name}.md" for name in ("Report", "Census", "Tradeoff", "League")} <= set(api)
-    assert not any("|" in line and "_MISSING" in line for text in api.values() for line in text.splitlines())
-
-
-def test_keywords_of_a_scene_are_told_with_types_and_defaults(api: dict[str, str]) -> None:
-    text = api["api/functions/slice.md"]
-    assert "| `device` | `str` | `'auto'` |" in text
-    assert "| `fidelity` | `str \\| Fidelity \\| None` | `None` |" in text
-    assert "keyword" not in api["api/functions/open_slice.md"]
+def test_the_interface_lists_every_public_name_and_what_functions_return() -> None:
+    """Of what is not public it lists the records of this package that a public function is annotated to return."""
+    text = (ROOT / "docs/interface.md").read_text()
+    listed = re.findall(r"^   (gradscape\.\S+)$", text, flags=re.MULTILINE)
+    assert {f"gradscape.{name}" for name in PUBLIC} == {name for name in listed if name.count(".") == 1}
+    assert [name for name in listed if locate(name) is None] == []
+    functions = [one for one in PUBLIC.values() if not inspect.isclass(one)]
+    annotated = [str(inspect.signature(one).return_annotation) for public in functions
+                 for one in (public, *get_overloads(public))]  # fmt: skip
+    returned = {word for text in annotated for word in re.findall(r"(?<![\w.])[A-Z]\w+", text)} - FOREIGN
+    assert returned <= {name.rpartition(".")[2] for name in listed}
+    assert dict(re.findall(r"\| `(\w+)` \| `(.+)` \|", text)) == {name: repr(one) for name, one in DEFAULTS.items()}
 
 
 def test_every_scene_has_a_page_with_what_it_says_and_where_it_is_bounded(
@@ -119,15 +107,19 @@ def test_every_scene_has_a_page_with_what_it_says_and_where_it_is_bounded(
     assert "measures it" in pages["scenes/mjx-drop.md"]
 
 
-def test_pages_hold_every_figure_and_claim_and_say_what_is_not_measured(nothing: Kept, tmp_path: Path) -> None:
+def test_pages_hold_every_figure_and_claim_and_say_what_is_not_measured(
+    nothing: Kept, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(scenes, "BUILTIN", [])
     text = reproduction.pages(nothing, tmp_path)["reproduction.md"]
     figures, paper = read_figures(), read_paper()
     assert [one.id for one in figures if f"### {one.id}\n" not in text] == []
     assert text.count(f"| **{NOT_MEASURED}** |") >= len(figures) + sum(map(len, paper.claims.values()))
     assert all(prose(why) in text for why in paper.silences.values())
     assert {f"## Figure {one.caption.number}" for one in figures if one.caption.number} <= set(text.splitlines())
-    assert f"| {NOT_MEASURED} |" in provenance.pages(nothing)["figures.md"]
-    assert "## " not in wall.pages(nothing, tmp_path)["wall.md"]
+    everything = extension.pages(nothing, tmp_path)
+    assert f"| {NOT_MEASURED} |" in everything["figures.md"]
+    assert "## " not in everything["wall.md"]
 
 
 @pytest.mark.parametrize(
@@ -174,20 +166,18 @@ def test_pictures_lead_to_the_gallery_where_it_is_built_and_to_scenes_where_not(
     (tmp_path / "site" / one.figure.id).mkdir(parents=True)
     (tmp_path / "site" / one.figure.id / "index.html").write_text("")
     few = replace(kept, figures=[one])
-    assert f":target: scenes/{one.figure.env}.html" in wall.pages(few, tmp_path)["wall.md"]
-    built = replace(few, gallery=tmp_path / "site")
-    assert f":target: ../gallery/{one.figure.id}/index.html" in wall.pages(built, tmp_path)["wall.md"]
-    page = scenes.pages(built, tmp_path)[f"scenes/{one.figure.env}.md"]
-    assert f'<a href="../../gallery/{one.figure.id}/index.html">' in page
+    assert f":target: scenes/{one.figure.env}.html" in extension.pages(few, tmp_path)["wall.md"]
+    pages = extension.pages(replace(few, gallery=tmp_path / "site"), tmp_path)
+    assert f":target: ../gallery/{one.figure.id}/index.html" in pages["wall.md"]
+    assert f'<a href="../../gallery/{one.figure.id}/index.html">' in pages[f"scenes/{one.figure.env}.md"]
 
 
 def test_every_picture_of_the_pages_says_what_made_it() -> None:
-    text = provenance.pages(Kept([], read_paper(), None))["figures.md"]
-    pictures = {file.name for file in (ROOT / "docs").glob("*.png")}
-    assert pictures == set(re.findall(r"^\| `([\w-]+\.png)` \|", text, flags=re.MULTILINE))
-    for row in (line for line in text.splitlines() if ".png`" in line):
-        assert re.search(r"\| \[[\w-]+\]\(\.\./", row), f"no page shows {row}"
-        verb = re.search(r"`landscape (gallery \w+|\w+)", row)
+    found = extension.pictures_of_pages()
+    assert {file.name for file in (ROOT / "docs").glob("*.png")} == set(found)
+    for name, (pages, command) in found.items():
+        assert pages, f"no page shows {name}"
+        verb = re.match(r"landscape (gallery \w+|\w+)", command)
         assert verb
         assert verb[1] in VERBS
 
@@ -199,34 +189,22 @@ def test_samples_of_another_model_are_called_so(kept: Kept, monkeypatch: pytest.
 
 
 def test_the_example_package_is_shown_whole() -> None:
-    text = package.pages()["example_package.md"]
-    for file in (ROOT / "docs/example_package").rglob("*.*"):
-        assert file.suffix == ".pyc" or file.read_text() in text
+    shown_files = re.findall(r"\{literalinclude\} (\S+)", (ROOT / "docs/example.md").read_text())
+    files = [file for file in (ROOT / "docs/example_package").rglob("*.*") if file.suffix != ".pyc"]
+    assert {f"example_package/{file.name}" for file in files} == set(shown_files)
 
 
-def test_pages_of_what_is_gone_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in (scenes, reproduction, wall):
-        monkeypatch.setattr(module, "pages", lambda kept, pictures: {})
-    (tmp_path / "commands").mkdir()
-    (tmp_path / "commands/gone.md").write_text("# gone\n")
-    write_pages(tmp_path, gallery=None)
-    assert not (tmp_path / "commands/gone.md").exists()
-    written = {file: file.stat().st_mtime_ns for file in tmp_path.rglob("*.md")}
-    write_pages(tmp_path, gallery=None)
-    assert written == {file: file.stat().st_mtime_ns for file in tmp_path.rglob("*.md")}  # what is equal stays
+def test_pages_of_what_is_gone_go(tmp_path: Path) -> None:
+    pages = {"commands/slice.md": "# landscape slice\n"}
+    extension.write({"commands/gone.md": "# gone\n"}, tmp_path)
+    extension.write(pages, tmp_path)
+    assert [file.name for file in tmp_path.rglob("*.md")] == ["slice.md"]
+    written = (tmp_path / "commands/slice.md").stat().st_mtime_ns
+    extension.write(pages, tmp_path)
+    assert (tmp_path / "commands/slice.md").stat().st_mtime_ns == written  # what is equal stays
 
 
 @given(st.lists(st.text("ab*_[]<>$#|{}~\\! .,=:", min_size=1, max_size=12).filter(str.strip), min_size=1, max_size=3))
 def test_a_text_is_read_as_it_was_written(words: list[str]) -> None:
     text = "x" + " ".join(words)
     assert shown(prose(text)) == " ".join(text.split())
-
-
-@pytest.mark.parametrize("name", PUBLIC)
-def test_a_docstring_becomes_what_autodoc_reads_without_complaint(name: str) -> None:
-    from docutils.core import publish_doctree
-
-    lines = (inspect.getdoc(PUBLIC[name]) or "").splitlines()
-    interface.to_rst(None, "", "", None, None, lines)
-    tree = publish_doctree("\n".join(lines), settings_overrides={"report_level": 2, "halt_level": 2})
-    assert "`" not in tree.astext()

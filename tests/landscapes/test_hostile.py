@@ -1,6 +1,7 @@
 """The Python API under values that make no sense, and under arrays of every kind."""
 
 import math
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -163,12 +164,15 @@ REFUSED: dict[str, tuple[Callable[[], Any], str]] = {
 
 
 @pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("name", REFUSED)
-def test_what_makes_no_sense_is_refused_in_a_line(name: str) -> None:
-    call, said = REFUSED[name]
-    with pytest.raises(ValueError, match=said) as refusal:
-        call()
-    assert "\n" not in str(refusal.value)
+def test_what_makes_no_sense_is_refused_in_a_line() -> None:
+    wrong = {}
+    for name, (call, said) in REFUSED.items():
+        try:
+            wrong[name] = repr(call())
+        except ValueError as refusal:
+            if not re.search(said, str(refusal)) or "\n" in str(refusal):
+                wrong[name] = str(refusal)
+    assert wrong == {}
 
 
 ARRAYS: dict[str, Callable[[Any], Any]] = {
