@@ -102,13 +102,13 @@ def overlay(
 
         refuse_unknown(env)
     from ..jobs.foreign import tables_over
-    from ..jobs.overlay import STREAM, Cut, OverlayJob
+    from ..jobs.overlay import STREAM, OverlayJob, PlaneSpec
     from .view import check_display, show_recording
 
-    call, cut = current(), Cut.of(through, plane, resolution)  # type: ignore[arg-type] # one number for both axes
+    call, new = current(), PlaneSpec.of(through, plane, resolution)  # type: ignore[arg-type] # one number for both axes
     beneath = as_slice(slice, env=env)
     job = OverlayJob.of(
-        beneath, tables_over(beneath, several, call.watch), command=call.command, cut=cut, device=device,
+        beneath, tables_over(beneath, several, call.watch), command=call.command, plane=new, device=device,
         out=as_path(out), prints=as_widths(figure_width_mm), watch=call.watch,
     )  # fmt: skip
     recording = job.folder / STREAM

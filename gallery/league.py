@@ -288,7 +288,7 @@ class KeptRuns:
 
     def write(self, path: Path) -> None:
         """Write it as one file, whole or not at all."""
-        arrays = {name: np.array([getattr(one, name) for one in self.runs]) for name in EACH}
+        arrays: dict[str, Any] = {name: np.array([getattr(one, name) for one in self.runs]) for name in EACH}
         arrays["count"] = np.array([len(one.loss) for one in self.runs])
         arrays |= {name: np.concatenate([getattr(one, name) for one in self.runs]) for name in JOINED}
         for method, run in self.packed.items():

@@ -256,9 +256,9 @@ class CompanionPart(FigurePart):
             for name in points_beside(self.figure):
                 loss = _sample_losses(env, replace(self.figure, through=name).plane(env, self._resolution))
                 finite = loss[np.isfinite(loss)]
-                ends = (float(finite.min()), float(finite.max())) if finite.size else (None, None)
+                low, high = (float(finite.min()), float(finite.max())) if finite.size else (None, None)
                 cuts.append(CompanionSlice(name, loss))
-                found.append(Companion(name, *ends, 1 - finite.size / loss.size))
+                found.append(Companion(name, low, high, 1 - finite.size / loss.size))
                 advance(len(found) * loss.size, "")
         save(companions_figure(cuts, dataset), self.folder / COMPANION_PICTURE)
         lighten(self.folder / COMPANION_PICTURE)

@@ -124,8 +124,8 @@ def open_run(path: Path) -> xr.Dataset:
             if torn := packed.testzip():  # a chunk that is not found would be one of nothing but its fill value
                 raise ValueError(f"{torn} in it is torn")
         with ZipStore(path, mode="r") as store:
-            table = xr.open_zarr(store, zarr_format=3, consolidated=False, mask_and_scale=False, decode_times=False)
-            table.load()
+            how: Any = {"mask_and_scale": False, "decode_times": False}
+            table: xr.Dataset = xr.open_zarr(store, zarr_format=3, consolidated=False, **how).load()
         if lost := COLUMNS.keys() - table.variables.keys():
             raise ValueError(f"it lacks {', '.join(sorted(lost))}")
     return table

@@ -97,10 +97,6 @@ class CompareJob(Job[SliceComparison]):
         """Return what is written of it, with what was compared."""
         return {**super().record(found), IDENTITY: self.identity}
 
-    def kept(self) -> str:
-        """Say what of it is on disk."""
-        return f"each file in {self.folder} is whole"
-
     def _sample(self, objective: Objective, watch: Watch) -> xr.Dataset:
         """Sample the objective where the first slice is sampled; return its slice."""
         boxed = bool(self.slice.identity.get("boxed"))

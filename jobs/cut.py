@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 
 ONE_OF = "a slice takes --dims, one or two parameters, or --along, directions; give one of them"
 WORDS = ("center", "example", "random", "best")  # that names of points begin with
-HALF, LEAST = 0.5, 1e-3  # of a width of the box: how far a slice reaches at least, and what is no width for one
-SPREAD = 1 / 8  # the same by the root of how many parameters there are: each moves by that share of its width
+REACH, MIN_WIDTH = 0.5, 1e-3  # of a width of the box: how far a slice reaches, and what is no width for one
+REACH_PER_ROOT = 1 / 8  # the same by the root of how many parameters there are: each moves by that share of its width
 
 
 def refuse_cut(dims: Sequence[int | str] | None, along: str | None) -> None:
@@ -126,14 +126,13 @@ def _reach(space: ParameterSpace, point: Tensor, spans: Tensor) -> tuple[list[fl
     """
     import torch
 
-    most = max(HALF, SPREAD * space.dim**0.5)
+    most = max(REACH, REACH_PER_ROOT * space.dim**0.5)
     ends = [[(bound - point) / span for bound in (space.lower, space.upper)] for span in spans]
     lower = [max(-most, float(torch.minimum(*pair).nan_to_num(-most).max())) for pair in ends]
     upper = [min(most, float(torch.maximum(*pair).nan_to_num(most).min())) for pair in ends]
-    narrow = [high - low < LEAST for low, high in zip(lower, upper, strict=True)]  # in a corner that it points out of
-    return [-HALF if n else v for n, v in zip(narrow, lower, strict=True)], [
-        HALF if n else v for n, v in zip(narrow, upper, strict=True)
-    ]
+    # in a corner that a direction points out of there is no width
+    pairs = [(-REACH, REACH) if high - low < MIN_WIDTH else (low, high) for low, high in zip(lower, upper, strict=True)]
+    return [low for low, _ in pairs], [high for _, high in pairs]
 
 
 def _ends(extent: float | tuple[float, float]) -> tuple[float, float]:

@@ -106,10 +106,6 @@ class EpisodeJob(Job[EpisodeSummary]):
         tidy(self.folder)
         return found.files
 
-    def kept(self) -> str:
-        """Say what of it is on disk."""
-        return f"each file in {self.folder} is whole"
-
     def outcome(self, found: EpisodeSummary) -> str:
         """Say in a line what came out."""
         return f"{found.title} · {self.env.device} · {found.outcome}"

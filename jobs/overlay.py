@@ -1,4 +1,4 @@
-"""Runs to lay over a slice, or over one cut anew for them: what does not belong together, the plane, the files."""
+"""Runs to lay over a slice, or over a new one that is sampled for them: what is refused, the plane, the files."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import xarray as xr
 
@@ -39,8 +39,8 @@ SHOULD = ("fidelity", "settings", "engine", MODEL_VERSION)  # as well
 
 
 @dataclass(frozen=True)
-class Cut:
-    """Say how a slice is cut anew: through a point of runs, along their principal directions, with other resolution.
+class PlaneSpec:
+    """The plane of a new slice: through a point of runs, along their principal directions, with another resolution.
 
     `through` is the best point of all runs (best) or of one run's folder, or any other that a slice can go through;
     `principal` takes the runs' two principal directions instead of the slice's own, and `resolution` is by default the
@@ -52,8 +52,8 @@ class Cut:
     resolution: int | None = None
 
     @classmethod
-    def of(cls, through: str | None, plane: str | None, resolution: int | None) -> Cut | None:
-        """Return how to cut, None where nothing asks for that. Raises ValueError for what makes no plane."""
+    def of(cls, through: str | None, plane: str | None, resolution: int | None) -> PlaneSpec | None:
+        """Return the plane to sample, None where nothing asks for one. Raises ValueError for what makes no plane."""
         if plane not in (None, PCA):
             raise ValueError(f"--plane takes pca, the runs' principal plane; got {plane!r}")
         if not (through or plane):
@@ -62,7 +62,7 @@ class Cut:
             return None
         return cls(through, plane is not None, resolution)
 
-    def plane(self, present: Plane, tables: Sequence[xr.Dataset], objective: Objective) -> Plane:
+    def make(self, present: Plane, tables: Sequence[xr.Dataset], objective: Objective) -> Plane:
         """Return the plane of the new slice: parallel to the one that is present, or the runs' principal one.
 
         Raises ValueError where there is no such point of the objective to go through, and where the run it goes through
@@ -144,12 +144,12 @@ class Overlay:
 
 @dataclass(frozen=True, kw_only=True)
 class OverlayJob(Job[Overlay]):
-    """Runs to lay over a slice; with a `cut` over one that is sampled first in the same folder, on `device`."""
+    """Runs to lay over a slice; with a `plane` over one that is sampled there first in the same folder, on `device`."""
 
     results = OVERLAY
     slice: Slice
     runs: Sequence[xr.Dataset]
-    cut: Cut | None = None
+    plane: PlaneSpec | None = None
     device: str = "auto"
 
     @classmethod
@@ -159,7 +159,7 @@ class OverlayJob(Job[Overlay]):
         runs: Sequence[xr.Dataset],
         *,
         command: str,
-        cut: Cut | None = None,
+        plane: PlaneSpec | None = None,
         device: str = "auto",
         out: Path | None = None,
         prints: Sequence[float] = (),
@@ -172,16 +172,16 @@ class OverlayJob(Job[Overlay]):
         for run in runs:
             check_run(slice.data, run, watch or Watch())
         overlay(slice.data, runs)
-        folder = out or overlay_folder(slice.data, runs, cut)
+        folder = out or overlay_folder(slice.data, runs, plane)
         OVERLAY.check(folder, allowed=[file for file in visible_files(folder) if slice_exists(file / SLICE_STORE)])
-        return cls(slice=slice, runs=runs, folder=folder, command=command, cut=cut, device=device, prints=prints)
+        return cls(slice=slice, runs=runs, folder=folder, command=command, plane=plane, device=device, prints=prints)
 
     def compute(self, watch: Watch) -> Overlay:
         """Sample the new slice, if there is to be one, lay the runs over it and draw them.
 
         Raises StoreMismatchError where a slice is to be cut again that its objective gives other numbers for.
         """
-        beneath = self._sample(watch) if self.cut else self.slice
+        beneath = self._sample(watch, self.plane) if self.plane else self.slice
         return self._draw(Overlay(beneath, overlay(beneath.data, self.runs), self.folder, []))
 
     def write(self, found: Overlay) -> list[str]:
@@ -189,24 +189,19 @@ class OverlayJob(Job[Overlay]):
         tidy(self.folder)
         return found.files
 
-    def kept(self) -> str:
-        """Say what of it is on disk."""
-        return f"each file in {self.folder} is whole"
-
     def outcome(self, found: Overlay) -> str:
         """Say in a line what it shows."""
         return found.summary.outcome()
 
-    def _sample(self, watch: Watch) -> Slice:
-        """Sample the slice that is cut anew."""
-        assert self.cut is not None  # as `run` has seen
+    def _sample(self, watch: Watch, spec: PlaneSpec) -> Slice:
+        """Sample the new slice."""
         env = self._objective()
         if self.slice.folder is not None:
             with watch.busy(PREPARING):
                 verify_dataset(env, self.slice.data, self.slice.folder, todo=RESAMPLE)
-        plane = self.cut.plane(plane_of(self.slice.data), self.runs, env)
-        how: dict[str, Any] = {"gradients": int("grad" in self.slice.data), "boxed": self.cut.principal}
-        job = SliceJob.of(env, plane, command=self.command, root=self.folder, **how)
+        plane = spec.make(plane_of(self.slice.data), self.runs, env)
+        gradients = int("grad" in self.slice.data)
+        job = SliceJob.of(env, plane, command=self.command, root=self.folder, gradients=gradients, boxed=spec.principal)
         job.run(watch)
         return Slice(open_slice(job.folder / SLICE_STORE), job.folder, lambda: env)
 
@@ -224,14 +219,8 @@ class OverlayJob(Job[Overlay]):
 
 def check_run(dataset: xr.Dataset, run: xr.Dataset, watch: Watch) -> None:
     """Raise ValueError for a run of another landscape than a slice's; warn where it is simulated otherwise."""
-    ours, theirs = stored_identity(dataset), stored_identity(run)
-    name = f"{theirs.get('objective')}, {theirs.get('method')}, seed {theirs.get('seed')}"
-    for setting in MUST:
-        if ours.get(setting) != theirs.get(setting):
-            raise ValueError(
-                f"the slice and the run ({name}) are of different landscapes: {setting} is {ours.get(setting)!r} there "
-                f"and {theirs.get(setting)!r} here; lay runs over a slice of their own"
-            )
+    refuse_other_landscape(dataset, run)
+    ours, theirs, name = stored_identity(dataset), stored_identity(run), _name(run)
     if differ := [one for one in SHOULD if ours.get(one) != theirs.get(one)]:
         settings = (f"{one} {ours.get(one)!r} there, {theirs.get(one)!r} here" for one in differ if one != "settings")
         watch.note(
@@ -239,8 +228,24 @@ def check_run(dataset: xr.Dataset, run: xr.Dataset, watch: Watch) -> None:
         )
 
 
-def overlay_folder(dataset: xr.Dataset, runs: Sequence[xr.Dataset], cut: Cut | None, root: Path = ROOT) -> Path:
+def refuse_other_landscape(dataset: xr.Dataset, run: xr.Dataset) -> None:
+    """Raise ValueError for a run of another landscape than a slice's."""
+    ours, theirs = stored_identity(dataset), stored_identity(run)
+    for setting in MUST:
+        if ours.get(setting) != theirs.get(setting):
+            raise ValueError(
+                f"the slice and the run ({_name(run)}) are of different landscapes: {setting} is {ours.get(setting)!r} "
+                f"there and {theirs.get(setting)!r} here; lay runs over a slice of their own"
+            )
+
+
+def _name(run: xr.Dataset) -> str:
+    known = stored_identity(run)
+    return f"{known.get('objective')}, {known.get('method')}, seed {known.get('seed')}"
+
+
+def overlay_folder(dataset: xr.Dataset, runs: Sequence[xr.Dataset], plane: PlaneSpec | None, root: Path = ROOT) -> Path:
     """Return a folder of its own for every different overlay, the same for the same one."""
     ours = stored_identity(dataset)
-    how = [cut.through, PCA if cut.principal else None, cut.resolution] if cut else [None, None, None]
+    how = [plane.through, PCA if plane.principal else None, plane.resolution] if plane else [None, None, None]
     return folder_named(["overlay", ours["objective"]], [ours, [stored_identity(run) for run in runs], how], root)

@@ -12,6 +12,7 @@ from ..landscapes.identity import stored_identity
 from ..landscapes.storage.files import tidy
 from .folder import SLICE_STORE, SURFACE, folder_named, run_tables, store_in
 from .job import Job
+from .overlay import refuse_other_landscape
 from .watch import Watch
 
 if TYPE_CHECKING:
@@ -41,7 +42,7 @@ class SurfaceJob(Job[Path]):
         dataset = open_slice(store_in(slice_, SLICE_STORE))
         tables = run_tables(runs) if runs else []
         for table in tables:
-            check_landscape(dataset, table)
+            refuse_other_landscape(dataset, table)
         placed = overlay(dataset, tables) if tables else []
         ours = stored_identity(dataset)
         content = [ours, [stored_identity(table) for table in tables]]
@@ -66,17 +67,3 @@ class SurfaceJob(Job[Path]):
         printed = save_prints(lambda width: draw(width=width), self.folder / PICTURE, self.prints)
         tidy(self.folder)
         return [PICTURE, MODEL, *printed]
-
-    def kept(self) -> str:
-        """Say what of it is on disk."""
-        return f"each file in {self.folder} is whole"
-
-
-def check_landscape(dataset: xr.Dataset, table: xr.Dataset) -> None:
-    """Raise ValueError where a run searched another landscape than the slice is of."""
-    ours, theirs = stored_identity(dataset), stored_identity(table)
-    if any(ours.get(one) != theirs.get(one) for one in ("objective", "options")):
-        raise ValueError(
-            f"the slice is of {ours.get('objective')} {ours.get('options')}, a run of {theirs.get('objective')} "
-            f"{theirs.get('options')}; lay runs over a slice of their own"
-        )

@@ -102,8 +102,8 @@ def _tile(env: str, group: Sequence[FigureEntry], data: Path, out: Path, studio:
     if found := _place_census(env, data, out, studio):
         census, files = found
         words = [WordShare(word, one.value, one.low, one.high) for word, one in census.words.items()]
-        paths = [path.relative_to(out).as_posix() for path in (files.picture, files.table)]
-        return Tile(*about, len(census.slices), True, words, *paths, census.command)
+        picture, table = (path.relative_to(out).as_posix() for path in (files.picture, files.table))
+        return Tile(*about, len(census.slices), True, words, picture, table, census.command)
     said = [set(entry.words) for entry in group if entry.report is not None]
     words = [WordShare(word, sum(word in one for one in said) / len(said)) for word in WORDS] if said else []
     return Tile(*about, len(said), False, words)
