@@ -21,7 +21,7 @@ from gradscape.landscapes.space import ParameterSpace
 from gradscape.landscapes.storage.paths import filling_path
 from gradscape.landscapes.storage.store import SliceStore
 from gradscape.landscapes.verification import POINTS
-from gradscape.studies.stability import ask
+from gradscape.studies.stability import ask, is_stable
 
 from ...processes import FORK
 
@@ -125,7 +125,7 @@ def test_memory_for_no_point_at_all_ends_it_and_other_errors_pass():
 def test_memory_that_runs_out_says_nothing_of_a_setting():
     points = SPACE.uniform(16, seed=0)
     small = Small(4, RuntimeError(MESSAGES[1]))
-    assert ask(small, points).stable
+    assert is_stable(ask(small, points))
     assert small.asked[:3] == [16, 8, 4]
     found = ask(Small(0, RuntimeError(MESSAGES[1])), points)
     assert "wave ran out of memory at a single point" in found.refused
