@@ -16,13 +16,10 @@ import torch
 from .. import __version__
 from ..envs.engines import installed_version
 from ..envs.registry import find_environment, make, registered_environment
-from ..landscapes.convert import from_json
 from ..landscapes.identity import MODEL_VERSION, PACKAGE, VERSIONS
 from ..landscapes.plain import digest, plain_json
 from ..landscapes.storage.files import moved_by
 from ..landscapes.storage.records import read_json, reading
-from ..optim.league import SceneStandings
-from ..studies.kept import find_fidelity, own_folder
 from .watch import Watch
 
 if TYPE_CHECKING:
@@ -333,6 +330,7 @@ def _time(env: Environment, variants: Sequence[Environment]) -> dict[str, float]
     from ..landscapes.storage.files import write_json
     from ..landscapes.storage.records import read_json, reading
     from ..studies import variants as timing
+    from ..studies.kept import own_folder
 
     of = digest([asdict(env.options), env.engine, env.version_on(env.engine), __version__])  # others take another time
     path = own_folder() / f"{env.name}-{env.device}-{of}.seconds.json"
@@ -356,6 +354,8 @@ def find_variant(env: Environment, device: str) -> tuple[MeasuredVariant, Path]:
 
     Raises ValueError where nothing was.
     """
+    from ..studies.kept import find_fidelity
+
     found = find_fidelity(env, device)
     for row in _rows(found[0], env, device) if found else []:
         if found and row.device == device and row.fidelity == env.fidelity:
@@ -387,6 +387,8 @@ def read_tolerance(given: object) -> float:
 
 def _candidates(env: Environment, options: Mapping[str, Any]) -> tuple[FidelityRecord, Path, Sequence[MeasuredVariant]]:
     """Return the study to choose from, its file, and its variants that solve the same problem on the engine."""
+    from ..studies.kept import find_fidelity
+
     measuring = [
         "landscape",
         "study",
@@ -422,6 +424,9 @@ def best_of_league(env: Environment) -> tuple[Tensor, float] | None:
     It is None where there is none, or one of another fidelity's number of parameters. Raises DamagedError where the
     file is not what was written.
     """
+    from ..landscapes.convert import from_json
+    from ..optim.league import SceneStandings
+
     path = league_file(env.name)
     if not path.is_file():
         return None

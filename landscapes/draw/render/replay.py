@@ -229,14 +229,14 @@ def is_still(part: Part) -> bool:
     )
 
 
-def _lay_ground(plotter: pv.Plotter, view: View, solids: Sequence[pv.PolyData]) -> None:
+def _lay_ground(plotter: pv.Plotter, view: View, bodies: Sequence[pv.PolyData]) -> None:
     """Lay the ground under the view, darker where solids stand in the light, fading into the background."""
     assert view.ground is not None  # the caller asked
     low, high = np.array(view.lower), np.array(view.upper)
     center, half = (low + high) / 2, EXTENT * float(np.linalg.norm(high - low)) / 2
     x = center[0] + half * np.linspace(-1, 1, CELLS)
     z = center[2] + half * np.linspace(-1, 1, CELLS)
-    dark = _shadow(solids, view.ground, x, z)
+    dark = _shadow(bodies, view.ground, x, z)
     away = np.hypot((x[:, None] - center[0]) / half, (z[None, :] - center[2]) / half)
     fade = np.clip((away - 0.45) / 0.5, 0.0, 1.0)[..., None]
     ground, background = (np.array(pv.Color(name).float_rgb) for name in (solids.GROUND, solids.BACKGROUND))
@@ -248,9 +248,9 @@ def _lay_ground(plotter: pv.Plotter, view: View, solids: Sequence[pv.PolyData]) 
     )
 
 
-def _shadow(solids: Sequence[pv.PolyData], ground: float, x: Grid, z: Grid) -> Grid:
+def _shadow(bodies: Sequence[pv.PolyData], ground: float, x: Grid, z: Grid) -> Grid:
     """Return how much of the key light solids take from the ground, shape (x, z), 0 to 1."""
-    spots = np.concatenate([_scatter_points(solid) for solid in solids if solid.n_cells] or [np.zeros((0, 3))])
+    spots = np.concatenate([_scatter_points(solid) for solid in bodies if solid.n_cells] or [np.zeros((0, 3))])
     lift = spots[:, 1:2] - ground
     shift = np.array(solids.KEY)
     feet = (spots - lift * shift / shift[1])[lift[:, 0] > 0]
