@@ -35,7 +35,7 @@ def small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     monkeypatch.setattr(gallery_companions, "RESOLUTION", 4)
     for name, value in (("HEIGHT", 60), ("LONGEST", 2)):
         monkeypatch.setattr(gallery_episodes, name, value)
-    for name, value in (("REPORT_POINTS", 2), ("TRADEOFF_POINTS", 4), ("TURNED", ["precision"])):
+    for name, value in (("REPORT_POINTS", 2), ("STUDY_POINTS", 4), ("CHANGED", ["precision"])):
         monkeypatch.setattr(gallery_measures, name, value)
     for name, value in (("METHODS", ("random", "descents")), ("BUDGET", 12), ("SEEDS", 3)):
         monkeypatch.setattr(gallery_league, name, value)
