@@ -30,7 +30,7 @@ def small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     for module, values in (
         (gallery_parts, {"SWEEP_FRAMES": 2, "SWEEP_RESOLUTION": 5, "SWEEP_DPI": 40, "COMPANION_RESOLUTION": 4}),
         (gallery_parts, {"EPISODE_HEIGHT": 60, "EPISODE_FRAMES": 2, "METHODS": ("random", "cma-es"), "BUDGET": 9}),
-        (gallery_parts, {"REPORT_POINTS": 2, "STUDY_POINTS": 4, "CHANGED": ("precision",)}),
+        (gallery_parts, {"REPORT_POINTS": 2, "STUDY_POINTS": 4, "CHANGED": ["precision"]}),
         (gallery_league, {"METHODS": ("random", "descents"), "BUDGET": 12, "SEEDS": 3}),
     ):
         for name, value in values.items():
