@@ -138,5 +138,5 @@ def test_a_wrong_function_is_told_what_and_what_to_do(fn, said):
 
 @pytest.mark.parametrize("option", [{"device": "tpu"}, {"precision": "float16"}, {"rows": 0}])
 def test_a_wrong_option_says_what_there_is(option):
-    with pytest.raises(ValueError, match=r"from_warp|precision|wave runs on cpu and cuda; got device"):
+    with pytest.raises(ValueError, match=r"from_warp|precision|runs on cpu and cuda; got device 'tpu'"):
         gs.from_warp(wave, SPACE, **option)
