@@ -10,8 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
-from ..jobs.plan import Work
-from ..jobs.watch import Stopped, Watch
+from ..jobs.watch import Stopped, Watch, Work
 from ..jobs.workers import workers
 from ..landscapes.capacity import require
 from ..landscapes.cost import duration

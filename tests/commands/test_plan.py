@@ -5,10 +5,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from gradscape.landscapes.measures.undersampled import probes
 
 import gradscape as gs
 from gradscape.jobs import plan as module
+from gradscape.landscapes.measures.undersampled import probes
 
 from ..command import Said
 
