@@ -7,13 +7,13 @@ import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
-
-import numpy as np
-import xarray as xr
+from typing import TYPE_CHECKING, Any
 
 from ..identity import DamagedError
 from .files import replacing, write_json
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 CHECKSUM = "checksum"  # of the rest of a record, which holds it under this name
 REASON_LENGTH = 160  # characters of what is wrong
@@ -71,6 +71,8 @@ def _sum(record: Mapping[str, Any]) -> int:
 
 def save_bundle(path: Path, **datasets: xr.Dataset) -> None:
     """Write datasets by name, whole or not at all: the file's arrays are called DATASET/VARIABLE/DIMENSION,..."""
+    import numpy as np
+
     arrays: dict[str, Any] = {
         f"{name}/{variable}/{','.join(map(str, array.dims))}": array.to_numpy()
         for name, dataset in datasets.items()
@@ -82,6 +84,9 @@ def save_bundle(path: Path, **datasets: xr.Dataset) -> None:
 
 def open_bundle(path: Path) -> dict[str, xr.Dataset]:
     """Read the datasets of a file by name."""
+    import numpy as np
+    import xarray as xr
+
     found: dict[str, dict[str, Any]] = {}
     with reading(path, "delete its folder to measure it anew"), np.load(path, allow_pickle=False) as arrays:
         for key, values in arrays.items():
