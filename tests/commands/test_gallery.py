@@ -98,7 +98,7 @@ def test_compute_goes_on_where_it_stopped_and_computes_nothing_twice(
     assert compute(tmp_path, *command) == 130
     said = capsys.readouterr().err
     assert "about 13 min in all" in said
-    assert re.search(r"stopped: in branin, \d+ of 1600 points are kept in .*; the same command goes on", said)
+    assert re.search(r"stopped: in branin, \d+ of 1600 points are kept in .*; the same command continues", said)
     kept = int((open_slice(tmp_path / "branin/slice.zarr")["status"] > 0).sum())
     assert 0 < kept <= sum(points)
     points.clear()
