@@ -123,6 +123,8 @@ def bounce(
 
     The folder then holds slice.zarr (the samples), landscape.png and summary.json.
 
+    Raises ValueError for another axis, and as `slice` does.
+
     Example: landscape bounce --axis y
 
     Parameters

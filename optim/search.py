@@ -64,7 +64,7 @@ def fill(
     gradient_cost: float | None = None,
     progress: Callable[[SearchProgress], None] | None = None,
 ) -> Asking[None]:
-    """Return the search that fills a locked run up to a budget, its optimiser restored; see `search`."""
+    """Return the search that fills a locked run up to a budget, its optimiser restored; raises as `search` does."""
     if gradient_cost is not None and not 0 < gradient_cost < math.inf:
         raise ValueError(f"search takes a gradient_cost above 0 and finite; got {gradient_cost}")
     optimizer = _begin(objective, method, run, gradient_cost) if run.count < budget else None

@@ -28,7 +28,7 @@ def test_no_function_is_longer_than_one_reads_at_once() -> None:
         if isinstance(node, Function) and (length := _lines(node)) > LONGEST
     }
     # One step of a flight with all that it may meet: a Warp function, whose parts would be as many arguments.
-    assert long.keys() == {"envs/engines/balls/events.py move"}
+    assert long.keys() == {"envs/engines/balls/impacts.py move"}
 
 
 def test_tests_stand_in_folders_that_there_are() -> None:

