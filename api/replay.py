@@ -43,10 +43,10 @@ def replay(
     film
         Also film the episode, which takes about a minute.
     """
-    from ..jobs.episode import EpisodeJob
-
     call = current()
     env = environment(scene, keywords)
+    from ..jobs.episode import EpisodeJob
+
     job = EpisodeJob.of(
         env, params, command=call.command, out=as_path(out), film=film, prints=as_widths(figure_width_mm)
     )

@@ -11,8 +11,6 @@ from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import torch
-
 from .. import __version__
 from ..envs.engines import installed_version
 from ..envs.registry import find_environment, make, registered_environment
@@ -424,6 +422,8 @@ def best_of_league(env: Environment) -> tuple[Tensor, float] | None:
     It is None where there is none, or one of another fidelity's number of parameters. Raises DamagedError where the
     file is not what was written.
     """
+    import torch
+
     from ..landscapes.convert import from_json
     from ..optim.league import SceneStandings
 

@@ -55,7 +55,7 @@ class Part:
         return {name: value for name, value in vars(self).items() if name != "options"}
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Take back what `state` returned."""
+        """Take back what `state` returned. Raises ValueError for what is no attribute of it."""
         for name, value in state.items():
             if name not in vars(self):
                 raise ValueError(f"{name} is no attribute of a {type(self).__name__}")

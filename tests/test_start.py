@@ -69,10 +69,15 @@ REFUSED = (
     *("slice fluid --dims 0 --tolerance x", "slice fluid --dims 0 --tolerance 5% --fidelity draft"),
     *("slice bounce --dims 0 --set nosuch", "slice bounce --dims 0 --fidelity nosuch"),
     *("slice bounce --dims 0 --device nosuch", "slice bounce --dims 0 --engine nosuch", "bounce --axis w"),
-    *("sweep fluid --dims 0 1 --over 12", "plan fluid --dims 12 0", "plan nosuch.toml", "plan fluid --methods nosuch"),
+    *(
+        "sweep fluid --dims 0 1 --over 12",
+        "plan slice fluid --dims 12 0",
+        "plan nosuch",
+        "plan race fluid --methods nosuch",
+    ),
     *("race fluid --methods nosuch", "race fluid --methods random --option bo.a=1", "optimize bounce --method nosuch"),
     *("league nosuch", "league fluid@nosuch", "league fluid --methods nosuch", "methods nosuch", "envs nosuch"),
-    *("report nosuch", "report fluid --fidelity nosuch", "bench fluid --against nosuch", "study no fluid"),
+    *("report nosuch", "report fluid --fidelity nosuch", "bench fluid --second-engine nosuch", "study no fluid"),
     *("compare nosuch fluid", "overlay nosuch run", "surface nosuch", "export nosuch", "view nosuch", "nosuch"),
 )
 
