@@ -31,6 +31,8 @@ from gradscape.optim.league import League
 
 from ..gallery.site.conftest import scene_standings
 
+pytestmark = pytest.mark.docs
+
 ROOT = Path(__file__).parents[2]
 REPORTED = "bounce-y"  # a figure whose report is kept
 
