@@ -45,17 +45,7 @@ def cheap(kind: type[Environment]) -> Fidelity:
 
 
 REGISTERED = tuple(entries())  # before other tests register classes from files
-ONE_OF_EACH = {"bounce", "branin", "cartpole", "fluid", "mjx-drop", "newton-flight", "pinball-2", "rope"}
-    "bounce",
-    "branin",
-    "cartpole",
-    "fluid",
-    "mjx-drop",
-    "newton-flight",
-    "pinball-2",
-    "rope",
-    "swing-velocity",
-}
+ONE_OF_EACH = {"bounce", "branin", "cartpole", "fluid", "mjx-drop", "newton-flight", "pinball-2", "rope", "flip"}
 SIMULATED = [name for name in REGISTERED if not issubclass(environment_class(name), Function)]
 SETTINGS = {name: {"fidelity": cheap(environment_class(name))} for name in SIMULATED}
 SOFT = of_family(Plasticine)
