@@ -7,6 +7,8 @@ import pytest
 
 from .command import Said
 
+pytestmark = pytest.mark.e2e
+
 Command = Callable[..., Said]
 CUT = "slice branin --dims 0 1 --resolution 4 --out cut"
 

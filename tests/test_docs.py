@@ -22,6 +22,8 @@ from gradscape.jobs.workers import workers
 
 from .command import Said
 
+pytestmark = pytest.mark.docs
+
 ROOT = Path(__file__).parent.parent
 ELSE = ("generated", "archive")  # written when the site is built, and of earlier versions
 PAGES = [ROOT / "README.md", *(one for one in sorted((ROOT / "docs").rglob("*.md")) if one.parent.name not in ELSE)]

@@ -14,6 +14,8 @@ from gradscape.envs.registry import as_environment, entries
 
 from .command import Said, leave_blank
 
+pytestmark = pytest.mark.e2e
+
 SIMULATORS = """
 import jax.numpy as jnp
 import warp as wp

@@ -25,6 +25,8 @@ from gradscape.landscapes.sampling.refine import Refinement
 
 from .processes import alone, landscape
 
+pytestmark = pytest.mark.e2e
+
 SPACE = ParameterSpace({"x": (-1, 1), "y": (-1, 1)})
 DIMS = ("x", "y")
 Loss = Callable[[Tensor], Tensor]

@@ -20,6 +20,8 @@ from .command import Said
 from .faults import FAULTS, Killed, damage
 from .kinds import KINDS, before, copy, files, missing, numbers, printed, say, undisturbed, wrong
 
+pytestmark = pytest.mark.e2e
+
 QUICK = ("slice", "run", "pairs")  # kinds of the default lane
 FULL = re.compile(r"no space|no room|disk is full|of disk, and .* free here", re.IGNORECASE)
 ADVICE = re.compile(r"make room|same command|run it again")

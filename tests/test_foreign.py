@@ -15,6 +15,8 @@ from gradscape.landscapes.identity import stored_identity
 
 from .command import Said
 
+pytestmark = pytest.mark.e2e
+
 # It has neither name nor fidelities nor docstring, imports a neighbour, and refuses what lies beyond its bounds.
 ARM = '''
 from dataclasses import dataclass

@@ -13,6 +13,8 @@ from gradscape.studies import samples
 
 from .command import Said
 
+pytestmark = pytest.mark.e2e
+
 Command = Callable[..., Said]
 SLICE = "slice branin --dims 0 1 --resolution 4 --out"
 SEARCH = "optimize branin --method random --budget 4 --out"

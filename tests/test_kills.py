@@ -11,6 +11,8 @@ from gradscape.cli import main
 from .kinds import numbers
 from .processes import Instant, alone, landscape
 
+pytestmark = pytest.mark.e2e
+
 BOUNCE = ["bounce", "--dims", "0", "1", "--resolution", "4", "--fidelity", "draft"]
 SEARCH = ["--budget", "4", "--fidelity", "draft"]
 JOBS = {

@@ -12,6 +12,8 @@ from gradscape.landscapes.storage.records import open_bundle, save_bundle
 
 from .command import Said
 
+pytestmark = pytest.mark.e2e
+
 Run = Callable[..., Said]
 SLICE = ("slice", "branin", "--dims", "0", "1", "--resolution", "5", "--out", "cut")
 

@@ -39,6 +39,8 @@ from gradscape.optim.runs.store import RunStore
 
 from .sockets import beyond_loopback, listening
 
+pytestmark = pytest.mark.e2e
+
 cloudpickle.register_pickle_by_value(sys.modules[__name__])  # workers need not find the tests
 SPACE = ParameterSpace.box(("x", "y", "z"), -2.0, 2.0, "m")
 PLANE = Plane.through(SPACE, SPACE.center, ["x", "z"], resolution=(18, 16))

@@ -18,6 +18,8 @@ from gradscape.optim.registry import methods, optimizer_class
 
 from .processes import Ended, alone, landscape
 
+pytestmark = pytest.mark.e2e
+
 HUGE = 10**15
 ROOM = 2 << 30  # bytes that a command may take beyond what it is loaded with
 COUNTS = {"seed", "top", "workers"}  # whole numbers that allocate nothing

@@ -21,6 +21,8 @@ from .command import leave_blank
 from .processes import FORK
 from .sockets import beyond_loopback, listening
 
+pytestmark = pytest.mark.e2e
+
 SMALL = """
 envs
 info

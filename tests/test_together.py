@@ -10,6 +10,8 @@ import pytest
 from gradscape.landscapes.storage.files import holding
 from gradscape.optim.runs.store import RunStore
 
+pytestmark = pytest.mark.e2e
+
 SEARCHES = {
     "race": "race branin --methods random,cma-es --seeds 2 --budget 12 --out made",
     "league": "league branin beale --methods random,cma-es --seeds 2 --budget 12 --device cpu --out made",

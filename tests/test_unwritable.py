@@ -13,6 +13,8 @@ from gradscape.envs.mpm import targets
 from gradscape.jobs import margins
 from gradscape.landscapes.storage.files import moved_by
 
+pytestmark = pytest.mark.e2e
+
 SLICE = "slice bounce --dims 0 1 --resolution 2 --fidelity draft --device cpu --out made"
 
 

@@ -21,6 +21,8 @@ import pytest
 
 from gradscape.envs.registry import EXTRAS
 
+pytestmark = pytest.mark.e2e
+
 ROOT = Path(__file__).parent.parent
 NOT_SENT = {".git", ".venv*", "build", "dist", "out", "__pycache__", "node_modules", "generated"}
 LARGEST = 10_000_000  # bytes of a wheel or an sdist

@@ -28,6 +28,8 @@ from gradscape.landscapes.verification import POINTS
 
 from ..command import leave_blank
 
+pytestmark = pytest.mark.e2e
+
 FIGURES = [
     Figure(
         "bounce-y", "bounce", (1,), PaperCaption("It jumps.", 8), through="example:aim", resolution=12, fidelity="draft"

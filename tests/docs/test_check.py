@@ -7,6 +7,8 @@ from pathlib import Path
 import pytest
 from docs.pages.check import find_faults, main
 
+pytestmark = pytest.mark.docs
+
 SOUND = """<html><head><link rel="stylesheet" href="_static/a.css"><link rel="canonical" href="https://example.org/">
 <script src="_static/a.js?v=1"></script></head><body><h1 id="top">Page</h1><a href="#top">up</a>
 <a href="sub/other.html#there">other</a><a href="https://arxiv.org">away</a>

@@ -13,6 +13,8 @@ from docs.pages.check import find_faults
 
 from ..command import PATIENCE
 
+pytestmark = pytest.mark.docs
+
 DOCS = Path(__file__).parents[2] / "docs"
 INDEX = """# Small
 

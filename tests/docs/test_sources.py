@@ -14,6 +14,8 @@ from pybtex.database import parse_file
 
 import gradscape
 
+pytestmark = pytest.mark.docs
+
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 FOLDERS = ("api", "benchmarks", "commands", "docs", "envs", "gallery", "jobs", "landscapes", "optim")

@@ -18,6 +18,8 @@ from gradscape.studies.model import ModelRecord
 from gradscape.studies.samples import Bootstrap
 from gradscape.studies.variants import StudyRecord
 
+pytestmark = pytest.mark.docs
+
 
 def lines(table: str) -> list[list[str]]:
     return [[cell.strip() for cell in line.strip("|\n ").split(" | ")] for line in table.splitlines()[2:]]

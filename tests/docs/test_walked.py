@@ -14,13 +14,13 @@ import pytest
 from docs.pages import commands, extension, pictures, reproduction, scenes
 from docs.pages.kept import NOT_MEASURED, Kept, KeptFigure
 from docs.pages.text import prose
-from gradscape.envs.function import DEFAULTS
 from hypothesis import given
 from hypothesis import strategies as st
 from markdown_it import MarkdownIt
 
 import gradscape
 from gradscape.cli import verbs
+from gradscape.envs.adapters import Function, FunctionKeywords
 from gradscape.envs.registry import BUILTIN, environment_class
 from gradscape.gallery.figures import read_figures
 from gradscape.gallery.files import DATA
@@ -30,6 +30,8 @@ from gradscape.optim.claims import ClaimVerdict
 from gradscape.optim.league import League
 
 from ..gallery.site.conftest import scene_standings
+
+pytestmark = pytest.mark.docs
 
 ROOT = Path(__file__).parents[2]
 REPORTED = "bounce-y"  # a figure whose report is kept
@@ -87,7 +89,8 @@ def test_the_interface_lists_every_public_name_and_what_functions_return() -> No
                  for one in (public, *get_overloads(public))]  # fmt: skip
     returned = {word for text in annotated for word in re.findall(r"(?<![\w.])[A-Z]\w+", text)} - FOREIGN
     assert returned <= {name.rpartition(".")[2] for name in listed}
-    assert dict(re.findall(r"\| `(\w+)` \| `(.+)` \|", text)) == {name: repr(one) for name, one in DEFAULTS.items()}
+    defaults = {name: repr(getattr(Function, name)) for name in FunctionKeywords.__annotations__}
+    assert dict(re.findall(r"\| `(\w+)` \| `(.+)` \|", text)) == defaults
 
 
 def test_every_scene_has_a_page_with_what_it_says_and_where_it_is_bounded(

@@ -3,9 +3,12 @@
 A new one is found by its family.
 """
 
+from collections.abc import Iterable
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
+import pytest
 import torch
 from torch import Tensor
 
@@ -42,6 +45,7 @@ def cheap(kind: type[Environment]) -> Fidelity:
 
 
 REGISTERED = tuple(entries())  # before other tests register classes from files
+ONE_OF_EACH = {"bounce", "branin", "cartpole", "fluid", "mjx-drop", "newton-flight", "pinball-2", "rope", "flip"}
 SIMULATED = [name for name in REGISTERED if not issubclass(environment_class(name), Function)]
 SETTINGS = {name: {"fidelity": cheap(environment_class(name))} for name in SIMULATED}
 SOFT = of_family(Plasticine)
@@ -51,6 +55,13 @@ TAICHI = [*of_family(Fluid, SheetScene), "rolling-pin"]  # of plasticine one sce
 # Where vertices strike a surface their losses jump, by little but often: differences need a step between the jumps.
 SMALL_STEPS = dict.fromkeys(of_family(SheetScene), 1e-8)
 SMALL_STEPS["pinball-16"] = 1e-8  # many impacts amplify: at a slope of 5e5 m/rad, differences over 1e-6 rad err by 2 %
+
+
+def one_of_each(cases: Iterable[Any]) -> list[Any]:
+    """Return cases of tests, scenes or tuples that begin with one; those of a family's other scenes are slow."""
+    names = [(case, case if isinstance(case, str) else case[0]) for case in cases]
+    marked = [(case, [] if name in ONE_OF_EACH else [pytest.mark.slow]) for case, name in names]
+    return [pytest.param(*([case] if isinstance(case, str) else case), marks=marks) for case, marks in marked]
 
 
 def made(name: str) -> Environment:

@@ -12,12 +12,12 @@ from gradscape.landscapes.objective import Evaluation, Objective, Status
 
 from .corners import faults, small
 from .numbers import POINTS, moved, points_of
-from .scenes import SETTINGS, SHORT, SIMULATED, SMALL_STEPS, assert_returns_stay, made, made_once
+from .scenes import SETTINGS, SHORT, SIMULATED, SMALL_STEPS, assert_returns_stay, made, made_once, one_of_each
 
 ROWS = POINTS["tiny"][0]
 
 
-@pytest.fixture(scope="module", params=sorted(entries()))
+@pytest.fixture(scope="module", params=one_of_each(sorted(entries())))
 def env(request):
     return made(request.param)
 
@@ -118,7 +118,7 @@ OTHER_PRECISIONS = [
 ]
 
 
-@pytest.mark.parametrize(("name", "precision"), OTHER_PRECISIONS)
+@pytest.mark.parametrize(("name", "precision"), one_of_each(OTHER_PRECISIONS))
 def test_so_it_does_in_every_precision_of_its_fidelities(name, precision):
     settings = {"fidelity": replace(SETTINGS[name]["fidelity"], precision=precision)} | SHORT.get(name, {})
     assert_returns_stay(make(name, device="cpu", **settings))

@@ -18,6 +18,8 @@ from gradscape.landscapes.conformance.subject import Subject
 
 from .scenes import made_once
 
+pytestmark = pytest.mark.slow
+
 POINT = """
 <mujoco>
   <option gravity="0 0 -10"/>

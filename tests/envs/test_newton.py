@@ -12,6 +12,8 @@ from gradscape.envs.newton.scene import BUDGET
 from gradscape.envs.registry import entries
 from gradscape.landscapes.objective import Status
 
+pytestmark = pytest.mark.slow
+
 SOLVED = [
     *(("newton-flight", solver) for solver in ("semi-implicit", "featherstone", "xpbd")),
     *(("newton-ball", solver) for solver in ("semi-implicit", "featherstone", "xpbd")),

@@ -11,6 +11,8 @@ import warp as wp
 
 from gradscape.envs.registry import make
 
+pytestmark = pytest.mark.slow
+
 # In a process of its own, since it unloads kernels that solvers of other tests would launch.
 PROGRAM = """
 import json

@@ -16,6 +16,8 @@ from gradscape.gallery.figures import Figure
 from gradscape.gallery.paper import PaperCaption
 from gradscape.gallery.records import open_run, save_run
 
+pytestmark = pytest.mark.e2e
+
 FIGURES = [
     Figure("ball", "bounce", (0, 1), PaperCaption("It jumps."), through="example:aim", resolution=8, fidelity="draft"),
     Figure("ball-y", "bounce", (1,), PaperCaption("It jumps."), through="example:aim", resolution=8, fidelity="draft"),

@@ -16,6 +16,8 @@ from gradscape.optim.methods.surrogate import Surrogate, SurrogateOptions
 
 from .test_race import Bowl
 
+pytestmark = pytest.mark.e2e
+
 KNOWN = 30
 
 

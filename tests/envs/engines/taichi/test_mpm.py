@@ -20,6 +20,8 @@ from gradscape.envs.mpm.plasticine_scenes import RollingPin
 
 from ..bench import DT, IDENTITY, MASS, SCALE, VOLUME, MaterialBench, draw, rotations, vectors
 
+pytestmark = pytest.mark.slow
+
 SYRUP = Fluid(1000.0, 4e4, viscosity=4.0)
 SPONGE = Elastic(1000.0, 2e4, 0.3)
 CLAY = Plasticine(1000.0, 2e4, 0.3, yield_stress=100.0)

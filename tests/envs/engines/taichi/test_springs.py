@@ -16,6 +16,8 @@ from gradscape.envs.engines.taichi.runtime import start
 from gradscape.envs.sheets import lattice
 from gradscape.envs.sheets.swing import SwingVelocity
 
+pytestmark = pytest.mark.slow
+
 PAN = Pan(flat=0.14, bend=0.07, sweep=math.asin(6 / 7), thickness=0.03)
 DT, STEPS, ROWS = 2e-3, 40, 3
 

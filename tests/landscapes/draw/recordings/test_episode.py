@@ -14,6 +14,8 @@ from gradscape.landscapes.draw.recordings.episode import save_episode
 from gradscape.landscapes.draw.render.solids import mesh
 from gradscape.landscapes.episode import Episode, Part, View
 
+pytestmark = pytest.mark.slow
+
 FRAMES = 4
 TIME = torch.arange(FRAMES, dtype=torch.float64) / 8
 WAY = torch.linspace(0.0, 0.5, FRAMES, dtype=torch.float64)[:, None, None] * torch.tensor([1.0, 0.5, 0.0])

@@ -25,6 +25,8 @@ from gradscape.landscapes.space import ParameterSpace
 
 from ....processes import alone
 
+pytestmark = pytest.mark.slow
+
 SPACE = ParameterSpace.box(("a", "b", "c"), -1.0, 1.0, "m")
 
 

@@ -21,6 +21,8 @@ from gradscape.landscapes.draw.render.replay import Shot, add_title, axes, frame
 from gradscape.landscapes.draw.render.solids import lump, mesh
 from gradscape.landscapes.episode import Episode, Part, View
 
+pytestmark = pytest.mark.slow
+
 SCENES = [entry.name for entry in BUILTIN if "functions" not in entry.target]
 SMALL = 120  # height of a test's pictures [pixel]
 

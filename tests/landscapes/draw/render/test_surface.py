@@ -17,6 +17,8 @@ from gradscape.landscapes.plane import Plane
 from gradscape.landscapes.sampling.fill import sample
 from gradscape.landscapes.space import ParameterSpace
 
+pytestmark = pytest.mark.slow
+
 SPACE = ParameterSpace.box(["a", "b"], -1.0, 1.0, "m")
 PEAK = (0.5, -0.5)
 
