@@ -167,7 +167,7 @@ def test_every_figure_function_is_held_to_this() -> None:
     for module in pkgutil.walk_packages(draw.__path__, f"{draw.__name__}."):
         names = vars(import_module(module.name))
         found |= {name for name in names if name.endswith("_figure") and not name.startswith("_")}
-    assert found == set(FIGURES)
+    assert found == {*FIGURES, "mixed_figure"}  # which is that of a fidelity study, with other marks
 
 
 @pytest.mark.parametrize("kind", ["png", "pdf", "svg"])
