@@ -170,7 +170,8 @@ class Verb:
         if as_object:
             import json
 
-            print(json.dumps(results[0] if len(results) == 1 else {f"{self.words}s": results}))
+            whole = results[0] if len(results) == 1 else {f"{self.words}s": results}
+            print(json.dumps({"command": command_line(), **whole} if isinstance(whole, dict) else whole))
         return code
 
 
