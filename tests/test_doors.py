@@ -109,6 +109,10 @@ def functions(f: Any, name: str) -> dict[str, Callable[[], Any]]:
         "pairs": lambda: gs.pairs(f, samples=2, out=f"{name}/pairs"),
         "census": lambda: gs.census(f, slices=2, resolution=6, out=f"{name}/census"),
         "study": lambda: gs.study("fidelity", f, points=4, out=f"{name}/study"),
+        "replay": lambda: gs.replay(f, out=f"{name}/replay"),
+        "surface": lambda: gs.surface(f"{name}/slice", out=f"{name}/surface"),
+        "export": lambda: gs.export(f"{name}/slice"),
+        "plan": lambda: gs.plan(gs.slice, f, resolution=6),
     }
 
 
@@ -135,7 +139,7 @@ def commands(f: str, name: str) -> dict[str, str]:
     }
 
 
-OTHER_FUNCTIONS = {"card", "list_envs", "log", "register"}  # of no simulator that is given
+OTHER_FUNCTIONS = {"bench", "bounce", "card", "list_envs", "log", "register"}  # of no simulator that is given
 OTHER_VERBS = {"bench", "bounce", "card", "info", "methods", "view"}  # so are these; bench times, which takes long
 
 

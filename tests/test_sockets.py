@@ -17,7 +17,7 @@ from gradscape.cli import main, verbs
 from gradscape.jobs import workers as cluster
 from gradscape.landscapes.draw.recordings import viewer
 
-from .command import leave_blank
+from .command import leave_blank, options
 from .processes import FORK
 from .sockets import beyond_loopback, listening
 
@@ -39,14 +39,14 @@ replay bounce --fidelity draft --device cpu --no-film
 export cut
 view over/overlay.rrd
 bounce --axis y --resolution 3 --fidelity draft --device cpu
-plan bounce --resolution 2 --fidelity draft --device cpu
+plan slice bounce --dims 0 1 --resolution 2 --fidelity draft --device cpu
 bench bounce --batch 2 --seconds 0 --fidelity draft --device cpu
 check branin --points 2
 study fidelity cartpole --set horizon=0.02 --points 2 --settings precision --device cpu
 study mixed cartpole --set horizon=0.02 --points 2 --chaotic --time-limit 0.01 --device cpu
 study extremes bounce --set horizon=0.05 --points 4 --settings dt --precisions float64 --fidelity draft --device cpu
 pairs bounce --samples 2 --fidelity draft --device cpu
-report cut --points 2 --device cpu
+report cut --points-per-axis 2 --device cpu
 census branin --slices 1 --resolution 6
 card --scene control --resolution 3
 gallery compute --only bounce-y --part slices --resolution 4 --fidelity draft --device cpu --data data
@@ -55,7 +55,8 @@ gallery build --data data --out site
 gallery serve --out site --port 0
 """.strip().splitlines()
 # Flags of what results are like, and not of what is started.
-RESULTS = {"--json", "--force", "--no-gradients", "--deterministic", "--film", "--report", "--all", "--chaotic"}
+RESULTS = {"--json", "--force", "--no-gradients", "--deterministic", "--film", "--no-film", "--claims", "--all"}
+RESULTS |= {"--chaotic"}
 NO_WINDOW = "rerun's viewer could not open a window"
 SERVED = "until Ctrl-C"  # what is said by all that serves
 
@@ -69,10 +70,9 @@ def verb_of(line: str) -> str:
 
 def lines(small: str) -> Iterator[str]:
     """Yield a verb's small command, on workers where it takes them, and then with each flag that may start more."""
-    options = {name: param for param in VERBS[verb_of(small)].params for name in param.opts}
-    yield small + (" --scheduler local:1" if "--scheduler" in options else "")
-    flags = [name for name, param in options.items() if getattr(param, "is_flag", False)]
-    yield from (f"{small} {name}" for name in flags if name not in RESULTS)
+    known = options(VERBS[verb_of(small)])
+    yield small + (" --scheduler local:1" if "--scheduler" in known else "")
+    yield from (f"{small} {name}" for name, is_flag in known.items() if is_flag and name not in RESULTS)
 
 
 class Watched(io.StringIO):
