@@ -208,7 +208,7 @@ def test_many_slices_are_drawn_by_a_process_as_they_are_here(tmp_path: Path, mon
     for figure in figures:
         keep(figure, tmp_path / "data")
     with monkeypatch.context() as patch:
-        patch.setattr(studio, "FEW", 1)
+        patch.setattr(studio, "MAX_DRAWN_HERE", 1)
         patch.setattr(runtime, "cores", lambda: 2)
         patch.setattr(studio, "draw_slice", lambda source, folder: pytest.fail("it is drawn here"))
         build_site(figures, tmp_path / "data", tmp_path / "many")
