@@ -20,7 +20,7 @@ from .command import Said
 from .faults import FAULTS, Killed, damage
 from .kinds import KINDS, before, copy, files, missing, numbers, printed, say, undisturbed, wrong
 
-pytestmark = pytest.mark.e2e
+pytestmark = [pytest.mark.e2e, pytest.mark.nightly]  # cases are drawn at random, and take seconds each
 
 QUICK = ("slice", "run", "pairs")  # kinds of the default lane
 FULL = re.compile(r"no space|no room|disk is full|of disk, and .* free here", re.IGNORECASE)
