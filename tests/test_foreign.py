@@ -74,10 +74,10 @@ def test_a_class_in_a_file_is_sliced_measured_searched_and_shown(run: Callable[.
     found = run("optimize", "arm.py:TwoLinkArm", "--method", "descents", "--budget", "9", "--out", "run", cwd=folder)
     assert found.returncode == 0, found.stderr
     for command in (
-        ["report", "cut", "--env", "arm.py:TwoLinkArm", "--points", "6", "--out", "told"],
+        ["report", "cut", "--env", "arm.py:TwoLinkArm", "--points-per-axis", "6", "--out", "told"],
         ["overlay", "cut", "run", "--env", "arm.py:TwoLinkArm", "--through", "best", "--out", "over"],
         ["check", "arm.py:TwoLinkArm", "--points", "2"],
-        ["plan", "arm.py:TwoLinkArm", "--resolution", "4"],
+        ["plan", "slice", "arm.py:TwoLinkArm", "--dims", "0", "1", "--resolution", "4"],
         ["race", "arm.py:TwoLinkArm", "--methods", "random", "--seeds", "1", "--budget", "3", "--out", "raced"],
         ["pairs", "arm.py:TwoLinkArm", "--samples", "2", "--out", "paired"],
     ):
@@ -159,7 +159,7 @@ def test_a_program_registers_a_class_and_the_command_finds_it(run: Callable[...,
     assert isinstance(gs.make("spring"), Spring)
     done = run("slice", "spring", "--dims", "0", "--resolution", "4", "--out", "cut", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    report = run("report", "cut", "--points", "2", "--out", "told", cwd=tmp_path)
+    report = run("report", "cut", "--points-per-axis", "2", "--out", "told", cwd=tmp_path)
     assert report.returncode == 0, report.stderr
     gs.register(Spring)  # again, as a cell of a notebook does
     with pytest.raises(ValueError, match="an environment called 'fluid' exists already"):

@@ -46,8 +46,8 @@ WRITING = {  # the command, the file for which there is no room any more, what i
     "report": ("report cut --points-per-axis 2 --out made", "report.json", "0 of 1 reports are kept in"),
     "overlay": ("overlay cut run --out made", "overlay.png", "each file in made is whole"),
     "compare": ("compare cut branin --out made", "compare.json", "each file in made is whole"),
-    "surface": ("surface cut --out made", "surface.png", ANEW),
-    "replay": ("replay bounce --no-film --out made", "episode.json", ANEW),
+    "surface": ("surface cut --out made", "surface.png", "each file in made is whole"),
+    "replay": ("replay bounce --no-film --out made", "episode.json", "each file in made is whole"),
     "export": ("export cut --out made.csv", "made.csv", ANEW),
     "gallery": (
         "gallery compute --only bounce-y --part slices --fidelity draft --resolution 4 --device cpu --data made",
