@@ -297,12 +297,14 @@ def _json(path: Path) -> Numbers:
 
 
 def plain(value: Any) -> Any:
-    """Return a JSON value without what differs every time."""
+    """Return a JSON value without what differs every time; a number is the same as 1 and as 1.0."""
     if isinstance(value, dict):
         return {name: plain(inner) for name, inner in value.items() if name not in VOLATILE}
     if isinstance(value, list):
         return [plain(inner) for inner in value]
-    return None if isinstance(value, float) and math.isnan(value) else value
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        return None if math.isnan(value) else float(value)
+    return value
 
 
 def _table(path: Path) -> Numbers:

@@ -174,6 +174,7 @@ def test_bounce_counts_the_bounces_it_marks(run: Callable[..., Said], tmp_path: 
     assert (tmp_path / "b/landscape.png").exists()
 
 
+@pytest.mark.slow
 @needs_taichi
 def test_bench_prints_rates_ratios_and_memory_as_json(run: Callable[..., Said], tmp_path: Path) -> None:
     command = ["bench", "swing-velocity", "--second-engine", "taichi", "--batch", "2", "--seconds", "0"]

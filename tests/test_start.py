@@ -19,6 +19,8 @@ from gradscape.cli import verbs
 
 from .command import modules
 
+pytestmark = pytest.mark.e2e
+
 PROJECT = tomllib.loads((Path(__file__).parent.parent / "pyproject.toml").read_text())["project"]
 TOLD = {"cyclopts", "rich"}  # a command's words, and its tables
 SLICED = TOLD | {"numpy", "torch", "jaxtyping", "xarray", "pandas", "pyarrow", "zarr", "scipy", "matplotlib", "cattrs"}

@@ -119,6 +119,7 @@ LONG += ["--json", "--out", "run"]
 search = partial(landscape, *LONG)
 
 
+@pytest.mark.e2e
 def test_sigkill_at_several_moments_changes_no_bit(run: Callable[..., Said], tmp_path: Path) -> None:
     for name in ("whole", "killed"):
         (tmp_path / name).mkdir()

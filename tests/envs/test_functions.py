@@ -75,6 +75,7 @@ def noisy(p: jax.Array, key: jax.Array) -> jax.Array:
     return jnp.sum((p + 0.1 * jax.random.normal(key, (2,))) ** 2)
 
 
+@pytest.mark.slow
 def test_a_function_of_a_key_gets_the_same_one_everywhere_and_knows_its_noise() -> None:
     one, many = gs.from_jax(noisy, SPACE), gs.from_jax(noisy, SPACE, seeds=16)
     again = one.evaluate(X[[0, 1, 0]]).loss

@@ -206,6 +206,7 @@ def test_a_better_run_is_preferred_to_the_gallery_s(small: Path, monkeypatch: py
         assert torch.equal(point_of(env, "best"), expected)
 
 
+@pytest.mark.slow
 def test_median_runs_are_laid_over_the_slice_through_the_best_point(
     small: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

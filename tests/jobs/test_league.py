@@ -56,6 +56,7 @@ def rows(league: League) -> list[dict[str, Any]]:
     return [{name: value for name, value in row.items() if name != "command"} for row in to_json(league)["rows"]]
 
 
+@pytest.mark.slow
 def test_a_league_has_the_races_that_each_scene_has_alone(tmp_path: Path) -> None:
     league = job(tmp_path / "league", "branin", "beale").run()
     assert [scene.env for scene in league.scenes] == ["branin", "beale"]
@@ -100,6 +101,7 @@ def test_over_all_scenes_a_method_has_the_mean_of_its_mean_ranks(tmp_path: Path)
     assert [one.rank for one in league.overall] == sorted(one.rank for one in league.overall)
 
 
+@pytest.mark.e2e
 def test_a_league_that_is_stopped_goes_on_scene_by_scene(tmp_path: Path) -> None:
     whole = job(tmp_path / "whole", "branin", "beale").run()
     with pytest.raises(Stopped, match=r"72 of 144 episodes are kept"):

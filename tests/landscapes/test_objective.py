@@ -89,6 +89,7 @@ def test_differences_over_long_steps_are_there_where_both_ends_are():
     np.testing.assert_allclose(found["cosine"].where(np.isfinite(found["cosine"]), 1.0), 1.0, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_pairs_checks_and_trade_offs_ask_nothing_beyond(tmp_path):
     design = Design.sobol(SPACE, 4, seed=0)
     found = explore(Strict(), design, Checkpoint.open(tmp_path / "p", {}, what="pairs"))

@@ -52,6 +52,7 @@ def test_bo_evaluates_where_the_bound_of_all_it_knows_is_least_and_the_first_ten
         assert bound(found[:, None]) >= bound(grid[:, None]).max() - 1e-6
 
 
+@pytest.mark.slow
 def test_bo_comes_closer_to_branins_minimum_than_chance_does():
     branin = make("branin")
     gaps = [

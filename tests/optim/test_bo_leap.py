@@ -1,6 +1,7 @@
 import math
 
 import numpy as np
+import pytest
 
 from gradscape.envs.adapters import from_torch
 from gradscape.envs.registry import make
@@ -13,6 +14,7 @@ SPACE = ParameterSpace.box(("x", "y", "z"), -2.0, 4.0, "m")
 RIPPLES = from_torch(lambda x: ((x - 0.5) ** 2).sum(dim=1) + (4 * x).cos().sum(dim=1), SPACE)
 
 
+@pytest.mark.slow
 def test_branins_minimum_is_reached_to_a_thousandth_within_300_evaluations():
     branin = make("branin")
     runs = [search(branin, BOLeap(branin.space, seed=seed), budget=300, gradient_cost=2.0) for seed in range(5)]

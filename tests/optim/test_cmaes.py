@@ -97,6 +97,7 @@ def test_every_sample_is_inside_the_box_even_where_the_loss_falls_beyond_it() ->
     assert (np.abs(x) == 1.0).mean() < 0.05  # folded, not clamped to the border
 
 
+@pytest.mark.slow
 def test_it_begins_again_elsewhere_when_it_has_converged() -> None:
     two = torch.tensor([[0.5, 0.5, 0.5], [-0.5, -0.5, -0.5]], dtype=torch.float64)
     x = points(lambda x: torch.cdist(x, two).min(dim=1).values ** 2, budget=3000)
@@ -105,6 +106,7 @@ def test_it_begins_again_elsewhere_when_it_has_converged() -> None:
     assert len({tuple(row) for row in x}) == len(x)
 
 
+@pytest.mark.slow
 def test_a_flat_landscape_is_searched_all_over() -> None:
     x = points(lambda x: 0 * x.sum(dim=1), budget=1000)
     assert np.histogramdd(x, bins=3, range=[(-1, 1)] * 3)[0].min() > 0
@@ -132,6 +134,7 @@ def test_a_seed_decides_every_point_even_beside_other_searches() -> None:
     assert not np.array_equal(alone[0], alone[1])
 
 
+@pytest.mark.slow
 def test_a_restored_search_goes_on_bit_for_bit_past_restarts() -> None:
     one = CMAES(BOX, seed=2)
     for _ in range(150):

@@ -92,6 +92,7 @@ def played(optimizer, objective, proposals):
     return torch.cat([step(optimizer, objective) for _ in range(proposals)])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["ppo", "sac"])
 def test_it_learns_a_bandit_within_the_budget(method):
     losses = search(Bowl(), optimizer_class(method).on(Bowl(), seed=1), budget=300).dataset()["loss"].values
@@ -99,6 +100,7 @@ def test_it_learns_a_bandit_within_the_budget(method):
     assert losses[-60:].mean() < 0.6 * random
 
 
+@pytest.mark.slow
 def test_it_learns_to_use_what_it_sees():
     sighted, blind = (
         search(objective, PPO.on(objective, seed=0), budget=400).dataset()["loss"].values[-100:].mean()

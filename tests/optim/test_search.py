@@ -153,6 +153,7 @@ def searching(path: Path) -> None:
     filled(path, CMAES, budget=45)
 
 
+@pytest.mark.e2e
 def test_sigkill_at_any_instant_changes_no_bit(tmp_path: Path) -> None:
     instants = alone(partial(searching, tmp_path / "whole.zarr"), tmp_path).changes
     whole, found = run_at(tmp_path / "whole.zarr", budget=45).dataset().drop_vars("seconds"), []

@@ -155,6 +155,7 @@ def test_a_variant_that_fails_is_given_up_at_the_first_points_and_never_chosen(
     assert settings(found, 0) == optimum("draft")
 
 
+@pytest.mark.slow
 @pytest.mark.drawn
 def test_the_verb_prints_both_names_draws_and_goes_on_after_a_stop(
     run: Callable[..., Said], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -209,6 +210,7 @@ def test_where_the_limit_leaves_none_the_nearest_is_taken(tmp_path: Path) -> Non
     assert draft.shortfall == short[draft.variant] > 1
 
 
+@pytest.mark.slow
 def test_gradients_count_unless_the_motion_is_chaotic(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     finer = Trading.fidelities | {"draft": Fidelity("draft", dt=1 / 10, resolution=8)}
     monkeypatch.setattr(Trading, "fidelities", finer)
@@ -223,6 +225,7 @@ def test_gradients_count_unless_the_motion_is_chaotic(tmp_path: Path, monkeypatc
     assert loose.chaotic
 
 
+@pytest.mark.slow
 def test_an_option_that_makes_it_cheaper_is_told_but_not_chosen(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -167,6 +167,7 @@ def test_gradients_are_slopes_where_bodies_start_undeformed_and_where_they_yield
     assert float(error.max()) < 1e-4
 
 
+@pytest.mark.slow
 def test_gradients_hold_over_a_thousandth_of_the_box():
     """No jumps in contact or floor: what AD says at a point is what a searcher meets a step of 1e-3 away."""
     for kind in (Writer, Assembly):

@@ -61,6 +61,7 @@ def test_the_target_is_where_its_own_example_brings_the_cloth(cls, loss):
     assert result.status.tolist() == [Status.OK]  # though a distance has no slope at 0
 
 
+@pytest.mark.slow
 def test_losses_are_distances_between_the_ends_of_episodes(cls):
     envs = {loss: made(cls, loss) for loss in LOSSES}
     env = envs["mesh"]
@@ -121,6 +122,7 @@ def test_the_floor_lets_no_vertex_in(monkeypatch):
         assert (y.abs() < 1e-14).any()
 
 
+@pytest.mark.slow
 def test_a_cloth_whose_throw_changes_by_a_millionth_ends_a_little_elsewhere_since_contact_does_not_jump():
     """With the rule `start` more of them jump."""
     x = SwingVelocity.space.uniform(48, seed=5)
@@ -135,6 +137,7 @@ def test_a_cloth_whose_throw_changes_by_a_millionth_ends_a_little_elsewhere_sinc
     assert torn["start"] >= 2 * torn["end"] + 2
 
 
+@pytest.mark.slow
 def test_gradients_are_slopes_but_some_point_against_the_slope_over_two_decimetres_per_second(velocity):
     """The paper finds gradients that are noisy and often opposite to the slope; here one in six to four is."""
     x = velocity.space.uniform(32, seed=2)
@@ -158,6 +161,7 @@ def test_an_unstable_simulation_is_a_failure_and_no_error(cls):
     assert result.grad.isnan().all()
 
 
+@pytest.mark.slow
 def test_the_corners_of_the_box_can_be_simulated(cls):
     env = cls(fidelity="draft", device="cpu")
     rng = torch.Generator().manual_seed(0)

@@ -70,6 +70,7 @@ def maker(file: Path) -> str:
     return f"study {study} {scene}` measures it again" if study else "gallery compute --part "
 
 
+@pytest.mark.slow
 def test_a_site_is_built_or_refused_by_the_damaged_files_name(undrawn: None, data: Path, tmp_path: Path) -> None:
     kept = shutil.copytree(data, tmp_path / "data", ignore=shutil.ignore_patterns("runs.tmp", "line", "bare"))
     files = [

@@ -153,6 +153,7 @@ def test_no_more_is_evaluated_than_is_announced() -> None:
     assert effort(2, 3)[0] < counts[False] <= effort(2, 3, (10, 10))[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dims", [(0, 1), (0,)])
 @pytest.mark.drawn
 def test_the_picture_of_gradient_quality_is_written(tmp_path: Path, dims: tuple[int, ...]) -> None:

@@ -61,6 +61,7 @@ def alone(tmp_path):
     return store
 
 
+@pytest.mark.e2e
 def test_processes_write_the_bits_of_one_and_progress_counts_every_tile(tmp_path, alone, processes):
     store, seen = store_at(tmp_path / "s.zarr"), []
     sample(from_torch(wave, SPACE), PLANE, store, batch=40, executor=processes, progress=seen.append)
@@ -138,6 +139,7 @@ def test_a_function_of_a_notebook_travels(tmp_path, alone, processes):
     assert same(store, alone)
 
 
+@pytest.mark.slow
 def test_an_error_in_a_worker_comes_back_and_what_was_done_is_kept(tmp_path, alone, processes):
     store = store_at(tmp_path / "s.zarr")
     with pytest.raises(RuntimeError, match="broken cable"):

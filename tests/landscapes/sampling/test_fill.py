@@ -110,6 +110,7 @@ def sampling(path: Path) -> None:
     sample(Wave(), PLANE, store_at(path))
 
 
+@pytest.mark.e2e
 def test_sigkill_at_any_instant_changes_no_bit(tmp_path):
     undisturbed, found = tmp_path / "undisturbed.zarr", []
     instants, whole = alone(partial(sampling, undisturbed), tmp_path).changes, sample(Wave(), PLANE)

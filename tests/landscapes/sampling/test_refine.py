@@ -113,6 +113,7 @@ def test_samples_lie_where_the_loss_jumps() -> None:
     assert (np.nan_to_num(off(dataset, jumping, 129)) > 0.02).mean() < 0.001
 
 
+@pytest.mark.slow
 def test_a_thin_ridge_is_undersampled_at_32_and_resolved_by_refinement() -> None:
     objective = from_torch(ridged, SPACE)
     coarse = find_undersampled(objective, sample(objective, plane(32)))

@@ -31,6 +31,7 @@ def test_a_part_of_another_study_is_damaged_and_computed_again(tmp_path: Path) -
         assert study(tmp_path / "0", 0).load("one") is None
 
 
+@pytest.mark.slow
 def test_a_limit_is_not_moved_by_a_piece_of_another_seed(tmp_path: Path) -> None:
     how = {"points": 2, "settings": ["dt"], "precisions": ["float64"], "device": "cpu", "fidelity": "draft"}
     found = [gs.study("extremes", "bounce", **how, seed=seed, out=tmp_path / str(seed)) for seed in (0, 1)]

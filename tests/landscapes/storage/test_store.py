@@ -224,6 +224,7 @@ def finishing(path):
     store.finish(store.dataset())
 
 
+@pytest.mark.e2e
 def test_a_kill_at_any_instant_of_finishing_leaves_a_slice_whole(tmp_path):
     """Kill as the tiles are copied, as the copy takes its place, and in the middle of the tiles' removal."""
     whole = fill(SliceStore.in_memory(PLANE, SPACE, identity=IDENTITY)).dataset()

@@ -86,6 +86,7 @@ def assert_close(got, wanted):
     torch.testing.assert_close(got, wanted, rtol=0, atol=2e-5 * float(wanted.abs().max()))
 
 
+@pytest.mark.slow
 def test_warps_scatter_momentum_and_mass(scattering):
     """In stretches of any length they give the same bits."""
     s = scattering

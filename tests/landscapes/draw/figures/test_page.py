@@ -54,6 +54,8 @@ from .test_curve import table
 from .test_race import race
 from .test_sweep import SWEEP
 
+pytestmark = pytest.mark.slow
+
 INCH, WIDTHS = 25.4, (85.0, 170.0)
 COMMAND = "landscape slice bowl --dims speed lift --resolution 16 --fidelity standard --through example:somewhere"
 
@@ -267,6 +269,7 @@ def test_a_width_that_is_no_page_is_refused(width: float) -> None:
         landscape_figure(PLANE, width=width)
 
 
+@pytest.mark.slow
 def test_prints_are_named_by_their_width_and_those_there_are_drawn_anew(tmp_path: Path) -> None:
     drawn = []
 

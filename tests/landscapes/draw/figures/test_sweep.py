@@ -90,6 +90,7 @@ def test_nothing_moves_from_frame_to_frame_but_the_mark_at_the_value() -> None:
     assert [text.get_text() for text in bar.texts] == ["−1.00 m", "1.25 m", "c = 0.50 m"]
 
 
+@pytest.mark.slow
 def test_each_frame_of_both_films_is_the_picture_of_its_slice(films: tuple[Path, Path]) -> None:
     scales = Scales.of(SWEEP)
     wanted = [picture(frame_figure(SWEEP, number, scales), dpi=120).astype(float) for number in range(len(VALUES))]
