@@ -15,7 +15,7 @@ from ..command import needs_taichi
 from .numbers import moved, points_of
 from .scenes import SETTINGS, SHORT, TAICHI, assert_returns_stay
 
-pytestmark = needs_taichi
+pytestmark = [needs_taichi, pytest.mark.slow]
 
 
 @pytest.fixture(scope="module", params=TAICHI)

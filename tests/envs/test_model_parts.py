@@ -6,6 +6,7 @@ from torch import Tensor
 from gradscape.envs.registry import BUILTIN, environment_class, make
 
 
+@pytest.mark.slow
 def test_the_parts_of_a_scene_have_names_and_options_of_their_own_that_it_takes() -> None:
     for scene in (entry.name for entry in BUILTIN):
         parts = environment_class(scene).model_parts

@@ -29,6 +29,7 @@ class Hole(Objective):
         return Evaluation.from_results(loss, 2 * (x - 0.5) if grad else None)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", [BO, BODescents, BOLeap])
 def test_the_process_sees_the_loss_of_every_point(method):
     optimizer = method(SPACE, seed=2)

@@ -195,6 +195,7 @@ def test_only_sacs_warm_up_is_called_random(small):
     assert optimizer.ask().kind is Kind.POLICY
 
 
+@pytest.mark.slow
 def test_failed_episodes_teach_it_to_stay_away():
     losses = search(Fragile(), PPO.on(Fragile(), seed=0), budget=400).dataset()["loss"].values
     assert np.isnan(losses[:60]).mean() > 0.3

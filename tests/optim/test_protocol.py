@@ -53,6 +53,7 @@ def test_surrogates_are_told_the_same_points_first(name):
     torch.testing.assert_close(torch.stack(found[:6]), wanted, rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in methods() if name not in ELSEWHERE])
 def test_a_seed_decides_every_point_bit_for_bit_through_its_state_too(name):
     kind = optimizer_class(name)

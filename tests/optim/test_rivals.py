@@ -267,6 +267,7 @@ def test_the_covariance_of_slopes_and_the_likelihood_are_those_of_gpytorch():
         torch.testing.assert_close(one, two, rtol=1e-6, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_slopes_tell_the_process_more_than_losses_alone():
     def error(optimizer):
         _, losses = evaluated(BRANIN, optimizer, 25)

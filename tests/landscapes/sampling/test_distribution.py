@@ -82,6 +82,7 @@ class Raising(Objective):
         return Evaluation.from_results(x.sum(dim=1), slope, status, "RuntimeError: no" if bool(raised.any()) else "")
 
 
+@pytest.mark.slow
 def test_what_the_first_point_that_raised_said_comes_back_from_workers_and_stays(tmp_path, processes):
     store, here = (store_at(tmp_path / f"{name}.zarr") for name in ("workers", "here"))
     found, wanted = (

@@ -97,6 +97,7 @@ def test_warps_scatter_momentum_and_mass(scattering):
     assert_close(got, s.transfer(s.mass, s.mass[:, :, None] * s.v, s.A))
 
 
+@pytest.mark.slow
 def test_warps_scatter_adjoints_of_velocities(scattering):
     s, dt = scattering, 0.25
     adj_x, adj_C = s.v.flip(1), 0.01 * s.A
