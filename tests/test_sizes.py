@@ -5,13 +5,12 @@ import tracemalloc
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import Any, get_args
+from typing import get_args
 
 import pytest
 
 from gradscape.cli import verbs
 from gradscape.envs.registry import make
-from gradscape.jobs import plan
 from gradscape.landscapes.capacity import TooLargeError
 from gradscape.optim.memory import SearchSize, require_method
 from gradscape.optim.registry import methods, optimizer_class
@@ -22,45 +21,29 @@ pytestmark = pytest.mark.e2e
 
 HUGE = 10**15
 ROOM = 2 << 30  # bytes that a command may take beyond what it is loaded with
-COUNTS = {"seed", "top", "workers"}  # whole numbers that allocate nothing
-OF_A_GRID = [  # nor does one that is held to the points of a grid
-    (("slice",), "budget"),
-    (("census",), "gradients"),
-    (("plan",), "gradients"),
-]
-SUBJECTS = {"ENV": "ackley", "SLICE": "cut", "RUN": "run", "[SLICE|ENV]": "cut", "ENV|FIGURES.toml": "branin"}
-OF_A_RACE = [(("plan",), "seeds"), (("plan",), "budget")]  # those of a plan that are not of a slice
+COUNTS = {"--seed", "--top", "--workers", "--port"}  # whole numbers that allocate nothing
+OF_A_GRID = {("slice", "--budget"), ("census", "--gradients")}  # nor does one that is held to the points of a grid
+OF_A_GRID |= {("slice", "--gradients"), ("sweep", "--gradients"), ("study", "--grid")}
+SUBJECTS = {"env": "ackley", "SLICE": "cut", "RUNS": "run", "WHAT": "cut", "KIND": "extremes"}
 NEEDED = {"--dims": "0 1", "--over": "smoothing", "--method": "random", "--axis": "x", "--plane": "pca"}
 
 
 def sizes() -> list[list[str]]:
     """Return a command for every option that is a whole number without an end, and that alone is huge."""
     found = []
-    for words, command in verbs().items():
-        path = tuple(words.split())
-        needed = [word for one in command.params for word in _said(one, path)]
-        for one in command.params:
-            kind = one.type_descriptor.annotation
-            held = one.max is not None or one.name in COUNTS or (path, one.name) in OF_A_GRID
-            if int in (kind, *get_args(kind)) and not held:
-                of_a_race = (path, one.name) in OF_A_RACE
-                about = [*path, needed[0], "--methods", "random"] if of_a_race else [*path, *needed]
-                found.append([*about, one.opts[0], str(HUGE)])
-    return found
+    for words, verb in verbs().items():
+        needed = [word for one in verb.options for word in _said(one.names[0], words)]
+        for name in (one.names[0] for one in verb.options if int in (one.type, *get_args(one.type))):
+            if name not in COUNTS and (words, name) not in OF_A_GRID:
+                found.append([*words.split(), *needed, name, str(HUGE)])
+    return [*found, ["plan", *found[0]]]
 
 
-def is_answered(said: list[str]) -> bool:
-    """Return whether a command only foretells: a slice of any size, while a race is rehearsed in this machine."""
-    return said[0] == "plan" and "--methods" not in said
-
-
-def _said(parameter: Any, path: tuple[str, ...]) -> list[str]:
-    """Return what has to be said of a parameter; a study of fidelities needs a scene with several."""
-    name = parameter.opts[0]
+def _said(name: str, words: str) -> list[str]:
+    """Return what has to be said of an argument or an option; a study of extremes needs a scene with steps."""
     if name.startswith("-"):
         return [name, *NEEDED[name].split()] if name in NEEDED else []
-    subject = SUBJECTS.get(parameter.metavar, "")
-    return ["bounce" if path == ("study",) else subject] if subject else []
+    return ["bounce" if (words, name) == ("study", "env") else SUBJECTS[name]] if name in SUBJECTS else []
 
 
 def limited(*arguments: str) -> None:
@@ -83,23 +66,11 @@ def refused(done: Ended) -> bool:
     return done.returncode == 2 and len(done.stderr.splitlines()) == 1 and "would fit" in done.stderr
 
 
-@pytest.mark.parametrize("said", [said for said in sizes() if not is_answered(said)], ids=" ".join)
+@pytest.mark.parametrize("said", sizes(), ids=" ".join)
 def test_a_size_beyond_the_machine_is_refused_in_a_line(desk: Path, said: list[str]) -> None:
     done = alone(partial(limited, *said), desk)
     assert refused(done), done.stderr
     assert str(HUGE) in done.stderr
-
-
-@pytest.mark.parametrize("said", [said for said in sizes() if is_answered(said)], ids=" ".join)
-def test_a_plan_answers_at_any_size(desk: Path, said: list[str]) -> None:
-    done = alone(partial(small_rehearsal, *said), desk)
-    assert done.returncode == 0, done.stderr
-    assert f"{said[-2].strip('-')} {HUGE} takes" in done.stdout
-
-
-def small_rehearsal(*arguments: str) -> None:
-    plan.MOST_POINTS, plan.MOST_FRAMES = 8, plan.MORE
-    landscape(*arguments)
 
 
 @pytest.mark.parametrize("dim", ["1000000", "0", "-1"])

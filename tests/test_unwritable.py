@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +11,10 @@ import pytest
 
 from gradscape.envs.engines import runtime
 from gradscape.envs.mpm import targets
-from gradscape.jobs import margins
 from gradscape.landscapes.storage.files import moved_by
+from gradscape.studies import kept
+
+from .made_studies import fidelities
 
 pytestmark = pytest.mark.e2e
 
@@ -50,20 +53,9 @@ def test_other_folders_of_the_user_say_so_too(tmp_path: Path, monkeypatch: pytes
     monkeypatch.setattr(targets, "user_cache_path", lambda name: tmp_path / "file" / name)
     with pytest.raises(OSError, match=r"targets cannot be kept at .* XDG_CACHE_HOME"):
         targets.load_or_make("rope", "content", lambda: np.zeros(1))
-    monkeypatch.setattr(margins, "user_data_path", lambda name: tmp_path / "file" / name)
+    monkeypatch.setattr(kept, "user_data_path", lambda name: tmp_path / "file" / name)
     with pytest.raises(OSError, match=r"what was measured cannot be kept at .* XDG_DATA_HOME"):
-        margins.keep(Extremes())  # type: ignore[arg-type]
-
-
-class Extremes:
-    """As many as say something of the step."""
-
-    env = "rope"
-    limits = (type("Limit", (), {"knob": "dt"}),)
-    identity: dict[str, object] = {"settings": {}, "options": {}, "engine": "warp", "device": "cpu"}  # noqa: RUF012
-
-    def record(self) -> dict[str, object]:
-        return {}
+        kept.keep(replace(fidelities(), identity={"device": "cpu", "options": {}, "model_version": 1}))
 
 
 def test_a_full_disk_is_no_such_folder() -> None:

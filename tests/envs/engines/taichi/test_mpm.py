@@ -15,7 +15,7 @@ from gradscape.envs.engines.mpm.model import Body, Model
 from gradscape.envs.engines.taichi import mpm as taichi_mpm
 from gradscape.envs.engines.taichi.mpm import boundary_contact, kernels
 from gradscape.envs.engines.taichi.runtime import real, start
-from gradscape.envs.mpm import fluid, plasticine_model
+from gradscape.envs.mpm import fluid, plasticine
 from gradscape.envs.mpm.plasticine_scenes import RollingPin
 
 from ..bench import DT, IDENTITY, MASS, SCALE, VOLUME, MaterialBench, draw, rotations, vectors
@@ -41,7 +41,7 @@ def scene(**options):
 
 def rolling():
     """Return a coarse rolling-pin scene, and two paths of its pin."""
-    tiny = replace(RollingPin.fidelities["draft"], dt=plasticine_model.SPAN / 5, resolution=16, particles=100)
+    tiny = replace(RollingPin.fidelities["draft"], dt=plasticine.SPAN / 5, resolution=16, particles=100)
     environment = RollingPin(fidelity=replace(tiny, precision="float64"), device="cpu")
     x = torch.stack([environment.example("demonstration"), 2 * draw(environment.space.dim, seed=2)])
     return shortened(environment.model, environment.tools(x))
