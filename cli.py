@@ -7,20 +7,18 @@ import shlex
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, cached_property
 from importlib import import_module
 from inspect import Parameter as Slot
 from inspect import Signature, getdoc, signature
 from io import TextIOWrapper
-from typing import TYPE_CHECKING, Annotated, Any
+from pathlib import Path
+from typing import Annotated, Any
 
 from cyclopts import App, CycloptsError, Group, MissingArgumentError, Parameter
 
 from . import __version__
 from .commands.results import as_json, kind_of, shower
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 GROUPS = {  # of the help: heading -> verbs, each with the module of `api` that declares it
     "Look": {
@@ -54,6 +52,7 @@ GROUPS = {  # of the help: heading -> verbs, each with the module of `api` that 
         "gallery serve": "gallery",
     },
 }
+ABOUT = "See, measure and search the loss landscapes of differentiable simulators."
 GALLERY = "Compute the figures of the paper, and build a site that shows them offline."
 RENAMED = {  # verbs and options of earlier versions, and today's
     "tradeoff": "landscape study fidelity, model, convergence or mixed",
@@ -92,24 +91,21 @@ class Verb:
     function: Callable[..., Any]
     planned: bool = False
 
+    @cached_property
+    def displayed(self) -> dict[str, Slot]:
+        """The options of what shows its result, by name."""
+        slots = (slot for kind in _returned(self.function) for slot in _slots(shower(kind), (Slot.KEYWORD_ONLY,)))
+        return {slot.name: slot for slot in slots}
+
     @property
     def parameters(self) -> list[Slot]:
         """Its arguments and options: those of the function, then those of what shows its result, then --json."""
         own = _slots(self.function)
         if not _returned(self.function):
             return own
-        shown: dict[str, Slot] = {}
-        for kind in _returned(self.function):
-            shown |= {slot.name: slot for slot in _slots(shower(kind), (Slot.KEYWORD_ONLY,))}
         last = own.pop() if own and own[-1].kind is Slot.VAR_KEYWORD else None
-        whole = [*own, *shown.values(), Slot("json", Slot.KEYWORD_ONLY, default=False, annotation=JSON)]
+        whole = [*own, *self.displayed.values(), Slot("json", Slot.KEYWORD_ONLY, default=False, annotation=JSON)]
         return [*whole, last] if last else whole
-
-    @property
-    def displayed(self) -> set[str]:
-        """The names of the options of what shows its result."""
-        own = {slot.name for slot in _slots(self.function)}
-        return {slot.name for slot in self.parameters} - own - {"json"}
 
     def command(self) -> Callable[..., int]:
         """Return what the command line calls."""
@@ -154,7 +150,7 @@ class Verb:
         from .api.call import Call, calling
         from .commands.terminal import Bars, Console, command_line
 
-        shown = {name: named.pop(name) for name in self.displayed & set(named)}
+        shown = {name: named.pop(name) for name in self.displayed.keys() & named.keys()}
         as_object, results, code = named.pop("json", False), [], 0
         calls = _for_each_point(named)
         for one in calls if len(calls) > 1 else ():
@@ -211,7 +207,7 @@ def _slots(function: Callable[..., Any] | None, kinds: Sequence[Any] = ALL_KINDS
 
 
 def _hint(function: Callable[..., Any] | None, written: Any) -> Any:
-    """Return the type that stands for a parameter; what only type checkers know is no option of the command."""
+    """Return the type of a parameter from its annotation, Any where only type checkers know its name."""
     try:
         return eval(written, vars(import_module(str(function.__module__))))
     except NameError:
@@ -225,7 +221,7 @@ def _returned(function: Callable[..., Any]) -> list[str]:
 
 
 def _docstring(function: Callable[..., Any] | None) -> tuple[str, dict[str, str]]:
-    """Return a function's docstring without its parameters, and what it says of each of these."""
+    """Return the text of a docstring, and the help of each parameter by name."""
     said, _, listed = ((getdoc(function) or "") if function else "").partition("\n\nParameters\n----------\n")
     options, name = dict[str, str](), ""
     for line in listed.splitlines():
@@ -245,14 +241,8 @@ def _for_each_point(named: dict[str, Any]) -> list[dict[str, Any]]:
     points = split_points(named["through"])
     out = named.get("out")
     return [
-        named | {"through": point} | ({"out": folder_for(_path(out), point, points)} if out else {}) for point in points
+        named | {"through": point} | ({"out": folder_for(Path(out), point, points)} if out else {}) for point in points
     ]
-
-
-def _path(text: str) -> Path:
-    from pathlib import Path
-
-    return Path(text)
 
 
 @cache
@@ -277,7 +267,6 @@ def make_app(only: Sequence[str] = (), *, planned: bool = False) -> App:
     app = App(
         name="landscape", help=ABOUT, version=f"gradscape {__version__}", suppress_keyboard_interrupt=False, **look
     )
-    app.suppress_keyboard_interrupt = False
     gallery = App(name="gallery", help=GALLERY, group=panels["Publish"], **look)
     for heading, group in GROUPS.items():
         for words in group:
@@ -290,9 +279,6 @@ def make_app(only: Sequence[str] = (), *, planned: bool = False) -> App:
     if not only or any(words.startswith("gallery ") for words in only):
         app.command(gallery)
     return app
-
-
-ABOUT = "See, measure and search the loss landscapes of differentiable simulators."
 
 
 def main(arguments: list[str] | None = None) -> Any:

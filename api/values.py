@@ -6,6 +6,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from ..landscapes.plain import read_share
+
 
 def as_names(given: str | Sequence[str] | None) -> list[str]:
     """Return names that are given as a,b or several times."""
@@ -17,9 +19,8 @@ def as_share(given: float | str | None, option: str) -> float | None:
     """Return a share that is given as 1% or 0.01. Raises ValueError where it is neither."""
     if given is None or not isinstance(given, str):
         return given
-    text = given.strip()
     try:
-        return float(text.removesuffix("%")) / (100 if text.endswith("%") else 1)
+        return read_share(given)
     except ValueError:
         raise ValueError(f"{option} takes a share such as 1% or 0.01; got {given!r}") from None
 

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 
 def show(found: Card, console: Console) -> None:
-    """Print how each engine comes off in each scene."""
+    """Print a row for each engine in each scene: its outcome and its first finding."""
     shown = table("scene", "engine", "", "finding")
     for one in found.grades:
         count = "" if one.outcome == "not installed" else f" {sum(one.counts.values()) - one.counts.get('skip', 0)}"

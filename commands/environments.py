@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
 
 from .terminal import Console, table
 
@@ -39,7 +40,7 @@ def show_environment(env: Environment, console: Console) -> None:
     from ..landscapes.space import LOG10
     from ..studies.kept import describe_margins
 
-    console = Console(soft_wrap=True, highlight=False)
+    console.soft_wrap = True
     about = env.about() or "It says nothing of itself: its class has no docstring."
     console.print(f"{env.name}: {env.space.dim} parameter{'s' if env.space.dim > 1 else ''}\n\n{about}\n")
     bounded = table("no.", "parameter", "lower", "upper", "unit")
@@ -61,6 +62,33 @@ def show_environment(env: Environment, console: Console) -> None:
         console.print(f"the paper says: {words}")
 
 
+def describe_environment(env: Environment) -> dict[str, Any]:
+    """Return an environment as plain JSON: its parameters with bounds, and what it can be simulated with."""
+    space = env.space
+    lower, upper = (space.to_values(end).tolist() for end in (space.lower, space.upper))
+    columns = (space.names, space.scales, lower, upper, space.units)
+    return {
+        "name": env.name,
+        "about": env.about(),
+        "parameters": [
+            dict(zip(("name", "scale", "lower", "upper", "unit"), row, strict=True))
+            for row in zip(*columns, strict=True)
+        ],
+        "fidelities": [fidelity.record() for fidelity in env.fidelities.values()],
+        "engines": list(env.engines),
+        "options": asdict(env.options),
+        "examples": list(env.examples),
+    }
+
+
+def describe_method(kind: type[Optimizer]) -> dict[str, Any]:
+    """Return a method as plain JSON: what it does, and its options with their defaults."""
+    from ..optim.registry import find_method
+
+    about = {"name": kind.name, "summary": find_method(kind.name).summary, "gradients": kind.needs_grad}
+    return {**about, "options": asdict(kind.Options())}
+
+
 def show_methods(found: list[Method], console: Console) -> None:
     """Print every method as a row of a table."""
     shown = table("name", "what it does", "needs", title="methods")
@@ -79,7 +107,8 @@ def show_method(kind: type[Optimizer], console: Console) -> None:
 
     texts = [find_method(kind.name).summary, inspect.getdoc(kind) or ""]
     texts += [f"gradients: {'yes' if kind.needs_grad else 'no'}", in_full(kind.Options)]
-    Console(soft_wrap=True, highlight=False).print(f"{kind.name}: " + "\n\n".join(texts))
+    console.soft_wrap = True
+    console.print(f"{kind.name}: " + "\n\n".join(texts))
 
 
 def show_info(found: Info, console: Console) -> None:

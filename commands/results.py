@@ -32,12 +32,20 @@ SHOWN = {
 }
 
 
+RECORDED = {  # the same of types that are no records: what makes plain JSON of them
+    "Environment": "environments:describe_environment",
+    "type[Optimizer]": "environments:describe_method",
+}
+
+
 def shower(kind: str) -> Callable[..., int | None] | None:
     """Return what shows results of a type, None where its files say it all."""
-    if kind not in SHOWN:
-        return None
-    module, _, name = SHOWN[kind].partition(":")
-    found: Callable[..., int | None] = getattr(import_module(f".{module}", __package__), name)
+    return _find(SHOWN[kind]) if kind in SHOWN else None
+
+
+def _find(place: str) -> Callable[..., Any]:
+    module, _, name = place.partition(":")
+    found: Callable[..., Any] = getattr(import_module(f".{module}", __package__), name)
     return found
 
 
@@ -61,6 +69,10 @@ def as_json(result: Any, folder: Path | None) -> Any:
     if folder is not None and summary is not None:
         found = read_json(folder / summary)
         return {key: value for key, value in found.items() if key not in ("curves", "ecdf")} | {"folder": str(folder)}
+    if isinstance(result, Path):
+        return {"path": str(result)}
+    if (kind := kind_of(result)) in RECORDED:
+        return _find(RECORDED[kind])(result)
     found = to_json(getattr(result, "summary", result))
     if not isinstance(found, dict):
         return found

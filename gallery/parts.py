@@ -467,7 +467,7 @@ class ReportPart(FigurePart):
         return estimate_seconds(self.scene().make(), *effort(rank, REPORT_POINTS, shape))
 
     def make(self, watch: Watch) -> str:
-        """Measure the slice, in the place of a report of another one."""
+        """Measure the slice, and replace a report of another one."""
         from ..landscapes.draw.film import lighten
 
         for name in (REPORT, MEASURES, QUALITY, QUALITY_ARRAYS):

@@ -27,8 +27,8 @@ from ..landscapes.storage.records import read_json, reading
 from ..landscapes.storage.store import open_slice
 from .folder import COMPARISON, SLICE_STORE, folder_named
 from .job import Job
-from .slice import SliceJob, identity_of
-from .watch import Watch
+from .slice import SliceJob, identity_of, slice_work
+from .watch import Watch, Work
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -87,6 +87,12 @@ class CompareJob(Job[SliceComparison]):
         return cls(
             slice=slice, other=other, identity=identity, folder=folder, command=command, force=force, prints=prints
         )
+
+    def work(self) -> list[Work]:
+        """Return the second slice, if there is none."""
+        if isinstance(self.other, Slice):
+            return []
+        return [slice_work(self.other, self.slice.plane.resolution, int("grad" in self.slice.data))]
 
     def compute(self, watch: Watch) -> SliceComparison:
         """Sample the second slice, if there is none, and compare them."""

@@ -23,8 +23,8 @@ from ..landscapes.verification import RESAMPLE, verify_dataset
 from .folder import OVERLAY, ROOT, SLICE_STORE, folder_named, run_tables
 from .job import Job
 from .scene import environment_of, named_point
-from .slice import SliceJob
-from .watch import PREPARING, Watch
+from .slice import SliceJob, slice_work
+from .watch import PREPARING, Watch, Work
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -62,13 +62,17 @@ class PlaneSpec:
             return None
         return cls(through, plane is not None, resolution)
 
+    def shape(self, present: Plane) -> tuple[int, ...]:
+        """Return how many points the new slice has along each axis."""
+        return (self.resolution,) * present.rank if self.resolution else present.resolution
+
     def make(self, present: Plane, tables: Sequence[xr.Dataset], objective: Objective) -> Plane:
         """Return the plane of the new slice: parallel to the one that is present, or the runs' principal one.
 
         Raises ValueError where there is no such point of the objective to go through, and where the run it goes through
         searched another number of parameters.
         """
-        shape = (self.resolution,) * present.rank if self.resolution else present.resolution
+        shape = self.shape(present)
         point = None
         if self.through:
             point = self._point(self.through, tables, objective)
@@ -175,6 +179,13 @@ class OverlayJob(Job[Overlay]):
         folder = out or overlay_folder(slice.data, runs, plane)
         OVERLAY.check(folder, allowed=[file for file in visible_files(folder) if slice_exists(file / SLICE_STORE)])
         return cls(slice=slice, runs=runs, folder=folder, command=command, plane=plane, device=device, prints=prints)
+
+    def work(self) -> list[Work]:
+        """Return the new slice, if there is to be one."""
+        if self.plane is None:
+            return []
+        shape = self.plane.shape(plane_of(self.slice.data))
+        return [slice_work(self._objective(), shape, int("grad" in self.slice.data))]
 
     def compute(self, watch: Watch) -> Overlay:
         """Sample the new slice, if there is to be one, lay the runs over it and draw them.

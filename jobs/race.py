@@ -228,8 +228,8 @@ class RaceJob(Job[Race]):
             whole = left[0] * alone.forward + (left[1] * alone.gradient if grad else 0.0)
             by = workers_of(self.executor)
             return alone, f"{duration(whole)} one by one, by {by} workers, and what the methods take"
-        abreast = sum(self._count_left(one) > 0 for one in self.competitors)
-        seconds = lockstep_seconds(self.env, left, abreast)
+        concurrent = sum(self._count_left(one) > 0 for one in self.competitors)
+        seconds = lockstep_seconds(self.env, left, concurrent)
         return episode_cost(self.env, grad=grad), f"{duration(seconds)} to simulate, and what the methods take"
 
     def _count_left(self, one: Competitor) -> int:

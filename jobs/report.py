@@ -76,11 +76,12 @@ def sample_subject(env: Environment, points: int, command: str, watch: Watch) ->
     Raises TooLargeError for more points than a report has memory for, and as `SliceJob.run` does.
     """
     from .scene import plane_through
-    from .slice import SliceJob
+    from .slice import SliceJob, slice_work
 
     dims = list(range(min(2, env.space.dim)))
     refuse_too_many(points, len(dims), env.space.dim)
     plane = plane_through(env, dims, through="center", extent=None, resolution=RESOLUTION)
+    watch.plan([slice_work(env, plane.resolution, 1), report_work(env, plane.resolution, points)])
     job = SliceJob.of(env, plane, command=command)
     job.run(watch)
     return ReportedSlice.of(job.folder)
@@ -222,13 +223,20 @@ class ReportJob:
         watch.note(f"{report.folder}: {', '.join(printed)}")
 
 
+def report_work(env: Environment, shape: tuple[int, ...], points: int) -> Work:
+    """Return what measuring a slice evaluates at most, its growth with the horizon included, of shorter episodes."""
+    from ..landscapes.measures.profile import effort
+
+    losses, gradients = effort(len(shape), points, shape)
+    return Work(env, losses, gradients + growth.effort(env))
+
+
 def measure(env: Environment, dataset: xr.Dataset, points: int, seed: int, watch: Watch) -> Profile:
     """Announce what measuring a slice of an environment costs, and measure it."""
     from ..landscapes.measures.profile import PRECISION, effort, measure_profile
 
-    losses, gradients = effort(dataset["loss"].ndim, points, dataset["loss"].shape)
-    total = losses + gradients
-    watch.plan([Work(env, losses, gradients + growth.effort(env))])
+    total = sum(effort(dataset["loss"].ndim, points, dataset["loss"].shape))
+    watch.plan([report_work(env, dataset["loss"].shape, points)])
     _announce(env, dataset, points, watch)
     objective = BoxedObjective(env) if stored_identity(dataset).get("boxed") else env
     with watch.progress(total) as advance:
@@ -273,11 +281,11 @@ def estimate_seconds(env: Environment, losses: int, gradients: int) -> float:
 def _announce(env: Environment, dataset: xr.Dataset, points: int, watch: Watch) -> None:
     """Say what a report takes: its episodes, and what is measured of the slice itself."""
     from ..landscapes.capacity import peak_memory
-    from ..landscapes.measures.profile import effort, need_of, own_cost
+    from ..landscapes.measures.profile import need_of, own_cost
 
     rank = dataset["loss"].ndim
-    losses, gradients = effort(rank, points, dataset["loss"].shape)
-    gradients += growth.effort(env)  # of shorter episodes most
+    work = report_work(env, dataset["loss"].shape, points)
+    losses, gradients = work.losses, work.gradients
     own_seconds, own_bytes = own_cost(dataset["loss"].size)
     with watch.busy(f"{env.name}: {PREPARING}"):
         seconds = estimate_seconds(env, losses, gradients)

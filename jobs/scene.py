@@ -15,7 +15,7 @@ from .. import __version__
 from ..envs.engines import installed_version
 from ..envs.registry import find_environment, make, registered_environment
 from ..landscapes.identity import MODEL_VERSION, PACKAGE, VERSIONS
-from ..landscapes.plain import digest, plain_json
+from ..landscapes.plain import digest, plain_json, read_share
 from ..landscapes.storage.files import moved_by
 from ..landscapes.storage.records import read_json, reading
 from .watch import Watch
@@ -375,7 +375,7 @@ def read_tolerance(given: object) -> float:
     """Return a share of the losses' spread given as 5% or 0.05. Raises ValueError where it is neither."""
     text = str(given).strip()
     try:
-        value = float(text.removesuffix("%")) / (100 if text.endswith("%") else 1)
+        value = read_share(text)
     except ValueError:
         value = -1.0
     if not 0 <= value <= 1:
@@ -387,13 +387,8 @@ def _candidates(env: Environment, options: Mapping[str, Any]) -> tuple[FidelityR
     """Return the study to choose from, its file, and its variants that solve the same problem on the engine."""
     from ..studies.kept import find_fidelity
 
-    measuring = [
-        "landscape",
-        "study",
-        "fidelity",
-        env.name,
-        *(f"--set={key}={value}" for key, value in options.items()),
-    ]
+    settings = (f"--set={key}={value}" for key, value in options.items())
+    measuring = ["landscape", "study", "fidelity", env.name, *settings]
     found = find_fidelity(env, env.device)
     if found is None:
         said = f"no fidelities of {env.name} with these options are measured"

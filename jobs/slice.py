@@ -122,6 +122,17 @@ class SliceCost:
         return replace(self, episodes=self.episodes - done, seconds=self.seconds * (1 - done / self.episodes))
 
 
+def slice_work(objective: Objective, shape: tuple[int, ...], every: int, *, between: bool = True) -> Work:
+    """Return what a slice evaluates: gradients at every so many samples along each axis, `every`, 0 for none.
+
+    Losses `between` its samples, which a single slice looks at, are at most so many.
+    """
+    points, having = math.prod(shape), count_gradients(shape, every)
+    need = need_of(shape, objective.space.dim, grad=every > 0)
+    losses = points - having + (probes(points, grad=every == 1) if between else 0)
+    return Work(objective, losses, having, need.disk, need.memory)
+
+
 @dataclass(frozen=True, kw_only=True)
 class SliceJob(Job[SliceSummary]):
     """A slice to sample, and how to draw it, here or by the workers of an `executor`, each with what `remake` returns.
@@ -226,11 +237,7 @@ class SliceJob(Job[SliceSummary]):
 
     def work(self) -> list[Work]:
         """Return its samples, and what looks between them."""
-        shape, grad = self.plane.resolution, self.store.grad
-        having = count_gradients(shape, self.store.every if grad else 0)
-        losses = math.prod(shape) - having + probes(math.prod(shape), grad=grad and self.store.every == 1)
-        need = need_of(shape, self.plane.dim, grad=grad)
-        return [Work(self.objective, losses, having, need.disk, need.memory)]
+        return [slice_work(self.objective, self.plane.resolution, self.store.every if self.store.grad else 0)]
 
     def cost(self) -> SliceCost:
         """Estimate what is left; workers that compute it do, which warms them, and leaves a GPU of theirs alone."""

@@ -21,7 +21,7 @@ from ..landscapes.capacity import BLOCK, Need, require, size
 from ..landscapes.convert import to_json
 from ..landscapes.cost import duration
 from ..landscapes.identity import with_stride
-from ..landscapes.lattice import check_gradients, count_gradients
+from ..landscapes.lattice import check_gradients
 from ..landscapes.objective import BoxedObjective, Objective, failed
 from ..landscapes.plain import plain_name
 from ..landscapes.sampling.fill import Progress, sample
@@ -32,7 +32,17 @@ from ..landscapes.storage.store import SliceStore
 from .folder import ROOT, SWEEP, folder_named
 from .job import Job
 from .scene import provenance
-from .slice import MAX_NAME_LETTERS, SliceCost, count_statuses, estimate_cost, flat_points, kind_of, range_of, say_range
+from .slice import (
+    MAX_NAME_LETTERS,
+    SliceCost,
+    count_statuses,
+    estimate_cost,
+    flat_points,
+    kind_of,
+    range_of,
+    say_range,
+    slice_work,
+)
 from .watch import PREPARING, Advance, Watch, Work
 from .workers import recipe
 
@@ -198,10 +208,8 @@ class SweepJob(Job[SweepSummary]):
     def work(self) -> Iterator[Work]:
         """Return the samples of each slice."""
         for number, (store, plane) in enumerate(zip(self.stores, self.motion.planes, strict=True)):
-            having = count_gradients(plane.resolution, store.every if store.grad else 0)
-            need = slice_need(plane.resolution, plane.dim, grad=store.grad)
-            env = self.motion.env_at(number)
-            yield Work(env, math.prod(plane.resolution) - having, having, need.disk, need.memory)
+            every = store.every if store.grad else 0
+            yield slice_work(self.motion.env_at(number), plane.resolution, every, between=False)
 
     def compute(self, watch: Watch) -> SweepSummary:
         """Sample what is missing, film it and return the summary."""
@@ -414,8 +422,6 @@ def refuse_too_large(plane: Plane, frames: int, folder: Path, *, grad: bool, ove
 
 def need_of(shape: tuple[int, ...], dim: int, frames: int, *, grad: bool, over: int | str) -> Need:
     """Return what sampling a sweep and filming it takes: every frame's slice is stored, of a smoothing's only one."""
-    from ..landscapes.storage.arrays import need_of as slice_need
-
     slices, samples = 1 if over == SMOOTHING else frames, math.prod(shape)
     array, one = samples * (9 + 8 * dim * grad), slice_need(shape, dim, grad=grad)
     memory = one.memory + slices * (STORE_MEMORY + array) + frames * 9.0 * samples

@@ -31,8 +31,8 @@ def jsonable(value: Any) -> Any:
     has a `record` is what that returns, any other dataclass its fields, and the properties that it names in `derived`.
     Raises TypeError for anything else that JSON does not know.
     """
-    if hasattr(value, "record"):
-        return jsonable(value.record())
+    if callable(record := getattr(value, "record", None)):
+        return jsonable(record())
     if is_dataclass(value):
         names = [*(one.name for one in fields(value) if one.metadata.get("json", True)), *getattr(value, "derived", ())]
         return {name: jsonable(getattr(value, name)) for name in names}
@@ -84,6 +84,12 @@ def number(value: Any) -> float:
 def optional(kind: Callable[[Any], Any], value: Any) -> Any:
     """Return what has to be of a kind, or None."""
     return None if value is None else kind(value)
+
+
+def read_share(text: str) -> float:
+    """Return a share that is given as 5% or 0.05. Raises ValueError where it is neither."""
+    text = text.strip()
+    return float(text.removesuffix("%")) / (100 if text.endswith("%") else 1)
 
 
 def plain_name(text: str) -> str:

@@ -113,7 +113,7 @@ class FigureEntry:
 
     @classmethod
     def of(cls, figure: Figure, dataset: xr.Dataset, source: Path) -> FigureEntry:
-        """Return what is said of a slice without its other files."""
+        """Return the entry of a slice; its other files are added later."""
         identity, provenance = stored_identity(dataset), stored_provenance(dataset)
         device = identity.get("device", "auto")
         return cls(

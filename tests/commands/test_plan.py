@@ -58,6 +58,24 @@ def test_verbs_whose_episodes_depend_on_what_they_find_are_planned_too(
     done = run("plan", *words.split(), "--json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)["episodes"] > 10
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_samples_a_slice_first_is_planned_by_that_slice(run: Callable[..., Said], tmp_path: Path) -> None:
+    assert run("slice", "bounce", "--dims", "0", "1", "--resolution", "4", "--out", "cut", cwd=tmp_path).returncode == 0
+    search = ("optimize", "bounce", "--method", "random", "--budget", "3", "--out", "run")
+    assert run(*search, cwd=tmp_path).returncode == 0
+    before = sorted(tmp_path.rglob("*"))
+    for words, points in (
+        ("compare cut bounce --fidelity standard", 16),
+        ("overlay cut run --through best", 16),
+        ("overlay cut run --through best --resolution 6", 36),
+    ):
+        done = run("plan", *words.split(), "--json", cwd=tmp_path)
+        assert done.returncode == 0, done.stderr
+        assert json.loads(done.stdout)["gradients"] == points
+    assert "simulates nothing" in run("plan", "overlay", "cut", "run", cwd=tmp_path).stderr
+    assert sorted(tmp_path.rglob("*")) == before
 
 
 def test_a_plan_takes_as_many_episodes_as_the_slice(run: Callable[..., Said], tmp_path: Path) -> None:

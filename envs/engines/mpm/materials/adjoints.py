@@ -19,7 +19,7 @@ from ..stencil import adjoint_gatherers, layout
 
 
 class MaterialKernels(NamedTuple):
-    """What a material does: the kernel `update`, and functions of which the adjoint's kernel is made.
+    """What a material does: the kernel `update`, and the functions that make up its adjoint.
 
     `turn_back` makes of a particle's adjoint of A those of its state and C; `affine_momentum` computes A again;
     `strain` is what these two would both compute, if that is slow.

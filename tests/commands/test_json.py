@@ -1,0 +1,48 @@
+"""`--json`: one JSON value on standard output, of every verb that returns something, and nothing else there."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from gradscape.cli import verbs
+
+from ..command import Said, make
+
+PRINTED = """
+envs
+envs branin
+methods
+methods bo-leap
+info
+slice branin --resolution 4 --out more
+replay bounce --no-film --device cpu
+surface cut
+export cut --force
+compare cut cut
+plan slice branin --resolution 4
+check branin --points 2
+gallery list
+""".strip().splitlines()
+ELSEWHERE = {  # whose JSON other tests read
+    *("bench", "bounce", "card", "census", "gallery compute", "league", "optimize", "overlay"),
+    *("pairs", "race", "report", "study", "sweep"),
+}
+
+
+@pytest.fixture(scope="module")
+def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make(tmp_path_factory.mktemp("desk"), "slice branin --resolution 4 --out cut")
+
+
+@pytest.mark.parametrize("words", PRINTED)
+def test_what_is_printed_is_json(run: Callable[..., Said], desk: Path, words: str) -> None:
+    done = run(*words.split(), "--json", cwd=desk)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)
+
+
+def test_every_verb_with_the_option_is_tried() -> None:
+    having = {name for name, verb in verbs().items() if any("--json" in one.names for one in verb.options)}
+    assert {name for name in having if any(f"{line} ".startswith(f"{name} ") for line in PRINTED)} == having - ELSEWHERE
