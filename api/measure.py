@@ -53,12 +53,8 @@ def check(
 
     Parameters
     ----------
-    scene
-        The environment: a name that `landscape envs` lists, or FILE.py:NAME for a simulator in a file of your own.
     points
         Number of random points to check at.
-    seed
-        Random seed.
     """
     spec = spec_of(scene, keywords)
     from ..jobs.check import CheckJob
@@ -128,13 +124,9 @@ def pairs(
 
     Parameters
     ----------
-    scene
-        The environment: a name that `landscape envs` lists, or FILE.py:NAME for a simulator in a file of your own.
     samples
         Number of base points, of 1 + 5 x dim + 28 episodes each (fewer below 8 parameters). The default is 16, and down
         to 4 with many parameters.
-    seed
-        Random seed.
     """
     spec = spec_of(scene, keywords)
     from ..jobs.pairs import PairsJob
@@ -176,8 +168,6 @@ def census(
 
     Parameters
     ----------
-    scene
-        The environment: a name that `landscape envs` lists, or FILE.py:NAME for a simulator in a file of your own.
     slices
         Number of slices.
     resolution
@@ -189,8 +179,6 @@ def census(
         How slices are oriented: pairs of parameters, or random directions, both over the whole box.
     second_fidelity
         Repeat one slice per base point at this fidelity, to see its effect.
-    seed
-        Random seed.
     """
     spec = spec_of(scene, keywords)
     from dataclasses import replace
@@ -228,8 +216,6 @@ def bench(
 
     Parameters
     ----------
-    scene
-        The environment: a name that `landscape envs` lists, or FILE.py:NAME for a simulator in a file of your own.
     second_engine
         A second engine, timed in turn with the first.
     batch

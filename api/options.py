@@ -15,9 +15,9 @@ from cyclopts.validators import Number
 ARGUMENT = "argument"  # marks what stands on the command line without the name of an option
 
 
-def at_least(value: float, **more: Any) -> Parameter:
-    """Limit a number from below."""
-    return Parameter(validator=Number(gte=value, **more))
+def at_least(value: float, *, lte: float | None = None) -> Parameter:
+    """Limit a number from below, and from above by `lte`."""
+    return Parameter(validator=Number(gte=value, lte=lte))
 
 
 if TYPE_CHECKING:
@@ -47,14 +47,22 @@ else:
     Widths = list[float]
     Resolution = int
 
-Scene = Annotated[Any, ARGUMENT, Parameter(name="env")]
+Scene = Annotated[
+    Any,
+    ARGUMENT,
+    Parameter(
+        name="env",
+        help="The environment: a name that `landscape envs` lists, or FILE.py:NAME for a simulator in a file of your "
+        "own.",
+    ),
+]
 """What every function takes for a simulator: the name of a scene, FILE.py:NAME, an environment (`gs.from_torch` and
 its like make one of a function) or its class, a `SceneSpec`, or an object of one's own with `space` and `evaluate`."""
 
 Count = Annotated[int, at_least(1)]
 Budget = Annotated[int, at_least(1)]
 Side = Annotated[Resolution, at_least(2)]
-Seed = Annotated[int, at_least(0)]
+Seed = Annotated[int, at_least(0), Parameter(help="Random seed.")]
 Out = Annotated[str | Path | None, Parameter(help="Folder of the results; by default one named after them, in out/.")]
 Force = Annotated[bool, Parameter(help="Replace what is in the folder already.")]
 FigureWidth = Annotated[

@@ -36,8 +36,6 @@ def replay(
 
     Parameters
     ----------
-    scene
-        The environment: a name that `landscape envs` lists, or FILE.py:NAME for a simulator in a file of your own.
     params
         Parameters of the episode: center, random:SEED, example:NAME, best:RUN or a file of numbers.
     film

@@ -50,8 +50,6 @@ def report(
         Report on every figure of the gallery that is sampled.
     points_per_axis
         Number of points along each axis at which new evaluations test gradients.
-    seed
-        Random seed.
     """
     _refuse_words(what, all, keywords, env)
     from ..gallery.files import data_folder

@@ -76,14 +76,10 @@ def optimize(
 
     Parameters
     ----------
-    scene
-        The environment: a name that `landscape envs` lists, or FILE.py:NAME for a simulator in a file of your own.
     method
         Method to search with. `landscape methods` lists them.
     budget
         Number of episodes to evaluate. It is never exceeded.
-    seed
-        Random seed.
     method_options
         An option of the method, as name=value. It may be repeated.
     """
@@ -135,8 +131,6 @@ def race(
 
     Parameters
     ----------
-    scene
-        The environment: a name that `landscape envs` lists, or FILE.py:NAME for a simulator in a file of your own.
     methods
         Methods to race, a,b or repeated. The default is all that can run here; `landscape methods` lists them.
     budget

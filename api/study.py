@@ -62,12 +62,8 @@ def study(
     ----------
     kind
         Study to run: fidelity, convergence, model, mixed or extremes.
-    scene
-        The environment: a name that `landscape envs` lists, or FILE.py:NAME for a simulator in a file of your own.
     points
         Number of points at which every variant is measured. The default is 64, and 16 for extremes.
-    seed
-        Random seed.
     settings
         Settings to change, a,b or repeated. Of fidelity: dt, resolution, particles, precision, stiffness, engine,
         device. Of convergence: dt, resolution, particles, joint, precision. Of extremes: dt, resolution, box, horizon

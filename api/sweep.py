@@ -57,8 +57,6 @@ def sweep(
 
     Parameters
     ----------
-    scene
-        The environment: a name that `landscape envs` lists, or FILE.py:NAME for a simulator in a file of your own.
     dims
         One or two parameters to vary, by number or by name. An environment with at most two needs none.
     over
