@@ -40,7 +40,8 @@ if TYPE_CHECKING:
     Resolution: TypeAlias = int | Sequence[int]
     Parameter_: TypeAlias = int | str
 else:
-    Point = Points = Window = Share = FidelityName = Parameter_ = str
+    Point = Points = Share = FidelityName = Parameter_ = str
+    Window = Annotated[str, Parameter(allow_leading_hyphen=True)]  # -0.4:0.9
     Names = Settings = MethodSettings = list[str]
     Dims = Annotated[list[str], Parameter(consume_multiple=(1, 2))]
     Stride = int
