@@ -13,9 +13,9 @@ from inspect import Parameter as Slot
 from inspect import Signature, getdoc, signature
 from io import TextIOWrapper
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, get_args
 
-from cyclopts import App, CycloptsError, Group, MissingArgumentError, Parameter
+from cyclopts import App, CycloptsError, Group, MissingArgumentError, Parameter, UnusedCliTokensError, convert
 
 from . import __version__
 from .commands.results import as_json, kind_of, shower
@@ -68,7 +68,19 @@ STOPPED = 130  # the exit code of what Ctrl-C has ended
 LONG_PATH = 200  # characters of a path that an error shows
 DIMS = "--dims"
 JSON = Annotated[bool, Parameter(show_default=False, help="Print the result as one JSON object on standard output.")]
-WORDS = Parameter(negative_bool=(), negative_iterable=(), allow_repeating=True)
+
+
+def _read(hint: Any, words: Sequence[Any]) -> Any:
+    """Return the value of an option; a count such as 8.5 is refused, where Cyclopts would round it."""
+    for word in words if int in (hint, *get_args(hint)) else ():
+        try:
+            int(word.value)
+        except ValueError:
+            raise ValueError(f"not a whole number: {word.value}") from None
+    return convert(hint, words)
+
+
+WORDS = Parameter(negative_bool=(), negative_iterable=(), allow_repeating=True, converter=_read)
 
 
 @dataclass(frozen=True)
@@ -354,6 +366,8 @@ def _usage(error: CycloptsError) -> str:
     """Return what is wrong with a command's words, and where it is said what the command takes."""
     chain = " ".join(["landscape", *(error.command_chain or ())])
     said = " ".join(str(error).split()).rstrip(".")
+    if isinstance(error, UnusedCliTokensError):
+        said = f"unexpected: {shlex.join(error.unused_tokens or ())}"
     return f"{said} (`{chain} --help` says what it takes)"
 
 
