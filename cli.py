@@ -201,11 +201,12 @@ def _plan(function: Callable[..., Any], given: Sequence[Any], named: dict[str, A
 
 def _slots(function: Callable[..., Any] | None, kinds: Sequence[Any] = ALL_KINDS) -> list[Slot]:
     """Return a function's parameters for the command line: arguments are those that are marked, all else is options."""
+    from .api.call import hint_of
     from .api.options import ARGUMENT
 
     slots = []
     for slot in signature(function).parameters.values() if function else ():
-        hint, kind = _hint(function, slot.annotation), slot.kind
+        hint, kind = hint_of(function, slot.annotation), slot.kind
         if kind not in kinds or (kind is Slot.VAR_KEYWORD and hint is Any):
             continue  # of a plan: the words of another verb
         if slot.default is None or slot.default is False or slot.default == ():
@@ -216,14 +217,6 @@ def _slots(function: Callable[..., Any] | None, kinds: Sequence[Any] = ALL_KINDS
             kind = Slot.KEYWORD_ONLY
         slots.append(slot.replace(kind=kind, annotation=hint))
     return slots
-
-
-def _hint(function: Callable[..., Any] | None, written: Any) -> Any:
-    """Return the type of a parameter from its annotation, Any where only type checkers know its name."""
-    try:
-        return eval(written, vars(import_module(str(function.__module__))))
-    except NameError:
-        return Any
 
 
 def _returned(function: Callable[..., Any]) -> list[str]:

@@ -7,8 +7,13 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
 from functools import wraps
+from importlib import import_module
+from inspect import signature
 from pathlib import Path
-from typing import ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar, get_args
+
+from cyclopts import Parameter
+from cyclopts.validators import Number
 
 from ..jobs.watch import Watch
 
@@ -62,6 +67,7 @@ def verb(function: Callable[Given, Result]) -> Callable[Given, Result]:
     def call(*given: Given.args, **named: Given.kwargs) -> Result:
         if old := next((name for name in named if name in RENAMED), None):
             raise ValueError(f"{function.__name__} takes {RENAMED[old]}= today; got {old}=")
+        _check_numbers(function, given, named)
         if _CURRENT.get() is not None:
             return function(*given, **named)
         from .progress import default_watch
@@ -71,6 +77,33 @@ def verb(function: Callable[Given, Result]) -> Callable[Given, Result]:
             return function(*given, **named)
 
     return call
+
+
+def hint_of(function: Callable[..., object] | None, written: Any) -> Any:
+    """Return the type of a parameter from its annotation, Any where only type checkers know its name."""
+    try:
+        return eval(written, vars(import_module(str(function.__module__))))
+    except NameError:
+        return Any
+
+
+def _check_numbers(function: Callable[..., object], given: tuple[object, ...], named: dict[str, Any]) -> None:
+    """Raise ValueError for a number that is outside the limits in the function's signature, or that is not whole."""
+    slots = signature(function).parameters
+    for name, value in (dict(zip(slots, given, strict=False)) | named).items():
+        if name not in slots or isinstance(value, bool) or not isinstance(value, int | float):
+            continue
+        hint = hint_of(function, slots[name].annotation)
+        kinds = get_args(getattr(hint, "__origin__", hint)) or (getattr(hint, "__origin__", hint),)
+        if int in kinds and isinstance(value, float) and not value.is_integer():
+            raise ValueError(f"{function.__name__} takes a whole number as {name}; got {value}")
+        limits = (one for one in getattr(hint, "__metadata__", ()) if isinstance(one, Parameter))
+        for limit in (check for one in limits for check in one.validator if isinstance(check, Number)):
+            try:
+                limit(type(value), value)
+            except ValueError as error:
+                said = str(error).removeprefix("Must be ").rstrip(".")
+                raise ValueError(f"{function.__name__} takes {name} {said}; got {value}") from None
 
 
 def _written(value: object) -> str:

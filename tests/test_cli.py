@@ -105,6 +105,9 @@ BAD_INPUT = [
     ),
     (["slice", "branin", "--dims", "0", "1", "--through", "example:x"], "branin has no example 'x'"),
     (["slice", "branin", "--dims", "0", "1", "--window", "wide"], "got 'wide'"),
+    (["slice", "branin", "--window", "-15:wide"], "got '-15:wide'"),
+    (["slice", "branin", "--resolution", "8.5"], "--resolution: not a whole number: 8.5"),
+    (["slice", "branin", "extra"], "unexpected: extra"),
     (["slice", "branin", "--dims", "0", "1", "--set", "dim=3"], "branin has no option 'dim'"),
     (
         ["slice", "ackley", "--dims", "0", "1", "--set", "dim=two"],

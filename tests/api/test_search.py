@@ -87,9 +87,10 @@ def test_where_nothing_succeeded_there_is_no_best_and_it_is_said() -> None:
     ("wrong", "said"),
     [
         ({"method": "cma"}, "no method is called 'cma'; did you mean cma-es"),
-        ({"method": "random", "budget": 0}, "a budget is a whole number of at least 1; got 0"),
+        ({"method": "random", "budget": 0}, "optimize takes budget >= 1; got 0"),
         ({"method": "random", "method_options": {"sigma": 1}}, "random has no option 'sigma'"),
-        ({"method": "random", "seed": -1}, "the seed of random"),
+        ({"method": "random", "budget": 2.5}, "optimize takes a whole number as budget; got 2.5"),
+        ({"method": "random", "seed": -1}, "optimize takes seed >= 0; got -1"),
         ({"method": "random", "fidelity": "best"}, "has fidelities exact; got 'best'"),
     ],
 )
@@ -166,7 +167,7 @@ def test_a_race_tells_pairs_and_running_times(tmp_path: Path) -> None:
     ("wrong", "said"),
     [
         ({"methods": ["random", "magic"]}, "no method is called 'magic'"),
-        ({"methods": "random", "seeds": 0}, "a number of seeds is a whole number of at least 1"),
+        ({"methods": "random", "seeds": 0}, "race takes seeds >= 1; got 0"),
         ({"methods": "random", "workers": 0}, "a number of workers is a whole number of at least 1"),
     ],
 )
