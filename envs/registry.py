@@ -373,7 +373,8 @@ def _place_in_file(text: str) -> tuple[Path, str, str]:
 
 def _named(found: type[Environment] | Environment, attribute: str) -> type[Environment] | Environment:
     """Return a function that has no name of its own by what its file calls it."""
-    from .adapters import NAMELESS, FunctionEnvironment
+    from .adapters import FunctionEnvironment
+    from .user_functions import NAMELESS
 
     return found.named(attribute) if isinstance(found, FunctionEnvironment) and found.name == NAMELESS else found
 

@@ -261,7 +261,8 @@ class Open(Boundary):
 
     def function(self, name: str) -> tuple[Any, Any]:
         """Return the boundary's Warp function and its struct."""
-        return _open(name)
+        boundary, Data = _open(name)
+        return boundary, Data
 
 
 @dataclass(frozen=True)
@@ -286,7 +287,8 @@ class LadleInTank(Boundary):
 
     def function(self, name: str) -> tuple[Any, Any]:
         """Return the boundary's Warp function and its struct."""
-        return _ladle_in_tank(name)
+        boundary, Data = _ladle_in_tank(name)
+        return boundary, Data
 
 
 @cache
@@ -479,7 +481,8 @@ class ToolsInRoom(Boundary):
 
     def function(self, name: str) -> tuple[Any, Any]:
         """Return the boundary's Warp function and its struct."""
-        return _tools_in_room(name, len(self.tools))
+        boundary, Data = _tools_in_room(name, len(self.tools))
+        return boundary, Data
 
     def data(self, name: str, device: str) -> Any:
         """Return the function's data."""

@@ -33,7 +33,8 @@ class Frame:
     @cached_property
     def particles(self) -> Any:
         """x, v and C as kernels take them."""
-        found = particles(self.x.dtype._wp_scalar_type_.__name__)()
+        vec3: Any = self.x.dtype
+        found: Any = particles(vec3._wp_scalar_type_.__name__)()
         found.x, found.v, found.C = self.x, self.v, self.C
         return found
 
