@@ -1,163 +1,25 @@
-"""Functions of others as environments: what a user says of a function, and the environment that calls it."""
+"""Functions of others as environments, and their libraries: torch and NumPy here, JAX and Warp among the engines."""
 
 from __future__ import annotations
 
 import inspect
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields, make_dataclass, replace
-from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any, Literal, Protocol, TypedDict, Unpack, get_args
+from dataclasses import asdict, dataclass, replace
+from typing import TYPE_CHECKING, Any, Literal, Unpack, get_args
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..landscapes.identity import UNNAMED
 from ..landscapes.objective import Evaluation, SimulatorError, first_line
 from ..landscapes.space import ParameterSpace, as_tensor, as_whole
-from .base import Environment, Fidelity, check_shape
+from .base import Environment, check_shape
+from .user_functions import Backend, Compute, Function, FunctionKeywords
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
-
-NAMELESS = "function"  # what a lambda is called
-SAME_TIME = 0.01  # relative difference of what counts as the same time
-SEED_ARGUMENTS = ("key", "seed")  # of a function that draws random numbers
-FIDELITY_FIELDS = ("dt", "resolution", "sampling", "particles")  # that a function and a `Fidelity` call the same
-KINDS = (bool, int, float, str)  # of options
-
-
-class FunctionKeywords(TypedDict, total=False):
-    """The keywords that every `from_...` takes.
-
-    `name` is what the function is called, by default its own name, and `loss_unit` the unit of what it returns.
-    `maximize` looks for its greatest value: losses are its negative.
-
-    Keyword arguments of the function are its settings. `options` are those that a user sets, with their defaults; by
-    default all whose default is a number, a text or a truth value. `fidelities` names what decides how accurately it
-    simulates, the cheapest first and the most accurate last: {"draft": {"dt": 0.02}, "reference": {"dt": 0.001}}.
-    `horizon` names the keyword that says how long an episode is. What belongs together goes into the fidelities
-    together, such as the number of steps with the time step.
-
-    A function that takes a `key` (of JAX) or a `seed` gets the same one at every point: common random numbers. The
-    loss is the mean over `seeds` of them, and then it knows its standard error.
-    `precision`, float64 or float32, is what it is given its points in, at most `rows` of them in one call.
-    """
-
-    name: str
-    loss_unit: str
-    maximize: bool
-    options: Mapping[str, Any] | None
-    fidelities: Mapping[str, Mapping[str, Any]] | None
-    horizon: str | None
-    seeds: int
-    precision: str
-    rows: int
-
-
-Compute = Callable[[Float[Tensor, "batch dim"], bool], tuple[Tensor, Tensor | None, str]]
-"""Returns losses, gradients if asked for, and the type of numbers that the losses came in, at points."""
-
-
-class Backend(Protocol):
-    """A library that a function is written in, and how it is called and differentiated there."""
-
-    @property
-    def engine(self) -> str:
-        """What the library is called."""
-
-    @property
-    def devices(self) -> tuple[str, ...]:
-        """What it runs on."""
-
-    @property
-    def device(self) -> str:
-        """Where it runs by default: auto, cpu or cuda."""
-
-    def has_cuda(self) -> bool:
-        """Say whether it finds a CUDA device."""
-
-    def bind(self, call: Function, settings: Mapping[str, Any], precision: str, device: str) -> Compute:
-        """Return what computes the function with these keyword arguments."""
-
-
-@dataclass(eq=False)
-class Function:
-    """A function of points with what its user says of it, as `FunctionKeywords` has it.
-
-    Raises ValueError for what does not go together.
-    """
-
-    fn: Callable[..., Any]
-    space: ParameterSpace
-    backend: Backend
-    name: str = ""
-    loss_unit: str = ""
-    maximize: bool = False
-    options: Mapping[str, Any] | None = None
-    fidelities: Mapping[str, Mapping[str, Any]] | None = None
-    horizon: str | None = None
-    seeds: int = 1
-    precision: str = "float64"
-    rows: int = 256
-
-    def __post_init__(self) -> None:
-        fn, who = self.fn, f"from_{self.backend.engine}"
-        if not callable(fn):
-            raise ValueError(f"a function is wanted; got {type(fn).__name__} {fn!r}")
-        if not isinstance(self.space, ParameterSpace):
-            raise ValueError(f"a ParameterSpace is wanted, as gs.ParameterSpace({{'x': (-1, 1)}}); got {self.space!r}")
-        self.name, known = self.name or function_name(fn), _arguments(fn)
-        given = {key: dict(value) for key, value in (self.fidelities or {}).items()}
-        own = {argument: None for settings in given.values() for argument in settings if argument != "precision"}
-        bound = fn.keywords if isinstance(fn, partial) else {}  # by the user: no setting any more
-        chosen = _default_options(known, {**own, **bound}) if self.options is None else dict(self.options)
-        _check_arguments(self.name, known, chosen, own, self.horizon)
-        self.seeds = as_whole(self.seeds, f"{who}'s seeds", least=1)
-        self.rows = as_whole(self.rows, f"{who}'s rows", least=1)
-        self.seed_argument = next((one for one in SEED_ARGUMENTS if one in known and one not in own | chosen), "")
-        if self.seeds > 1 and not self.seed_argument:
-            seeded = " or ".join(SEED_ARGUMENTS)
-            raise ValueError(f"seeds={self.seeds} averages over random numbers, and {self.name} takes no {seeded}")
-        self.defaults = chosen | ({"seed": 0} if self.seed_argument else {})
-        self.known_fidelities = _read_fidelities(self.name, given, _check_precision(self.precision, who))
-        self.fidelity_arguments = tuple(own)
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Leave out what another process makes again."""
-        return {name: value for name, value in vars(self).items() if name != "options_class"}
-
-    @cached_property
-    def options_class(self) -> type[Any]:
-        """The dataclass of the options, each of the type of its default."""
-        declared = [(name, type(value), field(default=value)) for name, value in self.defaults.items()]
-        return make_dataclass("Options", declared, frozen=True)
-
-    @cached_property
-    def counts_steps(self) -> bool:
-        """Whether the horizon counts time steps: times dt, it is the same time in every fidelity."""
-        if not {self.horizon, "dt"} <= set(self.fidelity_arguments):
-            return False
-        steps: list[Any] = [one.settings.get(self.horizon or "") for one in self.known_fidelities.values()]
-        if not all(isinstance(count, int) for count in steps):
-            return False
-        times = [count * one.dt for count, one in zip(steps, self.known_fidelities.values(), strict=True)]
-        return bool(max(times) - min(times) <= SAME_TIME * max(times))
-
-    def settings_of(self, options: Any, fidelity: Fidelity) -> dict[str, Any]:
-        """Return the function's keyword arguments, but for its random numbers, with these options at a fidelity."""
-        found = {one.name: getattr(options, one.name) for one in fields(options)}
-        if self.seed_argument:
-            found.pop("seed")
-        for argument in self.fidelity_arguments:
-            known = argument in FIDELITY_FIELDS
-            found[argument] = getattr(fidelity, argument) if known else fidelity.settings.get(argument)
-        of = next((one for one in self.known_fidelities.values() if one.settings == fidelity.settings), fidelity)
-        if self.horizon and self.counts_steps and of.dt != fidelity.dt:  # a variant of a fidelity, of the same time
-            found[self.horizon] = max(1, round(found[self.horizon] * of.dt / fidelity.dt))
-        return {name: value for name, value in found.items() if value is not None}
 
 
 class FunctionEnvironment(Environment):
@@ -292,66 +154,6 @@ class FunctionEnvironment(Environment):
         """Return what decides the numbers, as plain JSON."""
         own: dict[str, Any] = {"maximize": True} if self.function.maximize else {}
         return super().identity() | own | ({"seeds": self.function.seeds} if self.function.seeds > 1 else {})
-
-
-def function_name(fn: Callable[..., object]) -> str:
-    """Return what a function is called, or its type where it has no name."""
-    name = str(getattr(fn, "__name__", type(fn).__name__))
-    return NAMELESS if name == "<lambda>" else name
-
-
-def _arguments(fn: Callable[..., Any]) -> dict[str, Any]:
-    """Return the keyword arguments of a function with their defaults, `inspect.Parameter.empty` where one has none."""
-    try:
-        found = list(inspect.signature(fn).parameters.values())
-    except (TypeError, ValueError):  # of a function in C
-        return {}
-    return {one.name: one.default for one in found[1:] if one.kind in (one.POSITIONAL_OR_KEYWORD, one.KEYWORD_ONLY)}
-
-
-def _default_options(known: Mapping[str, Any], taken: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the keyword arguments whose default is a number, a text or a truth value, and that are not `taken`."""
-    free = {name: value for name, value in known.items() if name not in (*taken, *SEED_ARGUMENTS)}
-    return {name: value for name, value in free.items() if isinstance(value, KINDS)}
-
-
-def _check_arguments(
-    name: str, known: Mapping[str, Any], options: Mapping[str, Any], own: Mapping[str, Any], horizon: str | None
-) -> None:
-    """Raise ValueError for settings that are no keyword arguments of the function, or that are said twice."""
-    for option, value in options.items():
-        if not isinstance(value, KINDS):
-            raise ValueError(
-                f"{name}'s option {option} needs a number, a text or a truth value as default; got {value!r}"
-            )
-    if twice := options.keys() & own.keys():
-        raise ValueError(f"{name} has {', '.join(sorted(twice))} in options and in fidelities; leave it in one of them")
-    if horizon and horizon not in options.keys() | own.keys():
-        raise ValueError(f"{name}'s horizon is one of its options or fidelities' settings; got {horizon!r}")
-    strange = [one for one in (*options, *own) if known and one not in known]
-    if strange:
-        takes = ", ".join(known) or "none"
-        raise ValueError(f"{name} takes no keyword argument {', '.join(strange)}; it takes {takes}")
-
-
-def _read_fidelities(name: str, given: Mapping[str, Mapping[str, Any]], precision: str) -> dict[str, Fidelity]:
-    """Return fidelities by name, of the settings that a user gave for each."""
-    found = {}
-    names = {argument for settings in given.values() for argument in settings}
-    for fidelity, settings in (given or {UNNAMED: {}}).items():
-        if lacking := names - settings.keys() - {"precision"}:
-            raise ValueError(f"{name}'s fidelity {fidelity} lacks {', '.join(sorted(lacking))}, which others have")
-        own = {key: value for key, value in settings.items() if key in FIDELITY_FIELDS}
-        other = {key: value for key, value in settings.items() if key not in (*FIDELITY_FIELDS, "precision")}
-        computed = _check_precision(settings.get("precision", precision), name)
-        found[fidelity] = Fidelity(fidelity, **{"dt": 0.0, **own}, precision=computed, settings=other)
-    return found
-
-
-def _check_precision(precision: Any, who: str) -> str:
-    if precision not in ("float64", "float32"):
-        raise ValueError(f"{who} takes precision float64 or float32; got {precision!r}")
-    return str(precision)
 
 
 # ---- Functions of torch, NumPy, JAX and Warp, simulators with reset and step, and objects of one's own as
@@ -516,13 +318,12 @@ def _wrap(fn: Callable[..., Any], space: ParameterSpace, backend: Backend, said:
 
 
 @dataclass(frozen=True)
-class _Torch:
+class _Torch(Backend):
     """Call functions of torch."""
 
+    engine = "torch"
     vectorized: bool
     device: str
-    engine: str = "torch"
-    devices: tuple[str, ...] = ("cpu", "cuda")
 
     def has_cuda(self) -> bool:
         """Say whether torch finds a CUDA device."""
@@ -582,18 +383,13 @@ def _autograd(loss: Float[Tensor, " batch"], x: Float[Tensor, "batch dim"], name
 
 
 @dataclass(frozen=True)
-class _NumPy:
+class _NumPy(Backend):
     """Call functions of NumPy."""
 
+    engine, devices = "numpy", ("cpu",)
     vectorized: bool
     differences: float | None
     device: str = "cpu"
-    engine: str = "numpy"
-    devices: tuple[str, ...] = ("cpu",)
-
-    def has_cuda(self) -> bool:
-        """Say no."""
-        return False
 
     def bind(self, call: Function, settings: Mapping[str, Any], precision: str, device: str) -> Compute:
         """Return what computes the function with these keyword arguments."""

@@ -17,15 +17,14 @@ import re
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from difflib import get_close_matches
 from functools import cache
 from importlib import import_module
-from importlib.metadata import entry_points
 from importlib.util import decode_source, module_from_spec, spec_from_file_location
 from pathlib import Path
 from types import BuiltinFunctionType, FunctionType, MethodType, ModuleType
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from ..landscapes import registry
 from ..landscapes.storage.files import resolve
 from .engines import ENGINES, install_line, is_installed
 from .engines import EXTRAS as EXTRAS
@@ -200,16 +199,7 @@ def entries() -> dict[str, Entry]:
 
     Raises ValueError where two packages register the same name.
     """
-    found = {entry.name: entry for entry in BUILTIN}
-    for point in entry_points(group=GROUP):
-        if point.name in found:
-            raise ValueError(
-                f"two environments are called {point.name!r}: {found[point.name].target} and {point.value}; "
-                "uninstall one of the packages or rename its entry point"
-            )
-        package = point.dist.name if point.dist else "another package"
-        found[point.name] = Entry(point.name, point.value, model=f"registered by {package}")
-    return found
+    return registry.collect(BUILTIN, GROUP, "environment", lambda name, target, by: Entry(name, target, model=by))
 
 
 def register(what: Kind) -> Kind:
@@ -331,25 +321,15 @@ def registered_environment(name: str) -> type[Environment] | Environment:
     target = _find_entry(name).target
     if not isinstance(target, str):
         return target
-    module, _, attribute = target.rpartition(":")
-    try:
-        found: type[Environment] | Environment = getattr(import_named(module), attribute)
-    except (ImportError, AttributeError) as error:
-        raise ValueError(f"{name} is registered as {target}, which cannot be imported: {error}") from error
+    found: type[Environment] | Environment = registry.load(name, target, import_named)
     return found
 
 
 def _find_entry(name: str) -> Entry:
     """Return what is registered by a name. Raises ValueError, with a name that comes close, where nothing is."""
     known = entries()
-    if name not in known:
-        close = get_close_matches(name, known, n=1)
-        hint = f"; did you mean {close[0]}?" if close else ";"
-        raise ValueError(
-            f"no environment is called {name!r}{hint} `landscape envs` lists all {len(known)}, and one in a file of "
-            "your own is FILE.py:NAME"
-        )
-    return known[name]
+    there = f"`landscape envs` lists all {len(known)}, and one in a file of your own is FILE.py:NAME"
+    return registry.find(known, name, "environment", there)
 
 
 def source_of(env: Environment) -> str | type[Environment] | Environment:
@@ -393,7 +373,8 @@ def _place_in_file(text: str) -> tuple[Path, str, str]:
 
 def _named(found: type[Environment] | Environment, attribute: str) -> type[Environment] | Environment:
     """Return a function that has no name of its own by what its file calls it."""
-    from .adapters import NAMELESS, FunctionEnvironment
+    from .adapters import FunctionEnvironment
+    from .user_functions import NAMELESS
 
     return found.named(attribute) if isinstance(found, FunctionEnvironment) and found.name == NAMELESS else found
 

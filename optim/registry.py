@@ -12,11 +12,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from difflib import get_close_matches
 from functools import cache
-from importlib import import_module
-from importlib.metadata import entry_points
 from typing import TYPE_CHECKING
+
+from ..landscapes import registry
 
 if TYPE_CHECKING:
     from .base import Optimizer
@@ -63,26 +62,12 @@ def methods() -> dict[str, Method]:
 
     Raises ValueError where two have the same name.
     """
-    found = {method.name: method for method in BUILTIN}
-    for point in entry_points(group=GROUP):
-        if point.name in found:
-            raise ValueError(
-                f"two methods are called {point.name!r}: {found[point.name].target} and {point.value}; "
-                "uninstall one of the packages or rename its entry point"
-            )
-        package = point.dist.name if point.dist else "another package"
-        found[point.name] = Method(point.name, point.value, f"registered by {package}")
-    return found
+    return registry.collect(BUILTIN, GROUP, "method", Method)
 
 
 def find_method(name: str) -> Method:
     """Return what is registered under a name. Raises ValueError, with the names there are, where nothing is."""
-    known = methods()
-    if name not in known:
-        close = get_close_matches(name, known, n=1)
-        hint = f"; did you mean {close[0]}?" if close else ";"
-        raise ValueError(f"no method is called {name!r}{hint} there are {', '.join(known)}")
-    return known[name]
+    return registry.find(methods(), name, "method", f"there are {', '.join(methods())}")
 
 
 def check_methods(names: Sequence[str]) -> list[str]:
@@ -98,16 +83,13 @@ def optimizer_class(name: str) -> type[Optimizer]:
     point leads nowhere or to an optimiser of another name.
     """
     method = find_method(name)
-    module, _, attribute = method.target.rpartition(":")
     try:
-        kind: type[Optimizer] = getattr(import_module(module), attribute)
-    except (ImportError, AttributeError) as error:
+        kind: type[Optimizer] = registry.load(name, method.target)
+    except ValueError as error:
         if method.extra:
             install = f"pip install '.[{method.extra}]' in gradscape's sources"
-            raise ValueError(f"{name} needs the extra {method.extra}: {install} ({error})") from error
-        if method in BUILTIN:
-            raise
-        raise ValueError(f"{name} is registered as {method.target}, which cannot be imported: {error}") from error
+            raise ValueError(f"{name} needs the extra {method.extra}: {install} ({error.__cause__})") from error
+        raise
     if getattr(kind, "name", None) != name:
         raise ValueError(
             f"{name} is registered as {method.target}, whose name is {getattr(kind, 'name', None)!r}; "

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,23 +15,20 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ...landscapes.objective import SimulatorError
-
-if TYPE_CHECKING:
-    from ..adapters import Compute, Function
+from ..user_functions import Backend, Compute, Function
 
 GROWTH = 4
 _TRACED: dict[str, str] = {}  # the precision that JAX has last traced a function in
 
 
 @dataclass(frozen=True)
-class JaxBackend:
+class JaxBackend(Backend):
     """Call functions of JAX, in its default device unless another one is named."""
 
+    engine = "jax"
     mode: str
     batch: str
     device: str = "auto"
-    engine: str = "jax"
-    devices: tuple[str, ...] = ("cpu", "cuda")
 
     def has_cuda(self) -> bool:
         """Say whether JAX computes on a CUDA device by default."""

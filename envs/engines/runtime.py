@@ -15,6 +15,8 @@ from ...landscapes.storage.files import moved_by
 
 wp.config.log_level = wp.LOG_ERROR  # no banner
 
+Ints = wp.array2d[wp.int32]  # [environment, number]
+
 CACHE = ("WARP_CACHE_PATH", "Warp's kernels")
 MANY = ".engines.mpm."  # where solvers are whose kernels are of many modules
 
@@ -45,6 +47,11 @@ class Precision:
     vec4: Any
     mat33: Any
     torch: torch.dtype
+
+    @property
+    def rows(self) -> tuple[Any, Any, Any, Any]:
+        """Arrays [environment, element] of numbers, of vectors, of four numbers each, and of matrices."""
+        return wp.array2d[self.real], wp.array2d[self.vec3], wp.array2d[self.vec4], wp.array2d[self.mat33]
 
 
 @cache

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,22 +16,19 @@ from torch import Tensor
 
 from ...landscapes.objective import SimulatorError
 from ..base import check_shape
+from ..user_functions import Backend, Compute, Function
 from .runtime import cuda_available, precision
-
-if TYPE_CHECKING:
-    from ..adapters import Compute, Function
 
 CORRUPTS = "This may corrupt gradient computation"  # how Warp ends what it says of an array that is overwritten
 
 
 @dataclass(frozen=True)
-class WarpBackend:
+class WarpBackend(Backend):
     """Call functions that launch Warp kernels."""
 
+    engine = "warp"
     check_overwrites: bool
     device: str = "auto"
-    engine: str = "warp"
-    devices: tuple[str, ...] = ("cpu", "cuda")
 
     def has_cuda(self) -> bool:
         """Say whether Warp finds a CUDA device."""

@@ -20,8 +20,8 @@ from markdown_it import MarkdownIt
 
 import gradscape
 from gradscape.cli import verbs
-from gradscape.envs.adapters import Function, FunctionKeywords
 from gradscape.envs.registry import BUILTIN, environment_class
+from gradscape.envs.user_functions import Function, FunctionKeywords
 from gradscape.gallery.figures import read_figures
 from gradscape.gallery.files import DATA
 from gradscape.gallery.paper import read_paper

@@ -1,10 +1,10 @@
 """What grid velocities meet: moving tools and walls.
 
-A boundary is a Warp function (its data, node position, velocity, environment, lane, tools, sums, control step, fraction
-of it, 1 over its span) -> velocity. `tools` [environment, control step, slot] holds positions [m] at the ends of
-control steps; in between a tool moves at constant velocity. A node looks whether a tool is near without an adjoint, and
-reads where it is with one that is summed exactly (`exact`), in the `sums` of its `lane`. Sizes and frictions are data,
-so that scenes with the same kind of boundary share its compiled kernel.
+A boundary is a Warp function (its data, node position, velocity, environment, lane, tools, sums, substep) -> velocity.
+`tools` [environment, control step, slot] holds positions [m] at the ends of control steps; in between a tool moves at
+constant velocity. A node looks whether a tool is near without an adjoint, and reads where it is with one that is summed
+exactly (`exact`), in the `sums` of its `lane`. Sizes and frictions are data, so that scenes with the same kind of
+boundary share its compiled kernel.
 """
 
 import abc
@@ -152,6 +152,7 @@ BITS = 16
 SUMS = {"float32": 17, "float64": 132}  # ranges that hold all exponents, and the last: how many are no numbers
 
 LOWEST = {"float32": 149, "float64": 1074}  # 2^-LOWEST is the least number
+Sums = wp.array2d[wp.int64]  # [environment and lane, sum]
 
 
 @cache
@@ -163,14 +164,13 @@ def tool_readers(name: str) -> SimpleNamespace:
     integers `sums` of the environment's `lane`, after being 0 or 1; `settle` takes it from there.
     """
     vec3 = precision(name).vec3
+    Paths = wp.array3d[vec3]
 
     @cpp.func_native(called="read_tool", template=[LANES, SUMS[name]], adjoint="adj_read_tool")
-    def read(
-        tools: wp.array3d[vec3], sums: wp.array2d[wp.int64], e: int, lane: int, step: int, after: int, slot: int
-    ) -> vec3: ...
+    def read(tools: Paths, sums: Sums, e: int, lane: int, step: int, after: int, slot: int) -> vec3: ...
 
     @cpp.func_native(called="look_at_tool", adjoint="")
-    def look(tools: wp.array3d[vec3], e: int, step: int, after: int, slot: int) -> vec3: ...
+    def look(tools: Paths, e: int, step: int, after: int, slot: int) -> vec3: ...
 
     return SimpleNamespace(read=read, look=look)
 
@@ -189,13 +189,13 @@ def settle_kernel(name: str):
     def weigh(sum: wp.int64, range: int) -> wp.float64: ...
 
     @cpp.func_native(template=[LANES])
-    def take_sum(sums: wp.array2d[wp.int64], e: int, at: int) -> wp.int64: ...
+    def take_sum(sums: Sums, e: int, at: int) -> wp.int64: ...
 
     @cpp.func_native()
     def no_number() -> wp.float64: ...
 
     @wp.kernel(module=cpp.module(f"gradscape.exact.{name}"), enable_backward=False)
-    def settle(step: int, sums: wp.array2d[wp.int64], adj_tools: wp.array4d[real]):
+    def settle(step: int, sums: Sums, adj_tools: wp.array4d[real]):
         e, place = wp.tid()
         value = wp.float64(0.0)
         for i in range(count):
@@ -209,6 +209,29 @@ def settle_kernel(name: str):
         adj_tools[e, at_step, slot, axis] = adj_tools[e, at_step, slot, axis] + real(value)
 
     return settle
+
+
+@cache
+@no_type_check
+def substep_struct(name: str) -> Any:
+    """Return the struct of what all nodes of a substep have in common, in one precision."""
+    real = precision(name).real
+
+    @partial(wp.struct, module=f"gradscape.substeps.{name}")
+    class Substep:
+        """It lasts `dt` [s], and begins at a `fraction` of control step `step`, which takes 1 / `rate` [s].
+
+        Nodes lighter than `empty` [kg] carry no velocity.
+        """
+
+        dt: real
+        gravity: real
+        empty: real
+        step: int
+        fraction: real
+        rate: real
+
+    return Substep
 
 
 class Boundary(abc.ABC):
@@ -271,27 +294,15 @@ class LadleInTank(Boundary):
 @cache
 @no_type_check
 def _open(name: str) -> tuple[Any, Any]:
-    types = precision(name)
-    real, vec3 = types.real, types.vec3
-    module = f"gradscape.boundaries.{name}"
+    vec3, Substep, module = precision(name).vec3, substep_struct(name), f"gradscape.boundaries.{name}"
+    Paths = wp.array3d[vec3]
 
     @partial(wp.struct, module=module)
     class Nothing:
         unused: int
 
     @wp.func(module=module, name=f"open_{name}")
-    def boundary(
-        data: Nothing,
-        p: vec3,
-        v: vec3,
-        e: int,
-        lane: int,
-        tools: wp.array3d[vec3],
-        sums: wp.array2d[wp.int64],
-        step: int,
-        fraction: real,
-        rate: real,
-    ) -> vec3:
+    def boundary(data: Nothing, p: vec3, v: vec3, e: int, lane: int, tools: Paths, sums: Sums, now: Substep) -> vec3:
         return v
 
     return boundary, Nothing
@@ -302,7 +313,7 @@ def _open(name: str) -> tuple[Any, Any]:
 def _ladle_in_tank(name: str) -> tuple[Any, Any]:
     types = precision(name)
     real, vec3, vec4 = types.real, types.vec3, types.vec4
-    module = f"gradscape.boundaries.{name}"
+    module, Paths, Substep = f"gradscape.boundaries.{name}", wp.array3d[vec3], substep_struct(name)
     bowl_distance, rod_distance = bowl(name), rod(name)
     read, look = tool_readers(name).read, tool_readers(name).look
 
@@ -320,23 +331,21 @@ def _ladle_in_tank(name: str) -> tuple[Any, Any]:
         slip: real
 
     @wp.func(module=module)
-    def look_between(tools: wp.array3d[vec3], e: int, step: int, fraction: real) -> vec3:
+    def look_between(tools: Paths, e: int, now: Substep) -> vec3:
         """Return where the ladle is, without an adjoint."""
-        start = look(tools, e, step, 0, 0)
-        return start + fraction * (look(tools, e, step, 1, 0) - start)
+        start = look(tools, e, now.step, 0, 0)
+        return start + now.fraction * (look(tools, e, now.step, 1, 0) - start)
 
     @wp.func(module=module)
-    def between(
-        tools: wp.array3d[vec3], sums: wp.array2d[wp.int64], e: int, lane: int, step: int, fraction: real
-    ) -> vec3:
+    def between(tools: Paths, sums: Sums, e: int, lane: int, now: Substep) -> vec3:
         """Return where the ladle is."""
-        start = read(tools, sums, e, lane, step, 0, 0)
-        return start + fraction * (read(tools, sums, e, lane, step, 1, 0) - start)
+        start = read(tools, sums, e, lane, now.step, 0, 0)
+        return start + now.fraction * (read(tools, sums, e, lane, now.step, 1, 0) - start)
 
     @wp.func(module=module)
-    def velocity(tools: wp.array3d[vec3], sums: wp.array2d[wp.int64], e: int, lane: int, step: int, rate: real) -> vec3:
+    def velocity(tools: Paths, sums: Sums, e: int, lane: int, now: Substep) -> vec3:
         """Return how the ladle moves."""
-        return rate * (read(tools, sums, e, lane, step, 1, 0) - read(tools, sums, e, lane, step, 0, 0))
+        return now.rate * (read(tools, sums, e, lane, now.step, 1, 0) - read(tools, sums, e, lane, now.step, 0, 0))
 
     @wp.func(module=module)
     def slide(v: vec3, body: vec3, hit: vec4, band: real, friction: real) -> vec3:
@@ -362,31 +371,20 @@ def _ladle_in_tank(name: str) -> tuple[Any, Any]:
         return vec3(across * v[0], upwards * v[1], deep * v[2])
 
     @wp.func(module=module)
-    def boundary(
-        scene: Scene,
-        p: vec3,
-        v: vec3,
-        e: int,
-        lane: int,
-        tools: wp.array3d[vec3],
-        sums: wp.array2d[wp.int64],
-        step: int,
-        fraction: real,
-        rate: real,
-    ) -> vec3:
+    def boundary(scene: Scene, p: vec3, v: vec3, e: int, lane: int, tools: Paths, sums: Sums, now: Substep) -> vec3:
         shell = scene.half_thickness + scene.band
         rounded = real(1.001) * shell
         outer, inner = scene.radius + rounded, wp.max(scene.radius - rounded, real(0.0))
-        local = p - look_between(tools, e, step, fraction)
+        local = p - look_between(tools, e, now)
         apart = wp.dot(local, local)
         if apart < outer * outer and apart >= inner * inner:  # elsewhere the bowl is too far off to change anything
-            hit = bowl_distance(p - between(tools, sums, e, lane, step, fraction), scene.radius, scene.half_thickness)
-            v = slide(v, velocity(tools, sums, e, lane, step, rate), hit, scene.band, scene.friction)
+            hit = bowl_distance(p - between(tools, sums, e, lane, now), scene.radius, scene.half_thickness)
+            v = slide(v, velocity(tools, sums, e, lane, now), hit, scene.band, scene.friction)
         handle = scene.height > real(0.0)
         if handle and wp.abs(local[2]) < shell and wp.abs(local[0] + scene.radius) < shell:
-            foot = p - between(tools, sums, e, lane, step, fraction) + vec3(scene.radius, real(0.0), real(0.0))
+            foot = p - between(tools, sums, e, lane, now) + vec3(scene.radius, real(0.0), real(0.0))
             hit = rod_distance(foot, scene.height, scene.half_thickness)
-            v = slide(v, velocity(tools, sums, e, lane, step, rate), hit, scene.band, scene.friction)
+            v = slide(v, velocity(tools, sums, e, lane, now), hit, scene.band, scene.friction)
         edge = scene.half_width - real(1e-6)  # a wall's own nodes belong to it
         if wp.abs(p[0]) > edge or wp.abs(p[2]) > edge or p[1] < real(1e-6):
             v = along_wall(p, v, edge, scene.slip)
@@ -509,7 +507,7 @@ class ToolsInRoom(Boundary):
 def _tools_in_room(name: str, count: int) -> tuple[Any, Any]:
     types = precision(name)
     real, vec3, vec4 = types.real, types.vec3, types.vec4
-    module = f"gradscape.tools.{name}.{count}"
+    module, Paths, Substep = f"gradscape.tools.{name}.{count}", wp.array3d[vec3], substep_struct(name)
     ball, stick, ring, post = sphere(name), capsule(name), torus(name), cylinder(name)
     read, look = tool_readers(name).read, tool_readers(name).look
     up = wp.constant(vec3(0.0, 1.0, 0.0))
@@ -567,36 +565,26 @@ def _tools_in_room(name: str, count: int) -> tuple[Any, Any]:
 
     @wp.func(module=module)
     def apply_tool(
-        scene: Scene,
-        j: int,
-        p: vec3,
-        v: vec3,
-        e: int,
-        lane: int,
-        tools: wp.array3d[vec3],
-        sums: wp.array2d[wp.int64],
-        step: int,
-        fraction: real,
-        rate: real,
+        scene: Scene, j: int, p: vec3, v: vec3, e: int, lane: int, tools: Paths, sums: Sums, now: Substep
     ) -> vec3:
         slot = scene.slot[j]
-        place = look(tools, e, step, 0, slot)
-        gap = p - (place + fraction * (look(tools, e, step, 1, slot) - place))
+        place = look(tools, e, now.step, 0, slot)
+        gap = p - (place + now.fraction * (look(tools, e, now.step, 1, slot) - place))
         if wp.dot(gap, gap) > scene.reach[j] * scene.reach[j]:
             return v
         kind = scene.kind[j]
         shape = scene.shape[j]
-        start = read(tools, sums, e, lane, step, 0, slot)
-        change = read(tools, sums, e, lane, step, 1, slot) - start
-        local = p - (start + fraction * change)
-        body = rate * change
+        start = read(tools, sums, e, lane, now.step, 0, slot)
+        change = read(tools, sums, e, lane, now.step, 1, slot) - start
+        local = p - (start + now.fraction * change)
+        body = now.rate * change
         axis = up
         if kind == Kind.ROLLER:
-            angles = read(tools, sums, e, lane, step, 0, slot + 1)
-            turn = read(tools, sums, e, lane, step, 1, slot + 1) - angles
-            yaw = angles[1] + fraction * turn[1]
+            angles = read(tools, sums, e, lane, now.step, 0, slot + 1)
+            turn = read(tools, sums, e, lane, now.step, 1, slot + 1) - angles
+            yaw = angles[1] + now.fraction * turn[1]
             axis = vec3(wp.sin(yaw), real(0.0), wp.cos(yaw))
-            body += wp.cross(rate * (turn[0] * axis + turn[1] * up), local)
+            body += wp.cross(now.rate * (turn[0] * axis + turn[1] * up), local)
         return contact(distance(kind, local, axis, shape), v, body, shape[2], scene.softness, scene.substeps)
 
     @wp.func(module=module)
@@ -608,20 +596,9 @@ def _tools_in_room(name: str, count: int) -> tuple[Any, Any]:
         return rub(vec3(v[0], real(0.0), v[2]), v[1], friction)
 
     @wp.func(module=module)
-    def boundary(
-        scene: Scene,
-        p: vec3,
-        v: vec3,
-        e: int,
-        lane: int,
-        tools: wp.array3d[vec3],
-        sums: wp.array2d[wp.int64],
-        step: int,
-        fraction: real,
-        rate: real,
-    ) -> vec3:
+    def boundary(scene: Scene, p: vec3, v: vec3, e: int, lane: int, tools: Paths, sums: Sums, now: Substep) -> vec3:
         for j in range(wp.static(count)):  # unrolled: a loop that AD replays would lose v
-            v = apply_tool(scene, j, p, v, e, lane, tools, sums, step, fraction, rate)
+            v = apply_tool(scene, j, p, v, e, lane, tools, sums, now)
         if p[1] <= scene.floor:
             v = apply_floor(v, scene.floor_friction)
         vx, vy, vz = v[0], v[1], v[2]

@@ -10,6 +10,7 @@ from ..runtime import precision
 from .boundaries import LANES, SUMS
 from .columns import Lists
 from .model import Box, Model, place_grid
+from .stencil import particles
 
 T = TypeVar("T")
 
@@ -28,6 +29,14 @@ class Frame:
     def arrays(self) -> tuple[wp.array, ...]:
         """Return every array of the frame."""
         return (self.x, self.v, self.C, *self.S)
+
+    @cached_property
+    def particles(self) -> Any:
+        """x, v and C as kernels take them."""
+        vec3: Any = self.x.dtype
+        found: Any = particles(vec3._wp_scalar_type_.__name__)()
+        found.x, found.v, found.C = self.x, self.v, self.C
+        return found
 
 
 @dataclass(frozen=True, eq=False)

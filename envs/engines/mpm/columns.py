@@ -7,7 +7,7 @@ nodes, nor on chance.
 """
 
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache, cached_property, partial
 from types import SimpleNamespace
 from typing import Any, no_type_check
 
@@ -15,9 +15,62 @@ import warp as wp
 
 from .. import cpp
 from ..launches import BLOCK, blocks
-from ..runtime import precision
+from ..runtime import Ints, fill_struct, precision
 from .model import Box
-from .stencil import lattice, layout, stencil
+from .stencil import lattice, layout, particles, stencil
+
+# ---- Arrays of integers that kernels share, as Warp structs.
+
+
+@cache
+@no_type_check
+def list_struct() -> Any:
+    """Return the struct of `Lists`."""
+
+    @partial(wp.struct, module="gradscape.lists")
+    class Listed:
+        """The fields of Lists."""
+
+        order: Ints
+        full: wp.array[wp.int32]
+        walks: wp.array2d[wp.vec4i]
+        planes: Ints
+        starts: Ints
+        nodes: Ints
+        touched: Ints
+
+    return Listed
+
+
+@cache
+@no_type_check
+def count_struct() -> Any:
+    """Return the struct of what kernels write down on the way to `Lists`."""
+
+    @partial(wp.struct, module="gradscape.lists")
+    class Counting:
+        """What is known of each particle, cell, walk and column, by environment.
+
+        Of a particle its cell, its number there in the order of arrival, and who arrived at which place. Of a cell how
+        many there are, the first of its places in the list and the one beyond its last. Of a walk what `Lists` says,
+        how many are of a size, and its number among those. `used` is how many places of the list are taken, and how
+        many walks there are. `spans` has of each column of cells by how much the lowest plane of nodes that is touched
+        is below HIGHEST, counted from the box's first, and the one beyond the highest.
+        """
+
+        cells: Ints
+        numbers: Ints
+        arrived: Ints
+        counts: Ints
+        places: wp.array2d[wp.vec2i]
+        found: wp.array2d[wp.vec4i]
+        sizes: Ints
+        ranks: Ints
+        used: Ints
+        spans: Ints
+
+    return Counting
+
 
 # ---- Which nodes particles touch, for a GPU: grids hold these, one column along z after the other, and no others.
 #
@@ -32,7 +85,7 @@ def place_taker():
     """Return the function that takes the next `count` places of an environment, and `parts` of another kind."""
 
     @cpp.func_native()
-    def take_places(used: wp.array2d[wp.int32], e: int, count: int, parts: int) -> wp.vec2i: ...
+    def take_places(used: Ints, e: int, count: int, parts: int) -> wp.vec2i: ...
 
     return take_places
 
@@ -44,30 +97,22 @@ def node_placer(name: str):
 
     A warp's lanes call it together, for neighbouring columns.
     """
-    Lattice, take_places = lattice(name), place_taker()
+    Lattice, Listed, take_places = lattice(name), list_struct(), place_taker()
 
     @cpp.func_native(template=[HIGHEST])
-    def find_touched(lattice: Lattice, spans: wp.array2d[wp.int32], e: int, column: int) -> wp.vec2i: ...
+    def find_touched(lattice: Lattice, spans: Ints, e: int, column: int) -> wp.vec2i: ...
 
     @cpp.func_native()
-    def name_nodes(nodes: wp.array2d[wp.int32], e: int, column: int, depth: int, low: int, count: int, start: int): ...
+    def name_nodes(nodes: Ints, e: int, column: int, depth: int, low: int, count: int, start: int): ...
 
     @wp.func(module=f"gradscape.cells.{name}")
-    def place_nodes(
-        lattice: Lattice,
-        spans: wp.array2d[wp.int32],
-        touched: wp.array2d[wp.int32],
-        starts: wp.array2d[wp.int32],
-        nodes: wp.array2d[wp.int32],
-        e: int,
-        column: int,
-    ):
+    def place_nodes(lattice: Lattice, spans: Ints, lists: Listed, e: int, column: int):
         found = find_touched(lattice, spans, e, column)
         low, count = found[0], found[1] - found[0]
-        start = take_places(touched, e, count, wp.min(count, 1))[0]
+        start = take_places(lists.touched, e, count, wp.min(count, 1))[0]
         if column < lattice.nx * lattice.ny:
-            starts[e, column] = start - low
-        name_nodes(nodes, e, column, lattice.nz, low, count, start)
+            lists.starts[e, column] = start - low
+        name_nodes(lists.nodes, e, column, lattice.nz, low, count, start)
 
     return place_nodes
 
@@ -76,11 +121,12 @@ def node_placer(name: str):
 @no_type_check
 def node_taker():
     """Return the function that says which node has a place in the grid, -1 if none has."""
+    Listed = list_struct()
 
     @wp.func(module="gradscape.columns.nodes")
-    def take_node(touched: wp.array2d[wp.int32], nodes: wp.array2d[wp.int32], e: int, place: int):
-        node, count = nodes[e, place], touched[e, 0]  # the one does not wait for the other
-        return wp.where(place < count and count <= nodes.shape[1], node, -1)
+    def take_node(lists: Listed, e: int, place: int):
+        node, count = lists.nodes[e, place], lists.touched[e, 0]  # the one does not wait for the other
+        return wp.where(place < count and count <= lists.nodes.shape[1], node, -1)
 
     return take_node
 
@@ -132,6 +178,11 @@ class Lists:
         """Return every array of the lists."""
         return (self.order, self.full, self.walks, self.planes, self.starts, self.nodes, self.touched)
 
+    @cached_property
+    def struct(self) -> Any:
+        """The lists as kernels take them."""
+        return fill_struct(list_struct()(), self)
+
 
 def whole_warps(threads: int) -> int:
     """Return the number of threads of the warps that so many threads need."""
@@ -165,7 +216,7 @@ def number_taker():
     """Return the function that counts one more at a place, and returns how many there were."""
 
     @cpp.func_native()
-    def take_number(counts: wp.array2d[wp.int32], e: int, cell: int) -> int: ...
+    def take_number(counts: Ints, e: int, cell: int) -> int: ...
 
     return take_number
 
@@ -174,29 +225,21 @@ def number_taker():
 @no_type_check
 def counter(name: str):
     """Return the function that tells a particle at x its cell, and its number there in the order of arrival."""
-    vec3 = precision(name).vec3
+    vec3, Counting = precision(name).vec3, count_struct()
     Lattice, base_node, take_number = lattice(name), stencil(name).base_node, number_taker()
 
     @wp.func(module=f"gradscape.cells.{name}")
-    def count_in_cell(
-        lattice: Lattice,
-        x: vec3,
-        e: int,
-        p: int,
-        cells: wp.array2d[wp.int32],
-        numbers: wp.array2d[wp.int32],
-        counts: wp.array2d[wp.int32],
-    ):
+    def count_in_cell(lattice: Lattice, x: vec3, e: int, p: int, found: Counting):
         base = base_node((x - lattice.origin) * lattice.inv_dx, lattice)
         bottom = lattice.first[2] / SEGMENT
         depth = (lattice.first[2] + lattice.nz - 1) / SEGMENT - bottom + 1
         column = (base[0] - lattice.first[0]) * lattice.ny + base[1] - lattice.first[1]
         cell = (column * depth - bottom) * SEGMENT + base[2]
         if wp.isfinite(x):
-            cells[e, p] = cell
-            numbers[e, p] = take_number(counts, e, cell)
+            found.cells[e, p] = cell
+            found.numbers[e, p] = take_number(found.counts, e, cell)
         else:
-            cells[e, p] = -1
+            found.cells[e, p] = -1
 
     return count_in_cell
 
@@ -208,80 +251,60 @@ def cell_kernels(name: str) -> SimpleNamespace:
 
     Where g2p has counted particles, `count` need not.
     """
-    vec3 = precision(name).vec3
-    Lattice, count_in_cell, module = lattice(name), counter(name), cpp.module(f"gradscape.cells.{name}")
+    Vectors, Lattice, Counting, Listed = precision(name).rows[1], lattice(name), count_struct(), list_struct()
+    count_in_cell, module = counter(name), cpp.module(f"gradscape.cells.{name}")
     take_number, take_places, place_nodes = number_taker(), place_taker(), node_placer(name)
 
     Counts = wp.types.vector(SEGMENT, wp.int32)
 
     @cpp.func_native(template=[SEGMENT])
-    def take_counts(counts: wp.array2d[wp.int32], e: int, segment: int) -> Counts: ...
+    def take_counts(counts: Ints, e: int, segment: int) -> Counts: ...
 
     @cpp.func_native(template=[SEGMENT])
     def write_places(places: wp.array2d[wp.vec2i], e: int, segment: int, at: int, counted: Counts): ...
 
     @cpp.func_native()
-    def count_before(arrived: wp.array2d[wp.int32], e: int, places: wp.vec2i, p: int) -> int: ...
+    def count_before(arrived: Ints, e: int, places: wp.vec2i, p: int) -> int: ...
 
     @wp.func(module=module)
     def size_of(particles: int):
         return wp.min(particles / STEP, SIZES - 1)
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
-    def count(
-        lattice: Lattice,
-        x: wp.array2d[vec3],
-        cells: wp.array2d[wp.int32],
-        numbers: wp.array2d[wp.int32],
-        counts: wp.array2d[wp.int32],
-    ):
+    def count(lattice: Lattice, x: Vectors, counts: Counting):
         """Tell each particle its cell, and its number there in the order of arrival."""
         e, p = wp.tid()
-        count_in_cell(lattice, x[e, p], e, p, cells, numbers, counts)
+        count_in_cell(lattice, x[e, p], e, p, counts)
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
-    def place_segments(
-        lattice: Lattice,
-        counts: wp.array2d[wp.int32],
-        used: wp.array2d[wp.int32],
-        sizes: wp.array2d[wp.int32],
-        places: wp.array2d[wp.vec2i],
-        found: wp.array2d[wp.vec4i],
-        numbers: wp.array2d[wp.int32],
-        planes: wp.array2d[wp.int32],
-        spans: wp.array2d[wp.int32],
-        touched: wp.array2d[wp.int32],
-        stretch: int,
-    ):
+    def place_segments(lattice: Lattice, counts: Counting, lists: Listed, stretch: int):
         """Give each segment its places in the list, each of its cells, too, and walks a number among those of a size.
 
-        A cell's `places` are its first in the list and the one beyond its last. `spans` has of each column of cells by
-        how much the lowest plane of nodes that is touched is below HIGHEST, counted from the box's first, and the one
-        beyond the highest. `counts` are 0 again.
+        Counts are 0 again.
         """
         e, s = wp.tid()
         if s == 0:
-            touched[e, 0] = 0
-            touched[e, 1] = 0
+            lists.touched[e, 0] = 0
+            lists.touched[e, 1] = 0
         bottom = lattice.first[2] / SEGMENT
         depth = (lattice.first[2] + lattice.nz - 1) / SEGMENT - bottom + 1
         there = s < lattice.nx * lattice.ny * depth
         total, low, high = wp.int32(0), wp.int32(0), wp.int32(0)
         counted = Counts()
         if there:
-            counted = take_counts(counts, e, s)
+            counted = take_counts(counts.counts, e, s)
             for k in range(SEGMENT):
                 if counted[k] > 0:
                     if total == 0:
                         low = k
                     high = k + 3
                 total += counted[k]
-            planes[e, s] = (1 << high) - (1 << low)
+            lists.planes[e, s] = (1 << high) - (1 << low)
         walks = wp.where(total > 0, (high - low - 3) / stretch + 1, 0)
-        taken = take_places(used, e, total, walks)
+        taken = take_places(counts.used, e, total, walks)
         if total > 0:
             at, column, first = taken[0], s / depth, s % depth * SEGMENT
-            write_places(places, e, s, at, counted)
+            write_places(counts.places, e, s, at, counted)
             for w in range(walks):
                 lowest = low + w * stretch
                 beyond = wp.where(w < walks - 1, lowest + stretch, high)
@@ -291,46 +314,23 @@ def cell_kernels(name: str) -> SimpleNamespace:
                     before += wp.where(k < begin, counted[k], 0)
                     count += wp.where(k >= begin and k < beyond, counted[k], 0)
                 place = at + wp.min(before, total - 1)  # one of the list, should there be no particles
-                found[e, taken[1] + w] = wp.vec4i(s, place, count, lowest + 256 * beyond + 65536 * begin)
-                numbers[e, taken[1] + w] = take_number(sizes, e, size_of(count))
+                counts.found[e, taken[1] + w] = wp.vec4i(s, place, count, lowest + 256 * beyond + 65536 * begin)
+                counts.ranks[e, taken[1] + w] = take_number(counts.sizes, e, size_of(count))
             first -= lattice.first[2] % SEGMENT
-            wp.atomic_max(spans, e, 2 * column, HIGHEST - first - low)
-            wp.atomic_max(spans, e, 2 * column + 1, first + high)
+            wp.atomic_max(counts.spans, e, 2 * column, HIGHEST - first - low)
+            wp.atomic_max(counts.spans, e, 2 * column + 1, first + high)
 
     @wp.func(module=module)
-    def place_walk(
-        sizes: wp.array2d[wp.int32],
-        found: wp.array2d[wp.vec4i],
-        numbers: wp.array2d[wp.int32],
-        walks: wp.array2d[wp.vec4i],
-        e: int,
-        i: int,
-    ):
-        walk = found[e, i]
-        at = numbers[e, i]
+    def place_walk(counts: Counting, lists: Listed, e: int, i: int):
+        walk = counts.found[e, i]
+        at = counts.ranks[e, i]
         for larger in range(size_of(walk[2]) + 1, SIZES):
-            at += sizes[e, larger]
-        if at < walks.shape[1]:
-            walks[e, at] = walk
+            at += counts.sizes[e, larger]
+        if at < lists.walks.shape[1]:
+            lists.walks[e, at] = walk
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
-    def place(
-        lattice: Lattice,
-        cells: wp.array2d[wp.int32],
-        numbers: wp.array2d[wp.int32],
-        places: wp.array2d[wp.vec2i],
-        used: wp.array2d[wp.int32],
-        sizes: wp.array2d[wp.int32],
-        found: wp.array2d[wp.vec4i],
-        numbers_of_walks: wp.array2d[wp.int32],
-        arrived: wp.array2d[wp.int32],
-        full: wp.array[wp.int32],
-        walks: wp.array2d[wp.vec4i],
-        spans: wp.array2d[wp.int32],
-        touched: wp.array2d[wp.int32],
-        starts: wp.array2d[wp.int32],
-        nodes: wp.array2d[wp.int32],
-    ):
+    def place(lattice: Lattice, counts: Counting, lists: Listed):
         """List particles by cell, those of a cell as they arrived, and walks by size, the largest first.
 
         Give the nodes of each column that particles touch, and those between them, places one after the other. Where
@@ -338,46 +338,37 @@ def cell_kernels(name: str) -> SimpleNamespace:
         """
         e, i = wp.tid()
         if i - i % 32 < lattice.nx * lattice.ny:  # a whole warp, whose lanes take places together
-            place_nodes(lattice, spans, touched, starts, nodes, e, i)
+            place_nodes(lattice, counts.spans, lists, e, i)
         if i == 0:
-            full[e] = used[e, 1]
-        if i < cells.shape[1]:
-            cell = cells[e, i]
+            lists.full[e] = counts.used[e, 1]
+        particles = counts.cells.shape[1]
+        if i < particles:
+            cell = counts.cells[e, i]
             if cell >= 0:
-                arrived[e, places[e, cell][0] + numbers[e, i]] = i
-            for w in range(i, used[e, 1], cells.shape[1]):
-                place_walk(sizes, found, numbers_of_walks, walks, e, w)
+                counts.arrived[e, counts.places[e, cell][0] + counts.numbers[e, i]] = i
+            for w in range(i, counts.used[e, 1], particles):
+                place_walk(counts, lists, e, w)
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
-    def tidy(
-        lattice: Lattice,
-        cells: wp.array2d[wp.int32],
-        places: wp.array2d[wp.vec2i],
-        arrived: wp.array2d[wp.int32],
-        used: wp.array2d[wp.int32],
-        sizes: wp.array2d[wp.int32],
-        spans: wp.array2d[wp.int32],
-        order: wp.array2d[wp.int32],
-        touched: wp.array2d[wp.int32],
-        needed: wp.array[wp.int32],
-    ):
+    def tidy(lattice: Lattice, counts: Counting, lists: Listed, needed: wp.array[wp.int32]):
         """List them by cell, those of a cell as they lie in memory; count walks from 0 again.
 
         Note how many nodes an environment has `needed` at most.
         """
         e, p = wp.tid()
+        particles = counts.cells.shape[1]
         if p == 0:
-            used[e, 0] = 0
-            used[e, 1] = 0
-            needed[e] = wp.max(needed[e], touched[e, 0])
-        for i in range(p, SIZES, cells.shape[1]):
-            sizes[e, i] = 0
-        for i in range(p, 2 * lattice.nx * lattice.ny, cells.shape[1]):
-            spans[e, i] = 0
-        cell = cells[e, p]
+            counts.used[e, 0] = 0
+            counts.used[e, 1] = 0
+            needed[e] = wp.max(needed[e], lists.touched[e, 0])
+        for i in range(p, SIZES, particles):
+            counts.sizes[e, i] = 0
+        for i in range(p, 2 * lattice.nx * lattice.ny, particles):
+            counts.spans[e, i] = 0
+        cell = counts.cells[e, p]
         if cell >= 0:
-            mine = places[e, cell]
-            order[e, mine[0] + count_before(arrived, e, mine, p)] = p
+            mine = counts.places[e, cell]
+            lists.order[e, mine[0] + count_before(counts.arrived, e, mine, p)] = p
 
     return SimpleNamespace(count=count, place_segments=place_segments, place=place, tidy=tidy)
 
@@ -482,20 +473,20 @@ GPU_TEAM, CPU_TEAM = Team(32, 3, 9), Team(1, 1, 1)  # on a CPU a thread has a wa
 # Threads go through the rows of a batch from the last one on. Kernels before and after go from the first one on, and a
 # GPU's cache still has what was written last.
 WALK = """
-def kernel(lattice, rows, order, full, walks, OWN, parts):
+def kernel(lattice, rows, lists, OWN, parts):
     k, t = wp.tid()
     e = rows - 1 - k
-    mine = take_walk(e, t, full, walks)
-    if t / lanes * groups >= full[e]:
+    mine = take_walk(e, t, lists)
+    if t / lanes * groups >= lists.full[e]:
         return
     at, begin, count, span = mine[0] * PARTS, mine[1], mine[2], mine[3]
     state = open_segment(parts, e, at, span)
     last = begin + wp.max(count - 1, 0)
     place = begin + row_of(t % lanes)
-    p = listed(order, e, place, last)
+    p = listed(lists.order, e, place, last)
     for i in range(0, most(count), size):
         what = given(lattice, OWN, e, p)
-        p = listed(order, e, place + i + size, last)  # asked for before the present ones are walked
+        p = listed(lists.order, e, place + i + size, last)  # asked for before the present ones are walked
         state = walk(parts, e, at, span, wp.min(size, count - i), what, state)
     close_segment(parts, e, at, span, state)
 """
@@ -509,19 +500,19 @@ def walk_taker(team: Team):
     The first says of a thread's walk (segment, first place, count, span), none if it has none; the second which
     particle has a place in the list, or the `last` one of a walk.
     """
-    lanes, groups, group_of = team.lanes, team.groups, lane_numbers().group
+    lanes, groups, group_of, Listed = team.lanes, team.groups, lane_numbers().group, list_struct()
 
     @wp.func(module=f"gradscape.columns.{lanes}")
-    def take_walk(e: int, t: int, full: wp.array[wp.int32], walks: wp.array2d[wp.vec4i]):
+    def take_walk(e: int, t: int, lists: Listed):
         group = group_of(t % lanes)
         i = t / lanes * groups + group
-        mine = walks[e, wp.min(i, walks.shape[1] - 1)]  # does not wait for how many there are
-        if group >= groups or i >= full[e]:
+        mine = lists.walks[e, wp.min(i, lists.walks.shape[1] - 1)]  # does not wait for how many there are
+        if group >= groups or i >= lists.full[e]:
             return wp.vec4i(0, 0, 0, 0)
         return mine
 
     @wp.func(module=f"gradscape.columns.{lanes}")
-    def listed(order: wp.array2d[wp.int32], e: int, place: int, last: int):
+    def listed(order: Ints, e: int, place: int, last: int):
         return order[e, wp.min(place, last)]
 
     return take_walk, listed
@@ -542,9 +533,7 @@ def walking_kernel(key: str, name: str, team: Team, given: Any, *, sloping: bool
         return functions, lanes, groups, size, PARTS
 
     own = {label: kind for label, kind in given.input_types.items() if label not in ("lattice", "e", "p")}
-    vec4 = precision(name).vec4
-    kinds = {"lattice": lattice(name), "rows": int, "order": wp.array2d[wp.int32], "full": wp.array[wp.int32]}
-    kinds |= {"walks": wp.array2d[wp.vec4i]} | own | {"parts": wp.array2d[vec4]}
+    kinds = {"lattice": lattice(name), "rows": int, "lists": list_struct()} | own | {"parts": precision(name).rows[2]}
     bounds = {"grid_stride": False} | ({"launch_bounds": blocks(name)} if blocks(name) else {})
     return wp.Kernel(
         cpp.with_arguments(kernel, kinds),
@@ -559,12 +548,10 @@ def walking_kernel(key: str, name: str, team: Team, given: Any, *, sloping: bool
 @no_type_check
 def node_sum(name: str):
     """Return the function (lattice, planes, parts, e, node) that adds up what the parts say of a node, in one order."""
-    Lattice, vec4 = lattice(name), precision(name).vec4
+    Lattice, vec4, Nodes = lattice(name), precision(name).vec4, precision(name).rows[2]
 
     @cpp.func_native(template=[SEGMENT, PARTS])
-    def add_up_node(
-        lattice: Lattice, planes: wp.array2d[wp.int32], parts: wp.array2d[vec4], e: int, node: int
-    ) -> vec4: ...
+    def add_up_node(lattice: Lattice, planes: Ints, parts: Nodes, e: int, node: int) -> vec4: ...
 
     return add_up_node
 
@@ -577,42 +564,25 @@ def column_kernels(name: str, team: Team) -> SimpleNamespace:
     They are the scatters of `transfers`, up to the parts of sums that nodes then add up (`grid`).
     """
     types, at_nodes, lies = precision(name), walker(name, sloping=True).at_nodes, layout(name)
-    real, vec3, mat33 = types.real, types.vec3, types.mat33
-    Lattice, module = lattice(name), cpp.module(f"gradscape.columns.{name}.{team.lanes}")
+    real, (Reals, Vectors, _, Matrices) = types.real, types.rows
+    Lattice, Particles, module = lattice(name), particles(name), cpp.module(f"gradscape.columns.{name}.{team.lanes}")
     read_number, read_vector, read_matrix = lies.read_number, lies.read_vector, lies.read_matrix
 
     @wp.func(module=module)
-    def momentum(
-        lattice: Lattice,
-        mass: wp.array2d[real],
-        x: wp.array2d[vec3],
-        v: wp.array2d[vec3],
-        A: wp.array2d[mat33],
-        e: int,
-        p: int,
-    ):
+    def momentum(lattice: Lattice, mass: Reals, now: Particles, A: Matrices, e: int, p: int):
         """Return what a particle gives to its nodes of momentum m v + A (x_i - x) and mass."""
-        given = at_nodes(lattice, read_vector(x, e, p))
+        given = at_nodes(lattice, read_vector(now.x, e, p))
         given.mass = read_number(mass, e, p)
         given.a = read_matrix(A, e, p) * (real(1.0) / lattice.inv_dx)
-        given.q = given.mass * read_vector(v, e, p) - given.a * given.f
+        given.q = given.mass * read_vector(now.v, e, p) - given.a * given.f
         return given
 
     @wp.func(module=module)
-    def velocity_adjoint(
-        lattice: Lattice,
-        dt: real,
-        x: wp.array2d[vec3],
-        adj_x_new: wp.array2d[vec3],
-        adj_v_new: wp.array2d[vec3],
-        adj_C_new: wp.array2d[mat33],
-        e: int,
-        p: int,
-    ):
+    def velocity_adjoint(lattice: Lattice, dt: real, x: Vectors, adj_new: Particles, e: int, p: int):
         """Return what a particle gives to its nodes of the adjoints of the velocities that g2p gathered."""
         given = at_nodes(lattice, read_vector(x, e, p))
-        given.a = (real(4.0) * lattice.inv_dx) * read_matrix(adj_C_new, e, p)
-        given.q = read_vector(adj_v_new, e, p) + dt * read_vector(adj_x_new, e, p) - given.a * given.f
+        given.a = (real(4.0) * lattice.inv_dx) * read_matrix(adj_new.C, e, p)
+        given.q = read_vector(adj_new.v, e, p) + dt * read_vector(adj_new.x, e, p) - given.a * given.f
         return given
 
     return SimpleNamespace(

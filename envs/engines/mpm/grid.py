@@ -7,9 +7,9 @@ import warp as wp
 
 from .. import cpp
 from ..launches import blocks
-from ..runtime import precision
-from .boundaries import LANES, Boundary
-from .columns import PARTS, SEGMENT, node_taker
+from ..runtime import Ints, precision
+from .boundaries import LANES, Boundary, Sums, substep_struct
+from .columns import PARTS, SEGMENT, list_struct, node_taker
 from .stencil import lattice
 
 
@@ -26,31 +26,20 @@ def velocity_on(name: str, boundary: Boundary, *, columns: bool) -> Any:
 def velocity_at(name: str, boundary_velocity: Any, Data: Any) -> Any:
     """Return the function that makes of a node's momentum and mass its velocity after gravity and boundary."""
     types = precision(name)
-    real, vec3, vec4 = types.real, types.vec3, types.vec4
-    Lattice = lattice(name)
+    real, vec3, vec4, Paths = types.real, types.vec3, types.vec4, wp.array3d[types.vec3]
+    Lattice, Substep = lattice(name), substep_struct(name)
 
     @wp.func(module=f"gradscape.grid.{name}")
     def velocity_at_node(
-        lattice: Lattice,
-        boundary: Data,
-        dt: real,
-        gravity: real,
-        g: vec4,
-        e: int,
-        i: int,
-        tools: wp.array3d[vec3],
-        sums: wp.array2d[wp.int64],
-        step: int,
-        fraction: real,
-        rate: real,
+        lattice: Lattice, boundary: Data, now: Substep, g: vec4, e: int, i: int, tools: Paths, sums: Sums
     ) -> vec3:
         first = lattice.first
         column, k = i / lattice.nz, i % lattice.nz
         j = column % lattice.ny
         node = vec3(real(column / lattice.ny + first[0]), real(j + first[1]), real(k + first[2]))
         p = lattice.origin + node * (real(1.0) / lattice.inv_dx)
-        v = vec3(g[0], g[1], g[2]) / g[3] - vec3(real(0.0), dt * gravity, real(0.0))
-        return boundary_velocity(boundary, p, v, e, i % LANES, tools, sums, step, fraction, rate)
+        v = vec3(g[0], g[1], g[2]) / g[3] - vec3(real(0.0), now.dt * now.gravity, real(0.0))
+        return boundary_velocity(boundary, p, v, e, i % LANES, tools, sums, now)
 
     return velocity_at_node
 
@@ -65,68 +54,42 @@ def velocity_in_rows(name: str, boundary_velocity: Any, Data: Any, walls: str) -
     for one number more than there are nodes.
     """
     types = precision(name)
-    real, vec3, vec4 = types.real, types.vec3, types.vec4
-    Lattice, template = lattice(name), [f"gradscape::{walls}"]
+    real, vec3, vec4, Nodes, Paths = types.real, types.vec3, types.vec4, types.rows[2], wp.array3d[types.vec3]
+    Lattice, Substep, template = lattice(name), substep_struct(name), [f"gradscape::{walls}"]
 
     @cpp.func_native(called="place_of_node", template=[f"wp::{name}"], adjoint="")
     def place(lattice: Lattice, i: int) -> vec3: ...
 
     @cpp.func_native(adjoint="adj_free_velocity")
-    def free_velocity(dt: real, gravity: real, grid_m: wp.array2d[vec4], e: int, i: int) -> vec3: ...
+    def free_velocity(now: Substep, grid_m: Nodes, e: int, i: int) -> vec3: ...
 
     @cpp.func_native(template=template, adjoint="")
-    def list_near(
-        e: int,
-        lattice: Lattice,
-        data: Data,
-        empty: real,
-        step: int,
-        fraction: real,
-        tools: wp.array3d[vec3],
-        grid_m: wp.array2d[vec4],
-        near: wp.array2d[int],
-    ): ...
+    def list_near(e: int, lattice: Lattice, data: Data, now: Substep, tools: Paths, grid_m: Nodes, near: Ints): ...
 
     @cpp.func_native(template=template, adjoint="adj_velocity_of_others", replay=False)
     def velocity_of_others(
-        e: int,
-        lattice: Lattice,
-        data: Data,
-        dt: real,
-        gravity: real,
-        empty: real,
-        step: int,
-        fraction: real,
-        tools: wp.array3d[vec3],
-        grid_m: wp.array2d[vec4],
-        near: wp.array2d[int],
-        grid_v: wp.array2d[vec4],
+        e: int, lattice: Lattice, data: Data, now: Substep, tools: Paths, grid_m: Nodes, near: Ints, grid_v: Nodes
     ): ...
 
     @wp.kernel(module="unique", module_options=cpp.options())
     def velocity(
         lattice: Lattice,
         boundary: Data,
-        dt: real,
-        gravity: real,
-        empty: real,
-        step: int,
-        fraction: real,
-        rate: real,
-        tools: wp.array3d[vec3],
-        sums: wp.array2d[wp.int64],
-        grid_m: wp.array2d[vec4],
-        grid_v: wp.array2d[vec4],
-        near: wp.array2d[int],
+        now: Substep,
+        tools: Paths,
+        sums: Sums,
+        grid_m: Nodes,
+        grid_v: Nodes,
+        near: Ints,
     ):
         e, _ = wp.tid()
-        list_near(e, lattice, boundary, empty, step, fraction, tools, grid_m, near)
-        velocity_of_others(e, lattice, boundary, dt, gravity, empty, step, fraction, tools, grid_m, near, grid_v)
+        list_near(e, lattice, boundary, now, tools, grid_m, near)
+        velocity_of_others(e, lattice, boundary, now, tools, grid_m, near, grid_v)
         count = near[e, 0]
         for n in range(count):
             i = near[e, count - n]  # the last comes first, so that adjoints come in the nodes' order
-            v = free_velocity(dt, gravity, grid_m, e, i)
-            v = boundary_velocity(boundary, place(lattice, i), v, e, i % LANES, tools, sums, step, fraction, rate)
+            v = free_velocity(now, grid_m, e, i)
+            v = boundary_velocity(boundary, place(lattice, i), v, e, i % LANES, tools, sums, now)
             grid_v[e, i] = vec4(v[0], v[1], v[2], real(0.0))
 
     return cpp.take_rows(velocity)
@@ -139,65 +102,41 @@ def velocity_of_columns(name: str, boundary_velocity: Any, Data: Any) -> Any:
 
     It runs over [environment, place in the grid].
     """
-    types, take_node = precision(name), node_taker()
-    real, vec3, vec4 = types.real, types.vec3, types.vec4
-    Lattice, velocity_at_node = lattice(name), velocity_at(name, boundary_velocity, Data)
+    types, take_node, Listed = precision(name), node_taker(), list_struct()
+    real, vec4, Nodes, Paths = types.real, types.vec4, types.rows[2], wp.array3d[types.vec3]
+    Lattice, Substep, velocity_at_node = lattice(name), substep_struct(name), velocity_at(name, boundary_velocity, Data)
 
     @cpp.func_native(called="write_sum", template=[SEGMENT, PARTS], adjoint="", replay=False)
-    def add_up(
-        lattice: Lattice,
-        planes: wp.array2d[wp.int32],
-        parts: wp.array2d[vec4],
-        grid: wp.array2d[vec4],
-        e: int,
-        i: int,
-        node: int,
-    ): ...
+    def add_up(lattice: Lattice, planes: Ints, parts: Nodes, grid: Nodes, e: int, i: int, node: int): ...
 
     # A node is read once, so that its adjoint can be set, where Warp would add to it atomically; and it is set once.
     @cpp.func_native(called="read_node", adjoint="set_adj_read_node")
-    def read(grid: wp.array2d[vec4], e: int, i: int) -> vec4: ...
+    def read(grid: Nodes, e: int, i: int) -> vec4: ...
 
     @cpp.func_native(called="write_with_parts", template=[SEGMENT, PARTS], adjoint="adj_write_with_parts", replay=False)
-    def write(
-        lattice: Lattice,
-        planes: wp.array2d[wp.int32],
-        parts: wp.array2d[vec4],
-        grid: wp.array2d[vec4],
-        e: int,
-        i: int,
-        node: int,
-        value: vec4,
-    ): ...
+    def write(lattice: Lattice, planes: Ints, parts: Nodes, grid: Nodes, e: int, i: int, node: int, value: vec4): ...
 
     @wp.kernel(module="unique", module_options=cpp.options(), launch_bounds=blocks(name))
     def velocity(
         lattice: Lattice,
         boundary: Data,
-        dt: real,
-        gravity: real,
-        empty: real,
-        step: int,
-        fraction: real,
-        rate: real,
-        tools: wp.array3d[vec3],
-        sums: wp.array2d[wp.int64],
-        grid_m: wp.array2d[vec4],
-        grid_v: wp.array2d[vec4],
-        planes: wp.array2d[wp.int32],
-        touched: wp.array2d[wp.int32],
-        nodes: wp.array2d[wp.int32],
-        parts: wp.array2d[vec4],
+        now: Substep,
+        tools: Paths,
+        sums: Sums,
+        grid_m: Nodes,
+        grid_v: Nodes,
+        lists: Listed,
+        parts: Nodes,
     ):
         e, i = wp.tid()
-        node = take_node(touched, nodes, e, i)
+        node = take_node(lists, e, i)
         if node >= 0:
-            add_up(lattice, planes, parts, grid_m, e, i, node)  # its adjoint finds in grid_m what it needs
+            add_up(lattice, lists.planes, parts, grid_m, e, i, node)  # its adjoint finds in grid_m what it needs
             g = read(grid_m, e, i)
-            if g[3] > empty:
-                v = velocity_at_node(lattice, boundary, dt, gravity, g, e, node, tools, sums, step, fraction, rate)
-                write(lattice, planes, parts, grid_v, e, i, node, vec4(v[0], v[1], v[2], real(0.0)))
+            if g[3] > now.empty:
+                v = velocity_at_node(lattice, boundary, now, g, e, node, tools, sums)
+                write(lattice, lists.planes, parts, grid_v, e, i, node, vec4(v[0], v[1], v[2], real(0.0)))
             else:
-                write(lattice, planes, parts, grid_v, e, i, node, vec4())
+                write(lattice, lists.planes, parts, grid_v, e, i, node, vec4())
 
     return velocity

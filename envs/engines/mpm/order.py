@@ -15,26 +15,45 @@ import warp as wp
 
 from .. import cpp
 from ..launches import Launches
-from ..runtime import load, precision, to_torch
+from ..runtime import Ints, load, precision, to_torch
 from .model import Model, place_grid
-from .stencil import lattice, layout
+from .stencil import lattice, layout, particles
+
+
+@cache
+@no_type_check
+def order_struct(name: str) -> Any:
+    """Return the struct of what `Order` holds."""
+    Reals = precision(name).rows[0]
+
+    @partial(wp.struct, module=f"gradscape.order.{name}")
+    class Rows:
+        """The fields of Order, [environment, particle]."""
+
+        place: Ints
+        name: Ints
+        mass: Reals
+        volume: Reals
+
+    return Rows
 
 
 @cache
 @no_type_check
 def sorting_kernels(name: str, key: Any) -> SimpleNamespace:
     """Return the kernels `label`, with keys of a type, `take, give`, and `take_state, give_state` by a state's type."""
-    types = precision(name)
-    real, vec3, mat33 = types.real, types.vec3, types.mat33
-    Lattice, module = lattice(name), cpp.module(f"gradscape.order.{name}.{key.__name__}")
-    read_matrix, write_matrix = layout(name).read_matrix, layout(name).write_matrix
+    types, lies = precision(name), layout(name)
+    real, mat33, Vectors = types.real, types.mat33, types.rows[1]
+    Lattice, Particles, Rows = lattice(name), particles(name), order_struct(name)
+    module = cpp.module(f"gradscape.order.{name}.{key.__name__}")
+    read_matrix, write_matrix = lies.read_matrix, lies.write_matrix
 
     @wp.kernel(module=module, enable_backward=False)
     def label(
         grid: Lattice,
         bodies: int,
         body: wp.array[wp.int32],
-        x: wp.array2d[vec3],
+        x: Vectors,
         keys: wp.array[key],
         places: wp.array[wp.int32],
     ):
@@ -50,58 +69,27 @@ def sorting_kernels(name: str, key: Any) -> SimpleNamespace:
         places[at] = p
 
     @wp.kernel(module=module, enable_backward=False)
-    def take(
-        places: wp.array[wp.int32],
-        place: wp.array2d[wp.int32],
-        old_name: wp.array2d[wp.int32],
-        old_mass: wp.array2d[real],
-        old_volume: wp.array2d[real],
-        old_x: wp.array2d[vec3],
-        old_v: wp.array2d[vec3],
-        old_C: wp.array2d[mat33],
-        name: wp.array2d[wp.int32],
-        mass: wp.array2d[real],
-        volume: wp.array2d[real],
-        x: wp.array2d[vec3],
-        v: wp.array2d[vec3],
-        C: wp.array2d[mat33],
-    ):
+    def take(places: wp.array[wp.int32], before: Rows, old: Particles, order: Rows, after: Particles):
         e, p = wp.tid()
-        q = places[e * x.shape[1] + p]
-        place[e, p] = q
-        name[e, p] = old_name[e, q]
-        mass[e, p] = old_mass[e, q]
-        volume[e, p] = old_volume[e, q]
-        x[e, p] = old_x[e, q]
-        v[e, p] = old_v[e, q]
-        write_matrix(C, e, p, read_matrix(old_C, e, q))
+        q = places[e * old.x.shape[1] + p]
+        order.place[e, p] = q
+        order.name[e, p] = before.name[e, q]
+        order.mass[e, p] = before.mass[e, q]
+        order.volume[e, p] = before.volume[e, q]
+        after.x[e, p] = old.x[e, q]
+        after.v[e, p] = old.v[e, q]
+        write_matrix(after.C, e, p, read_matrix(old.C, e, q))
 
     @wp.kernel(module=module, enable_backward=False)
-    def give(
-        place: wp.array2d[wp.int32],
-        x: wp.array2d[vec3],
-        v: wp.array2d[vec3],
-        C: wp.array2d[mat33],
-        old_x: wp.array2d[vec3],
-        old_v: wp.array2d[vec3],
-        old_C: wp.array2d[mat33],
-    ):
+    def give(place: Ints, after: Particles, old: Particles):
         e, p = wp.tid()
         q = place[e, p]
-        old_x[e, q] = x[e, p]
-        old_v[e, q] = v[e, p]
-        write_matrix(old_C, e, q, read_matrix(C, e, p))
-
-    @wp.func(module=module)
-    def read_number(values: wp.array2d[real], e: int, p: int) -> real:
-        return values[e, p]
-
-    @wp.func(module=module)
-    def write_number(values: wp.array2d[real], e: int, p: int, value: real):
-        values[e, p] = value
+        old.x[e, q] = after.x[e, p]
+        old.v[e, q] = after.v[e, p]
+        write_matrix(old.C, e, q, read_matrix(after.C, e, p))
 
     states = {
-        real: _state_kernels(real, cpp.module(f"{module}.number"), read_number, write_number),
+        real: _state_kernels(real, cpp.module(f"{module}.number"), lies.read_number, lies.write_number),
         mat33: _state_kernels(mat33, cpp.module(f"{module}.matrix"), read_matrix, write_matrix),
     }
     return SimpleNamespace(label=label, take=take, give=give, states=states)
@@ -110,12 +98,12 @@ def sorting_kernels(name: str, key: Any) -> SimpleNamespace:
 @no_type_check
 def _state_kernels(kind: Any, module: str, read: Any, write: Any) -> tuple[Any, Any]:
     @wp.kernel(module=module, enable_backward=False)
-    def take_state(first: int, place: wp.array2d[wp.int32], before: wp.array2d[kind], after: wp.array2d[kind]):
+    def take_state(first: int, place: Ints, before: wp.array2d[kind], after: wp.array2d[kind]):
         e, p = wp.tid()
         write(after, e, p, read(before, e, place[e, first + p] - first))
 
     @wp.kernel(module=module, enable_backward=False)
-    def give_state(first: int, place: wp.array2d[wp.int32], after: wp.array2d[kind], before: wp.array2d[kind]):
+    def give_state(first: int, place: Ints, after: wp.array2d[kind], before: wp.array2d[kind]):
         e, p = wp.tid()
         write(before, e, place[e, first + p] - first, read(after, e, p))
 
@@ -136,6 +124,13 @@ class Order:
         real, numbers = precision(model.precision).real, np.arange(model.particles, dtype=np.int32)
         self.place, self.name = rows(numbers, wp.int32), rows(numbers, wp.int32)
         self.mass, self.volume = rows(model.mass, real), rows(model.volume, real)
+        self.struct = order_struct(model.precision)()
+        self.struct.place, self.struct.name, self.struct.mass, self.struct.volume = (
+            self.place,
+            self.name,
+            self.mass,
+            self.volume,
+        )
 
     def to_model(self, x: torch.Tensor) -> torch.Tensor:
         """Return what lies in this order, shape (batch, particle, *), in the model's."""
@@ -173,15 +168,14 @@ class Sorter:
         launch(self.kernels.label, (batch, count), inputs)
         # What is stored must not hold this: a cycle would keep a GPU's memory until it is collected.
         self.launches.call(partial(wp.utils.radix_sort_pairs, self.keys, self.places, batch * count, 0, self.bits))
-        theirs = [before.name, before.mass, before.volume, old.x, old.v, old.C]
-        ours = [order.name, order.mass, order.volume, new.x, new.v, new.C]
-        launch(self.kernels.take, (batch, count), [self.places, order.place, *theirs, *ours])
+        inputs = [self.places, before.struct, old.particles, order.struct, new.particles]
+        launch(self.kernels.take, (batch, count), inputs)
         for first, source, S in zip(self.first, old.S, new.S, strict=True):
             launch(self.kernels.states[S.dtype][0], (batch, S.shape[1]), [first, order.place, source, S])
 
     def unsort(self, new: Any, old: Any, order: Order, batch: int) -> None:
         """Launch what fills the frame `old`, in the order of the step before, from the frame `new`, in `order`."""
-        arrays = [new.x, new.v, new.C, old.x, old.v, old.C]
-        self.launches.launch(self.kernels.give, (batch, self.model.particles), [order.place, *arrays])
+        inputs = [order.place, new.particles, old.particles]
+        self.launches.launch(self.kernels.give, (batch, self.model.particles), inputs)
         for first, S, target in zip(self.first, new.S, old.S, strict=True):
             self.launches.launch(self.kernels.states[S.dtype][1], (batch, S.shape[1]), [first, order.place, S, target])

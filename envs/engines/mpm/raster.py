@@ -21,18 +21,12 @@ WHOLE = 2.0**60  # units of the mass of all particles
 def count_kernel(name: str) -> Any:
     """Return the kernel that adds particles' masses, in units, to their nodes."""
     types = precision(name)
-    real, vec3 = types.real, types.vec3
+    real, vec3, (Reals, Vectors, _, _) = types.real, types.vec3, types.rows
     Lattice, spline = lattice(name), stencil(name)
     base_node, weights = spline.base_node, spline.weights
 
     @wp.kernel(module=cpp.module(f"gradscape.raster.{name}"), enable_backward=False)
-    def count_mass(
-        lattice: Lattice,
-        mass: wp.array2d[real],
-        x: wp.array2d[vec3],
-        units: wp.float64,
-        grid: wp.array2d[wp.int64],
-    ):
+    def count_mass(lattice: Lattice, mass: Reals, x: Vectors, units: wp.float64, grid: wp.array2d[wp.int64]):
         e, p = wp.tid()
         s = (x[e, p] - lattice.origin) * lattice.inv_dx
         base = base_node(s, lattice)
@@ -67,9 +61,9 @@ class Raster:
         load([self.kernels.adjoint_p2g, *([self.count] if self.counting else [])], device)
         self.unit = float(mass.sum()) / WHOLE
         self.mass: wp.array = wp.array(np.tile(mass, (capacity, 1)), dtype=types.real, device=device)
-        kinds = types.vec3, types.vec3, types.mat33, types.vec3, types.vec3, types.mat33
-        particles = [wp.zeros((capacity, len(mass)), dtype=kind, device=device) for kind in kinds]
-        self.particles, self.adjoints = particles[:3], particles[3:]  # x, v, A: a mass does not depend on v and A
+        kinds = 2 * (types.vec3, types.vec3, types.mat33)
+        arrays = [wp.zeros((capacity, len(mass)), dtype=kind, device=device) for kind in kinds]
+        self.particles, self.adjoints = arrays[:3], arrays[3:]  # x, v, A: a mass does not depend on v and A
         self.grid = wp.zeros((capacity, model.cells), dtype=types.vec4, device=device)
         starts = np.arange(0, model.cells, model.nodes[2], dtype=np.int32)  # of columns of nodes, which have all theirs
         self.starts: list[wp.array] = [wp.array(np.tile(starts, (capacity, 1)), device=device)] if self.counting else []

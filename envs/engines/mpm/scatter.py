@@ -18,9 +18,9 @@ from .columns import (
     SEGMENT,
     SIZES,
     STRETCH,
-    Lists,
     cell_kernels,
     column_kernels,
+    count_struct,
     placing_warps,
     segments,
     warps,
@@ -67,7 +67,7 @@ class Scatter(abc.ABC):
         In place, it sets that of x; by columns, what gathers the adjoint of p2g does so.
         """
 
-    def to_add_up(self, step: int, substep: int) -> list[wp.array]:
+    def to_add_up(self, step: int, substep: int) -> list[Any]:
         """Return what nodes add up themselves, as their kernel takes it."""
         return []
 
@@ -108,8 +108,8 @@ class ByColumns(Scatter):
         self.kernels = column_kernels(model.precision, self.team)
         self.listing = cell_kernels(model.precision)
         load([self.kernels.p2g, self.listing.count], device)
-        self.cells, self.numbers, self.arrived = (allocator.array(wp.int32, model.particles) for _ in range(3))
-        self.used, self.sizes = (allocator.array(wp.int32, count) for count in (2, SIZES))
+        fixed = {"used": 2, "sizes": SIZES} | dict.fromkeys(("cells", "numbers", "arrived"), model.particles)
+        self.fixed = {field: allocator.array(wp.int32, count) for field, count in fixed.items()}
         self._allocate(1)
 
     def make_room(self, box: Box) -> bool:
@@ -122,25 +122,19 @@ class ByColumns(Scatter):
 
     def begin(self) -> None:
         """Forget what a run that was interrupted has left."""
-        for array in (self.counts, self.used, self.sizes, self.spans):
+        for array in (self.counts.counts, self.counts.used, self.counts.sizes, self.counts.spans):
             array.zero_()
 
     def list_particles(self, step: int, substep: int, frame: Frame, batch: int, *, counted: bool) -> None:
         """Find out where particles are, before a substep; g2p may have `counted` them already."""
         solver, tape, kernels = self.solver, self.solver.tape(step), self.listing
-        lists: Lists = tape.lists[substep]
-        count = solver.model.particles
+        lists, count = tape.lists[substep].struct, solver.model.particles
         if not counted:
-            inputs = [tape.lattice, frame.x, self.cells, self.numbers, self.counts]
-            solver.launch(kernels.count, count, batch, inputs)
-        inputs = [tape.lattice, self.counts, self.used, self.sizes, self.places, *self.found, lists.planes]
-        inputs += [self.spans, lists.touched, self.stretch(batch)]
-        solver.launch_on_box(kernels.place_segments, warps, batch, inputs)
-        inputs = [tape.lattice, self.cells, self.numbers, self.places, self.used, self.sizes, *self.found, self.arrived]
-        inputs += [lists.full, lists.walks, self.spans, lists.touched, lists.starts, lists.nodes]
+            solver.launch(kernels.count, count, batch, [tape.lattice, frame.x, self.counts])
+        inputs = [tape.lattice, self.counts, lists]
+        solver.launch_on_box(kernels.place_segments, warps, batch, [*inputs, self.stretch(batch)])
         solver.launch_on_box(kernels.place, partial(placing_warps, count), batch, inputs)
-        inputs = [tape.lattice, self.cells, self.places, self.arrived, self.used, self.sizes, self.spans, lists.order]
-        solver.launch(kernels.tidy, count, batch, [*inputs, lists.touched, solver.needed])
+        solver.launch(kernels.tidy, count, batch, [*inputs, solver.needed])
 
     def where(self, step: int, substep: int) -> list[Any]:
         """Return what says where nodes are in grids, as kernels that gather take it."""
@@ -149,25 +143,24 @@ class ByColumns(Scatter):
 
     def counting(self, counted: bool) -> list[Any]:
         """Return what g2p takes so as to count particles where it moves them to."""
-        return [int(counted), self.cells, self.numbers, self.counts]
+        return [self.counts, int(counted)]
 
     def p2g(self, step: int, substep: int, frame: Frame, batch: int) -> None:
         """Make parts of what nodes get of momentum and mass."""
-        inputs = [self.solver.orders[step].mass, frame.x, frame.v, self.solver.tape(step).A[substep]]
+        inputs = [self.solver.orders[step].mass, frame.particles, self.solver.tape(step).A[substep]]
         self.walk(self.kernels.p2g, step, substep, batch, inputs)
 
     def adjoint_g2p(
         self, step: int, substep: int, frame: Frame, new: Frame, grid_v: wp.array, adj_x: wp.array, batch: int
     ) -> None:
         """Make parts of the adjoint of the grid's velocity, from those of the frame `new`."""
-        inputs = [self.solver.model.dt, frame.x, new.x, new.v, new.C]
+        inputs = [self.solver.model.dt, frame.x, new.particles]
         self.walk(self.kernels.adjoint_g2p, step, substep, batch, inputs)
 
     def walk(self, kernel: Any, step: int, substep: int, batch: int, inputs: list[Any]) -> None:
         """Launch a kernel that leaves parts of sums at nodes, after the substep's lists."""
         tape = self.solver.tape(step)
-        lists: Lists = tape.lists[substep]
-        given = [tape.lattice, batch, lists.order, lists.full, lists.walks, *inputs, self.parts]
+        given = [tape.lattice, batch, tape.lists[substep].struct, *inputs, self.parts]
         self.solver.launch_on_box(kernel, partial(self.team.threads, stretch=self.stretch(batch)), batch, given)
 
     def stretch(self, batch: int) -> int:
@@ -179,20 +172,23 @@ class ByColumns(Scatter):
         inputs = [self.solver.tape(step).lattice, *self.to_add_up(step, substep), *grids]
         self.solver.launch_at_nodes(kernel, step, batch, inputs)
 
-    def to_add_up(self, step: int, substep: int) -> list[wp.array]:
+    def to_add_up(self, step: int, substep: int) -> list[Any]:
         """Return what nodes add up themselves, as their kernel takes it."""
-        lists: Lists = self.solver.tape(step).lists[substep]
-        return [lists.planes, lists.touched, lists.nodes, self.parts]
+        return [self.solver.tape(step).lists[substep].struct, self.parts]
 
     def _allocate(self, count: int) -> None:
         """Allocate what so many segments take."""
         allocator = self.solver.allocator
         self.parts: wp.array = allocator.array(allocator.types.vec4, count * PARTS)
-        self.counts: wp.array = allocator.array(wp.int32, count * SEGMENT)
-        self.places: wp.array = allocator.array(wp.vec2i, count * SEGMENT)
         walks = count * (SEGMENT // STRETCH)
-        self.found = allocator.array(wp.vec4i, walks), allocator.array(wp.int32, walks)
-        self.spans: wp.array = allocator.array(wp.int32, count * 2)  # of columns, of which there are no more
+        kinds = {"counts": (wp.int32, count * SEGMENT), "places": (wp.vec2i, count * SEGMENT)}
+        kinds |= {"found": (wp.vec4i, walks), "ranks": (wp.int32, walks)}
+        kinds |= {"spans": (wp.int32, count * 2)}  # of columns, of which there are no more
+        self.counts = count_struct()()
+        for field, array in self.fixed.items():
+            setattr(self.counts, field, array)
+        for field, (kind, size) in kinds.items():
+            setattr(self.counts, field, allocator.array(kind, size))
 
 
 def nodes(box: Box) -> int:

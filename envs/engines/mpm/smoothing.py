@@ -20,8 +20,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from .. import cpp
-from ..runtime import precision
-from .columns import Team, node_sum, node_taker, walker, walking_kernel
+from ..runtime import Ints, precision
+from .columns import Team, list_struct, node_sum, node_taker, walker, walking_kernel
 from .model import Model
 from .scatter import nodes
 from .stencil import gatherers, lattice, layout, stencil
@@ -39,21 +39,16 @@ class Smoother:
     def run(self, solver: Any, step: int, batch: int) -> None:
         """Fill the tape's first state from the checkpoint's."""
         self._spread(solver, step, batch)
-        inputs = [*solver.scatter.where(step, 0), self.first, self.slope, self.share, *self._particles(solver, step)]
-        inputs += [*self._sums(solver, step), solver.tape(step).smoothed[self.body]]
+        inputs = [*solver.scatter.where(step, 0), self._fluid(solver, step), *self._sums(solver, step)]
         solver.launch(self.kernels.collect, self.size, batch, inputs)
 
     def run_back(self, solver: Any, step: int, batch: int, adjoint: Any) -> None:
         """Turn the adjoint of the tape's first state into that of the checkpoint's, and add to that of x."""
-        amount, weight, adj_mean = self.nodes
-        tape, (x, J) = solver.tape(step), self._particles(solver, step)
-        adj_J, adj_x = adjoint.S[self.body], adjoint.x
         self._spread(solver, step, batch)
-        solver.launch_on_box(self.kernels.clear, nodes, batch, [adj_mean])
-        inputs = [tape.lattice, self.first, self.share, x, tape.smoothed[self.body], amount, weight]
-        solver.launch(self.kernels.adjoint_collect, self.size, batch, [*inputs, adj_J, adj_x, adj_mean])
-        inputs = [tape.lattice, self.first, self.slope, self.share, solver.orders[step].volume, x, J, *self.nodes]
-        solver.launch(self.kernels.adjoint_spread, self.size, batch, [*inputs, adj_J, adj_x])
+        solver.launch_on_box(self.kernels.clear, nodes, batch, [self.nodes[2]])
+        inputs = [solver.tape(step).lattice, self._fluid(solver, step), *self.nodes, adjoint.S[self.body], adjoint.x]
+        solver.launch(self.kernels.adjoint_collect, self.size, batch, inputs)
+        solver.launch(self.kernels.adjoint_spread, self.size, batch, inputs)
 
     def _prepare(self, solver: Any) -> None:
         self.kernels: Any = smoothing_kernels(solver.model.precision)
@@ -69,13 +64,16 @@ class Smoother:
         sums = self._sums(solver, step)
         for values in sums:
             solver.launch_on_box(self.kernels.clear, nodes, batch, [values])
-        inputs = [solver.tape(step).lattice, self.first, self.slope, solver.orders[step].volume]
-        inputs += [*self._particles(solver, step), *sums]
+        inputs = [solver.tape(step).lattice, self._fluid(solver, step), *sums]
         solver.launch(self.kernels.spread, self.size, batch, inputs)
 
-    def _particles(self, solver: Any, step: int) -> tuple[Any, Any]:
-        """Return all particles' x and the body's J at the step's beginning."""
-        return solver.checkpoints[step].x, solver.checkpoints[step].S[self.body]
+    def _fluid(self, solver: Any, step: int) -> Any:
+        """Return the body at a step's beginning as kernels take it."""
+        found, before = smoothed_struct(solver.model.precision)(), solver.checkpoints[step]
+        found.first, found.slope, found.share = self.first, self.slope, self.share
+        found.volume, found.x, found.J = solver.orders[step].volume, before.x, before.S[self.body]
+        found.J_new = solver.tape(step).smoothed[self.body]
+        return found
 
 
 class ColumnSmoother(Smoother):
@@ -86,13 +84,11 @@ class ColumnSmoother(Smoother):
 
     def run_back(self, solver: Any, step: int, batch: int, adjoint: Any) -> None:
         """Turn the adjoint of the tape's first state into that of the checkpoint's, and add to that of x."""
-        tape, (x, J), nodes = solver.tape(step), self._particles(solver, step), self._sums(solver, step)
-        adj_J, adj_x = adjoint.S[self.body], adjoint.x
-        J_new = tape.smoothed[self.body]
-        solver.scatter.walk(self.kernels.spread_adjoint, step, 0, batch, [self.first, self.share, x, J_new, adj_J])
+        nodes, fluid, adj_J = self._sums(solver, step), self._fluid(solver, step), adjoint.S[self.body]
+        solver.scatter.walk(self.kernels.spread_adjoint, step, 0, batch, [fluid, adj_J])
         solver.scatter.add_up(self.kernels.add_up_adjoint, step, 0, batch, nodes)
-        inputs = [*solver.scatter.where(step, 0), self.first, self.slope, self.share, solver.orders[step].volume]
-        solver.launch(self.kernels.adjoint_gather, self.size, batch, [*inputs, x, J, J_new, *nodes, adj_J, adj_x])
+        inputs = [*solver.scatter.where(step, 0), fluid, *nodes, adj_J, adjoint.x]
+        solver.launch(self.kernels.adjoint_gather, self.size, batch, inputs)
 
     def _prepare(self, solver: Any) -> None:
         self.kernels = smoothing_columns(solver.model.precision, solver.scatter.team)
@@ -102,8 +98,7 @@ class ColumnSmoother(Smoother):
         return [solver.tape(step).means[self.body]]
 
     def _spread(self, solver: Any, step: int, batch: int) -> None:
-        inputs = [self.first, self.slope, solver.orders[step].volume, *self._particles(solver, step)]
-        solver.scatter.walk(self.kernels.spread, step, 0, batch, inputs)
+        solver.scatter.walk(self.kernels.spread, step, 0, batch, [self._fluid(solver, step)])
         solver.scatter.add_up(self.kernels.add_up, step, 0, batch, self._sums(solver, step))
 
 
@@ -153,46 +148,49 @@ def _sum_at_nodes(
 
 @cache
 @no_type_check
+def smoothed_struct(name: str) -> Any:
+    """Return the struct of a body whose volume ratios are smoothed, in one precision."""
+    real, (Reals, Vectors, _, _) = precision(name).real, precision(name).rows
+
+    @partial(wp.struct, module=f"gradscape.smoothed.{name}")
+    class Smoothed:
+        """`volume` and `x` are those of all particles, of which the body's begin at `first`; J and J' are its own."""
+
+        first: int
+        slope: real
+        share: real
+        volume: Reals
+        x: Vectors
+        J: Reals
+        J_new: Reals
+
+    return Smoothed
+
+
+@cache
+@no_type_check
 def smoothing_kernels(name: str) -> SimpleNamespace:
     """Return `clear, spread, collect, adjoint_collect, adjoint_spread`, kernels of one precision for a CPU."""
-    types = precision(name)
-    real, Lattice, module = types.real, lattice(name), f"gradscape.smoothing.{name}"
+    real, (numbers, vectors, _, _), module = precision(name).real, precision(name).rows, f"gradscape.smoothing.{name}"
 
     @wp.kernel(module=cpp.module(module), enable_backward=False)
-    def clear(values: wp.array2d[real]):
+    def clear(values: numbers):
         e, i = wp.tid()
         values[e, i] = real(0.0)
 
-    numbers, vectors = wp.array2d[types.real], wp.array2d[types.vec3]
     declare = partial(cpp.kernel_in_rows, module)
-    begin, sums = {"lattice": Lattice, "first": int}, {"amount": numbers, "weight": numbers}
-    body, smoothed = {"x": vectors, "J": numbers}, {"x": vectors, "J_new": numbers}
-    adjoints = {"adj_J": numbers, "adj_x": vectors}
-    # Scatter V s and V.
-    spread = declare("smoothing_spread", **begin, slope=real, volume=numbers, **body, **sums)
-    # Gather the nodes' means and take J so far towards them.
-    collect = declare("smoothing_collect", **begin, slope=real, share=real, **body, **sums, J_new=numbers)
-    # Scatter the adjoints of the nodes' means; add to adj_x, turn adj_J from that of J' into that of log J'.
-    adjoint_collect = declare(
-        "smoothing_adjoint_collect", **begin, share=real, **smoothed, **sums, **adjoints, adj_mean=numbers
-    )
-    # Gather the adjoint of s; add to adj_x, turn adj_J from that of log J' into that of J.
-    body |= {**sums, "adj_mean": numbers}
-    adjoint_spread = declare(
-        "smoothing_adjoint_spread",
-        **begin,
-        slope=real,
-        share=real,
-        volume=numbers,
-        **body,
-        **adjoints,
-    )
+    given = {"lattice": lattice(name), "fluid": smoothed_struct(name), "amount": numbers, "weight": numbers}
+    adjoints = {"adj_mean": numbers, "adj_J": numbers, "adj_x": vectors}
     return SimpleNamespace(
         clear=clear,
-        spread=spread,
-        collect=collect,
-        adjoint_collect=adjoint_collect,
-        adjoint_spread=adjoint_spread,
+        # Scatter V s and V.
+        spread=declare("smoothing_spread", **given),
+        # Gather the nodes' means and take J so far towards them.
+        collect=declare("smoothing_collect", **given),
+        # Scatter the adjoints of the nodes' means; add to adj_x, turn adj_J from that of J' into that of log J'.
+        adjoint_collect=declare("smoothing_adjoint_collect", **given, **adjoints),
+        # Gather the adjoint of s; add to adj_x, turn adj_J from that of log J' into that of J.
+        adjoint_spread=declare("smoothing_adjoint_spread", **given, **adjoints),
     )
 
 
@@ -206,13 +204,13 @@ def smoothing_columns(name: str, team: Team) -> SimpleNamespace:
     Those that spread take threads in a `team`; particles of other bodies in the same cells give nothing. `collect` and
     `adjoint_gather` are over [environment, particle of the body].
     """
-    types = precision(name)
-    real, vec3, vec4 = types.real, types.vec3, types.vec4
-    Lattice, base_node, at_nodes = lattice(name), stencil(name).base_node, walker(name, sloping=False).at_nodes
-    from_base = gatherers(name).from_base
-    add_up_node, take_node = node_sum(name), node_taker()
+    types, lies, sums_of = precision(name), layout(name), gatherers(name)
+    real, vec3, vec4, mat33 = types.real, types.vec3, types.vec4, types.mat33
+    Reals, Vectors, Nodes, _ = types.rows
+    Lattice, Fluid, Listed = lattice(name), smoothed_struct(name), list_struct()
+    base_node, at_nodes = stencil(name).base_node, walker(name, sloping=False).at_nodes
+    gather, from_base, add_up_node, take_node = sums_of.gather, sums_of.from_base, node_sum(name), node_taker()
     module = cpp.module(f"gradscape.smoothing.{name}.columns.{team.lanes}")
-    lies, gather, mat33 = layout(name), gatherers(name).gather, types.mat33
     read_number, read_vector, read_node, write_node = (
         lies.read_number,
         lies.read_vector,
@@ -221,129 +219,75 @@ def smoothing_columns(name: str, team: Team) -> SimpleNamespace:
     )
 
     @wp.func(module=module)
-    def at(lattice: Lattice, starts: wp.array2d[wp.int32], nodes: wp.array2d[vec4], e: int, x: vec3, q: vec3):
+    def at(lattice: Lattice, starts: Ints, nodes: Nodes, e: int, x: vec3, q: vec3):
         """Return the sums of `gathers` at x, of what nodes hold, and of the slopes of w times its product with q."""
         base = base_node((x - lattice.origin) * lattice.inv_dx, lattice)
         f = from_base(x, base, lattice)
         return gather(lattice, starts, nodes, e, base - lattice.first, f, q, mat33(), real(0.0))
 
     @wp.func(module=module)
-    def given_volume(
-        lattice: Lattice,
-        body: int,
-        slope: real,
-        volume: wp.array2d[real],
-        x: wp.array2d[vec3],
-        J: wp.array2d[real],
-        e: int,
-        p: int,
-    ):
+    def given_volume(lattice: Lattice, fluid: Fluid, e: int, p: int):
         """Return what a particle gives to its nodes of V s and V."""
-        given = at_nodes(lattice, read_vector(x, e, p))
-        if p >= body and p < body + J.shape[1]:
-            V = read_number(volume, e, p)
-            given.q = vec3(V * (wp.log(read_number(J, e, p - body)) - slope * read_vector(x, e, p)[1]), V, real(0.0))
+        given = at_nodes(lattice, read_vector(fluid.x, e, p))
+        if p >= fluid.first and p < fluid.first + fluid.J.shape[1]:
+            V, J = read_number(fluid.volume, e, p), read_number(fluid.J, e, p - fluid.first)
+            given.q = vec3(V * (wp.log(J) - fluid.slope * read_vector(fluid.x, e, p)[1]), V, real(0.0))
         return given
 
     @wp.func(module=module)
-    def given_adjoint(
-        lattice: Lattice,
-        body: int,
-        share: real,
-        x: wp.array2d[vec3],
-        J_new: wp.array2d[real],
-        adj_J_new: wp.array2d[real],
-        e: int,
-        p: int,
-    ):
+    def given_adjoint(lattice: Lattice, fluid: Fluid, adj_J_new: Reals, e: int, p: int):
         """Return what a particle gives to its nodes of the adjoints of their means, from that of J'."""
-        given = at_nodes(lattice, read_vector(x, e, p))
-        if p >= body and p < body + J_new.shape[1]:
-            adj_log = read_number(adj_J_new, e, p - body) * read_number(J_new, e, p - body)
-            given.q = vec3(share * adj_log, real(0.0), real(0.0))
+        given = at_nodes(lattice, read_vector(fluid.x, e, p))
+        if p >= fluid.first and p < fluid.first + fluid.J_new.shape[1]:
+            adj_log = read_number(adj_J_new, e, p - fluid.first) * read_number(fluid.J_new, e, p - fluid.first)
+            given.q = vec3(fluid.share * adj_log, real(0.0), real(0.0))
         return given
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
-    def add_up(
-        lattice: Lattice,
-        planes: wp.array2d[wp.int32],
-        touched: wp.array2d[wp.int32],
-        named: wp.array2d[wp.int32],
-        parts: wp.array2d[vec4],
-        nodes: wp.array2d[vec4],
-    ):
+    def add_up(lattice: Lattice, lists: Listed, parts: Nodes, nodes: Nodes):
         """Set the nodes' means, and what these are shared by."""
         e, i = wp.tid()
-        node = take_node(touched, named, e, i)
+        node = take_node(lists, e, i)
         if node < 0:
             return
-        total = add_up_node(lattice, planes, parts, e, node)
+        total = add_up_node(lattice, lists.planes, parts, e, node)
         # A particle in the middle of a cell gives the farthest of its nodes nothing, and others may not meet these.
         inverse = wp.where(total[1] > real(0.0), real(1.0) / total[1], real(0.0))
         write_node(nodes, e, i, vec4(total[0] * inverse, real(0.0), real(0.0), inverse))
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
-    def collect(
-        lattice: Lattice,
-        starts: wp.array2d[wp.int32],
-        body: int,
-        slope: real,
-        share: real,
-        x: wp.array2d[vec3],
-        J: wp.array2d[real],
-        nodes: wp.array2d[vec4],
-        J_new: wp.array2d[real],
-    ):
+    def collect(lattice: Lattice, starts: Ints, fluid: Fluid, nodes: Nodes):
         """Gather the nodes' means and take J so far towards them."""
         e, p = wp.tid()
-        there = read_vector(x, e, body + p)
+        there = read_vector(fluid.x, e, fluid.first + p)
         sums = at(lattice, starts, nodes, e, there, vec3())
-        here = wp.log(read_number(J, e, p))
-        J_new[e, p] = wp.exp(here + share * (sums[0][0] - (here - slope * there[1])))
+        here = wp.log(read_number(fluid.J, e, p))
+        fluid.J_new[e, p] = wp.exp(here + fluid.share * (sums[0][0] - (here - fluid.slope * there[1])))
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
-    def add_up_adjoint(
-        lattice: Lattice,
-        planes: wp.array2d[wp.int32],
-        touched: wp.array2d[wp.int32],
-        named: wp.array2d[wp.int32],
-        parts: wp.array2d[vec4],
-        nodes: wp.array2d[vec4],
-    ):
+    def add_up_adjoint(lattice: Lattice, lists: Listed, parts: Nodes, nodes: Nodes):
         """Set the nodes' parts of the adjoint of s."""
         e, i = wp.tid()
-        node = take_node(touched, named, e, i)
+        node = take_node(lists, e, i)
         if node < 0:
             return
         held = read_node(nodes, e, i)
-        a = add_up_node(lattice, planes, parts, e, node)[0] * held[3]
+        a = add_up_node(lattice, lists.planes, parts, e, node)[0] * held[3]
         write_node(nodes, e, i, vec4(held[0], a, a * held[0], held[3]))
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
-    def adjoint_gather(
-        lattice: Lattice,
-        starts: wp.array2d[wp.int32],
-        body: int,
-        slope: real,
-        share: real,
-        volume: wp.array2d[real],
-        x: wp.array2d[vec3],
-        J: wp.array2d[real],
-        J_new: wp.array2d[real],
-        nodes: wp.array2d[vec4],
-        adj_J: wp.array2d[real],
-        adj_x: wp.array2d[vec3],
-    ):
+    def adjoint_gather(lattice: Lattice, starts: Ints, fluid: Fluid, nodes: Nodes, adj_J: Reals, adj_x: Vectors):
         """Gather the nodes' means and the adjoint of s; add to adj_x, turn adj_J from that of J' into that of J."""
         e, p = wp.tid()
-        there = read_vector(x, e, body + p)
-        ratio, V = read_number(J, e, p), read_number(volume, e, body + p)
-        beyond = wp.log(ratio) - slope * there[1]
-        g = read_number(adj_J, e, p) * read_number(J_new, e, p)
+        q, share = fluid.first + p, fluid.share
+        there = read_vector(fluid.x, e, q)
+        ratio, V = read_number(fluid.J, e, p), read_number(fluid.volume, e, q)
+        beyond = wp.log(ratio) - fluid.slope * there[1]
+        g = read_number(adj_J, e, p) * read_number(fluid.J_new, e, p)
         sums = at(lattice, starts, nodes, e, there, vec3(share * g, V * beyond, -V))
         adj_s = V * sums[0][1] - share * g
-        change = lattice.inv_dx * sums[4] - vec3(real(0.0), slope * adj_s, real(0.0))
-        adj_x[e, body + p] = read_vector(adj_x, e, body + p) + change
+        change = lattice.inv_dx * sums[4] - vec3(real(0.0), fluid.slope * adj_s, real(0.0))
+        adj_x[e, q] = read_vector(adj_x, e, q) + change
         adj_J[e, p] = (g + adj_s) / ratio
 
     return SimpleNamespace(

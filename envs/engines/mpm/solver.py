@@ -30,9 +30,9 @@ from .. import cpp
 from ..cpp import threads
 from ..launches import Launches
 from ..runtime import free_memory, load, precision, to_torch
-from .boundaries import settle_kernel
+from .boundaries import settle_kernel, substep_struct
 from .checkpoints import Allocator, Frame, Sizes, Tape
-from .columns import GPU_TEAM, cell_kernels, column_kernels, segments
+from .columns import GPU_TEAM, cell_kernels, column_kernels, list_struct, segments
 from .grid import velocity_on
 from .model import BOX_MARGIN, EMPTY, Box, Model, nodes_around
 from .order import Order, Sorter, sorting_kernels
@@ -93,7 +93,8 @@ class Adjoint:
         self.settle = settle_kernel(solver.model.precision)  # of a GPU, where nodes do not add to the adjoint itself
         load([self.settle] if solver.device != "cpu" else [], solver.device)
         # Adjoints that nobody wants, but Warp their place.
-        self.structs = lattice(solver.model.precision)(), type(solver.boundary)()
+        self.structs = lattice(solver.model.precision)(), type(solver.boundary)(), solver.substep()
+        self.lists = [list_struct()()] if solver.columns else []
 
     def run(self, adj_x: Mapping[int, torch.Tensor]) -> torch.Tensor:
         """Return the adjoint of the tools, shape (batch, step + 1, slot, 3)."""
@@ -148,8 +149,7 @@ class Adjoint:
     def _adjoint_velocity(self, step: int, substep: int, batch: int) -> None:
         solver = self.solver
         inputs = solver.velocity_inputs(step, substep)
-        adjoints = [*self.structs, *[None] * 6, self.tools, None, self.grid.m, self.grid.v]
-        adjoints += [None] * (len(inputs) - len(adjoints))
+        adjoints = [*self.structs, self.tools, None, self.grid.m, self.grid.v, *self.lists, None]
         how = {"adj_inputs": adjoints, "adj_outputs": [], "adjoint": True}
         solver.launch_at_nodes(solver.velocity, step, batch, inputs, **how)
 
@@ -355,7 +355,7 @@ class Solver:
         self.types = self.allocator.types
         self.kernels = (transfers_of_columns if columns else transfers)(model.precision)
         self.velocity = velocity_on(model.precision, model.boundary, columns=columns)
-        self.boundary = model.boundary.data(model.precision, device)
+        self.boundary, self.substep = model.boundary.data(model.precision, device), substep_struct(model.precision)
         self.materials = [group.material.kernels(model.precision, columns=columns) for group in model.groups]
         load([*vars(self.kernels).values(), self.velocity, *chain.from_iterable(self.materials)], device)
         self.first = np.concatenate([[0], np.cumsum([len(group.x) for group in model.groups])]).tolist()
@@ -577,36 +577,24 @@ class Solver:
 
     def _move_particles(self, frame: Frame, new: Frame, step: int, substep: int, batch: int, *, followed: bool) -> None:
         grid_v, where = self.tape(step).grids[substep].v, self.scatter.where(step, substep)
-        inputs = [*where, self.model.dt, frame.x, grid_v, new.x, new.v, new.C, self.left_box]
-        inputs += self.scatter.counting(followed)
+        moved = [new.particles] if self.columns else [new.x, new.v, new.C]
+        inputs = [*where, self.model.dt, frame.x, grid_v, *moved, self.left_box, *self.scatter.counting(followed)]
         self.launch(self.kernels.g2p, self.model.particles, batch, inputs)
 
     def material_inputs(self, b: int, step: int, frame: Frame) -> list[Any]:
         """Return what both kernels of a material take."""
-        dt, scale = self.model.dt, -self.model.dt * 4.0 / self.model.dx**2
-        constants = self.model.groups[b].material.constants()
-        order = self.orders[step]
-        return [self.first[b], dt, scale, *constants, order.mass, order.volume, frame.S[b], frame.C]
+        model, order = self.model, self.orders[step]
+        law = model.groups[b].material.law(model.precision)
+        law.first, law.dt, law.scale = self.first[b], model.dt, -model.dt * 4.0 / model.dx**2
+        return [law, order.mass, order.volume, frame.S[b], frame.C]
 
     def velocity_inputs(self, step: int, substep: int) -> list[Any]:
         """Return the arguments of the grid's velocity kernel."""
-        model, tape = self.model, self.tape(step)
-        time = [step, substep / model.substeps, 1.0 / (model.substeps * model.dt)]
-        grid = tape.grids[substep]
-        return [
-            tape.lattice,
-            self.boundary,
-            model.dt,
-            model.gravity,
-            self.empty,
-            *time,
-            self.tools,
-            self.sums,
-            grid.m,
-            grid.v,
-            *self.scatter.to_add_up(step, substep),
-            *self.listed,
-        ]
+        model, tape, now = self.model, self.tape(step), self.substep()
+        now.dt, now.gravity, now.empty = model.dt, model.gravity, self.empty
+        now.step, now.fraction, now.rate = step, substep / model.substeps, 1.0 / (model.substeps * model.dt)
+        grid, summed = tape.grids[substep], self.scatter.to_add_up(step, substep)
+        return [tape.lattice, self.boundary, now, self.tools, self.sums, grid.m, grid.v, *summed, *self.listed]
 
     def parallel_to_others(self, b: int) -> AbstractContextManager[None]:
         """Let a GPU run what is launched for a body parallel to what is for the others, up to the next join."""

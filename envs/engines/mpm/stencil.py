@@ -8,7 +8,7 @@ import torch
 import warp as wp
 
 from .. import cpp
-from ..runtime import precision
+from ..runtime import Ints, precision
 
 # ---- How arrays lie in memory, and how they are read and written: wide reads on a GPU, Warp's own on a CPU.
 #
@@ -21,30 +21,36 @@ from ..runtime import precision
 @cache
 @no_type_check
 def layout(name: str) -> SimpleNamespace:
-    """Return the functions `read_matrix, write_matrix, read_node, write_node, read_number, read_vector`."""
+    """Return the functions that read and write a number, a matrix or a node, and that reads a vector."""
     types = precision(name)
     real, vec3, mat33, vec4 = types.real, types.vec3, types.mat33, types.vec4
+    Reals, Vectors, Nodes, Matrices = types.rows
 
     @cpp.func_native(adjoint="adj_read_element")
-    def read_matrix(values: wp.array2d[mat33], e: int, p: int) -> mat33: ...
+    def read_matrix(values: Matrices, e: int, p: int) -> mat33: ...
 
     @cpp.func_native(adjoint="adj_write_matrix")
-    def write_matrix(values: wp.array2d[mat33], e: int, p: int, value: mat33): ...
+    def write_matrix(values: Matrices, e: int, p: int, value: mat33): ...
 
     @cpp.func_native(adjoint="adj_read_element")
-    def read_node(grid: wp.array2d[vec4], e: int, i: int) -> vec4: ...
+    def read_node(grid: Nodes, e: int, i: int) -> vec4: ...
 
     @cpp.func_native()
-    def write_node(grid: wp.array2d[vec4], e: int, i: int, value: vec4): ...
+    def write_node(grid: Nodes, e: int, i: int, value: vec4): ...
 
     @cpp.func_native(called="read_element", adjoint="adj_read_element")
-    def read_number(values: wp.array2d[real], e: int, i: int) -> real: ...
+    def read_number(values: Reals, e: int, i: int) -> real: ...
+
+    @wp.func(module=f"gradscape.layout.{name}")
+    def write_number(values: Reals, e: int, i: int, value: real):
+        values[e, i] = value
 
     @cpp.func_native(called="read_element", adjoint="adj_read_element")
-    def read_vector(values: wp.array2d[vec3], e: int, i: int) -> vec3: ...
+    def read_vector(values: Vectors, e: int, i: int) -> vec3: ...
 
     return SimpleNamespace(
         read_number=read_number,
+        write_number=write_number,
         read_vector=read_vector,
         read_matrix=read_matrix,
         write_matrix=write_matrix,
@@ -83,6 +89,23 @@ def lattice(name: str) -> type:
         nz: int
 
     return Lattice
+
+
+@cache
+@no_type_check
+def particles(name: str) -> type:
+    """Return the struct of particles' places, velocities and affine velocities, or of the adjoints of these."""
+    _, Vectors, _, Matrices = precision(name).rows
+
+    @partial(wp.struct, module=f"gradscape.particles.{name}")
+    class Particles:
+        """x [m], v [m/s] and C [1/s], [environment, particle]."""
+
+        x: Vectors
+        v: Vectors
+        C: Matrices
+
+    return Particles
 
 
 @cache
@@ -138,15 +161,15 @@ def gatherers(name: str) -> SimpleNamespace:
     `from_base(x, base, lattice)` is where x is from node `base`, in cells.
     """
     types = precision(name)
-    real, vec3, vec4, mat33 = types.real, types.vec3, types.vec4, types.mat33
+    real, vec3, mat33, Nodes = types.real, types.vec3, types.mat33, types.rows[2]
     Lattice, Sums = lattice(name), wp.types.matrix((5, 3), real)
 
     def declare(with_mass: bool):
         @cpp.func_native(called="gather_sums", template=[str(with_mass).lower()])
         def gather(
             lattice: Lattice,
-            starts: wp.array2d[wp.int32],
-            grid: wp.array2d[vec4],
+            starts: Ints,
+            grid: Nodes,
             e: int,
             corner: wp.vec3i,
             f: vec3,
@@ -172,21 +195,22 @@ def adjoint_gatherers(name: str) -> SimpleNamespace:
     `p2g` takes a particle's affine `momentum` A as a matrix. The adjoint of x is the sum of both.
     """
     types, lies, sums_of = precision(name), layout(name), gatherers(name)
-    real, vec3, vec4, mat33 = types.real, types.vec3, types.vec4, types.mat33
-    Lattice, base_node, module = lattice(name), stencil(name).base_node, f"gradscape.gathers.{name}"
+    real, mat33, (Reals, Vectors, Nodes, Matrices) = types.real, types.mat33, types.rows
+    Lattice, base_node = lattice(name), stencil(name).base_node
+    module = f"gradscape.gathers.{name}"
     gather, gather_with_mass, from_base = sums_of.gather, sums_of.gather_with_mass, sums_of.from_base
     read_number, read_vector, read_matrix = lies.read_number, lies.read_vector, lies.read_matrix
 
     @wp.func(module=module)
     def g2p(
         lattice: Lattice,
-        starts: wp.array2d[wp.int32],
+        starts: Ints,
         dt: real,
-        x: wp.array2d[vec3],
-        grid_v: wp.array2d[vec4],
-        adj_x_new: wp.array2d[vec3],
-        adj_v_new: wp.array2d[vec3],
-        adj_C_new: wp.array2d[mat33],
+        x: Vectors,
+        grid_v: Nodes,
+        adj_x_new: Vectors,
+        adj_v_new: Vectors,
+        adj_C_new: Matrices,
         e: int,
         p: int,
     ):
@@ -202,13 +226,13 @@ def adjoint_gatherers(name: str) -> SimpleNamespace:
     @wp.func(module=module)
     def p2g(
         lattice: Lattice,
-        starts: wp.array2d[wp.int32],
-        mass: wp.array2d[real],
-        x: wp.array2d[vec3],
-        v: wp.array2d[vec3],
+        starts: Ints,
+        mass: Reals,
+        x: Vectors,
+        v: Vectors,
         momentum: mat33,
-        adj_grid_m: wp.array2d[vec4],
-        adj_v: wp.array2d[vec3],
+        adj_grid_m: Nodes,
+        adj_v: Vectors,
         e: int,
         p: int,
     ):

@@ -15,18 +15,17 @@ from typing import no_type_check
 import warp as wp
 
 from .. import cpp
-from ..runtime import precision
-from .columns import counter
-from .stencil import adjoint_gatherers, gatherers, lattice, layout, stencil
+from ..runtime import Ints, precision
+from .columns import count_struct, counter
+from .stencil import adjoint_gatherers, gatherers, lattice, layout, particles, stencil
 
 
 @cache
 @no_type_check
 def transfers(name: str) -> SimpleNamespace:
     """Return the transfer kernels `p2g, g2p, adjoint_p2g, adjoint_g2p` of one precision for a CPU."""
-    types, Lattice = precision(name), lattice(name)
-    real, numbers, vectors = types.real, wp.array2d[types.real], wp.array2d[types.vec3]
-    nodes, matrices = wp.array2d[types.vec4], wp.array2d[types.mat33]
+    Lattice, real = lattice(name), precision(name).real
+    numbers, vectors, nodes, matrices = precision(name).rows
     declare = partial(cpp.kernel_in_rows, f"gradscape.transfers.{name}")
     given = {"lattice": Lattice, "mass": numbers, "x": vectors, "v": vectors, "A": matrices}
     gathered = {"lattice": Lattice, "dt": real, "x": vectors, "grid_v": nodes}
@@ -51,28 +50,29 @@ def transfers_of_columns(name: str) -> SimpleNamespace:
     The scatters are in `columns`. These take what those of `transfers` do, but g2p counts particles by cell, where
     they are then, if it is told to.
     """
-    types, sums_of = precision(name), gatherers(name)
-    real, vec3, vec4, mat33 = types.real, types.vec3, types.vec4, types.mat33
-    module, lies = cpp.module(f"gradscape.transfers.{name}.columns"), layout(name)
-    Lattice, base_node, count_in_cell = lattice(name), stencil(name).base_node, counter(name)
+    types, sums_of, lies = precision(name), gatherers(name), layout(name)
+    real, vec3, mat33 = types.real, types.vec3, types.mat33
+    Reals, Vectors, Nodes, Matrices = types.rows
+    Lattice, Particles, Counting = lattice(name), particles(name), count_struct()
+    module, base_node, count_in_cell = (
+        cpp.module(f"gradscape.transfers.{name}.columns"),
+        stencil(name).base_node,
+        counter(name),
+    )
     gather, from_base, gather_back = sums_of.gather, sums_of.from_base, adjoint_gatherers(name).p2g
     read_vector, read_matrix, write_matrix = lies.read_vector, lies.read_matrix, lies.write_matrix
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def g2p(
         lattice: Lattice,
-        starts: wp.array2d[wp.int32],
+        starts: Ints,
         dt: real,
-        x: wp.array2d[vec3],
-        grid_v: wp.array2d[vec4],
-        x_new: wp.array2d[vec3],
-        v_new: wp.array2d[vec3],
-        C_new: wp.array2d[mat33],
+        x: Vectors,
+        grid_v: Nodes,
+        after: Particles,
         left_box: wp.array[wp.int32],
-        counting: int,
-        cells: wp.array2d[wp.int32],
-        numbers: wp.array2d[wp.int32],
-        counts: wp.array2d[wp.int32],
+        counts: Counting,
+        wanted: int,
     ):
         """Gather v' = sum w v_i and C' = 4/dx^2 sum w v_i (x_i - x)^T; move x' = x + dt v'."""
         e, p = wp.tid()
@@ -82,27 +82,27 @@ def transfers_of_columns(name: str) -> SimpleNamespace:
         sums = gather(lattice, starts, grid_v, e, base - lattice.first, f, vec3(), mat33(), real(0.0))
         v = sums[0]
         C = wp.matrix_from_cols(sums[1] - f[0] * v, sums[2] - f[1] * v, sums[3] - f[2] * v)
-        write_matrix(C_new, e, p, (real(4.0) * lattice.inv_dx) * C)
+        write_matrix(after.C, e, p, (real(4.0) * lattice.inv_dx) * C)
         there = here + dt * v
-        v_new[e, p] = v
-        x_new[e, p] = there
+        after.v[e, p] = v
+        after.x[e, p] = there
         if wp.min(wp.min(f[0], f[1]), f[2]) < real(0.49) or wp.max(wp.max(f[0], f[1]), f[2]) > real(1.51):
             left_box[e] = 1
-        if counting > 0:
-            count_in_cell(lattice, there, e, p, cells, numbers, counts)
+        if wanted > 0:
+            count_in_cell(lattice, there, e, p, counts)
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def adjoint_p2g(
         lattice: Lattice,
-        starts: wp.array2d[wp.int32],
-        mass: wp.array2d[real],
-        x: wp.array2d[vec3],
-        v: wp.array2d[vec3],
-        A: wp.array2d[mat33],
-        adj_grid_m: wp.array2d[vec4],
-        adj_x: wp.array2d[vec3],
-        adj_v: wp.array2d[vec3],
-        adj_A: wp.array2d[mat33],
+        starts: Ints,
+        mass: Reals,
+        x: Vectors,
+        v: Vectors,
+        A: Matrices,
+        adj_grid_m: Nodes,
+        adj_x: Vectors,
+        adj_v: Vectors,
+        adj_A: Matrices,
     ):
         """Gather the adjoints of p2g: add to adj_x, set adj_v and adj_A."""
         e, p = wp.tid()

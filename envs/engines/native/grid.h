@@ -126,27 +126,28 @@ template <typename Real, typename Lattice> inline Vec3<Real> place_of_node(const
         lattice, i / (lattice.nz * lattice.ny), i / lattice.nz % lattice.ny, i % lattice.nz);
     return Vec3<Real>(p[0], p[1], p[2]);
 }
-template <typename Real>
-inline Vec3<Real> free_velocity(Real dt, Real gravity, const Rows<Vec4<Real>>& grid_m, int e, int i) {
+template <typename Real, typename Substep>
+inline Vec3<Real> free_velocity(const Substep& now, const Rows<Vec4<Real>>& grid_m, int e, int i) {
     const Quad<Real>* G = (const Quad<Real>*)&wp::index(grid_m, e, 0);
-    const Quad<Real> v = velocity_after_gravity<Real>(G[i], dt, gravity);
+    const Quad<Real> v = velocity_after_gravity<Real>(G[i], now.dt, now.gravity);
     return Vec3<Real>(v[0], v[1], v[2]);
 }
-template <typename Real>
+template <typename Real, typename Substep>
 inline void adj_free_velocity(
-    Real, Real, const Rows<Vec4<Real>>& grid_m, int e, int i, Real, Real, const Rows<Vec4<Real>>& adj_grid_m, int, int,
-    const Vec3<Real>& adj_ret) {
+    const Substep&, const Rows<Vec4<Real>>& grid_m, int e, int i, const Substep&, const Rows<Vec4<Real>>& adj_grid_m,
+    int, int, const Vec3<Real>& adj_ret) {
     const Quad<Real>* G = (const Quad<Real>*)&wp::index(grid_m, e, 0);
     *(Quad<Real>*)&wp::index(adj_grid_m, e, i) =
         adj_velocity_after_gravity<Real>(G[i], Quad<Real>{adj_ret[0], adj_ret[1], adj_ret[2], Real(0.0)});
 }
 
 // List the numbers of nodes that carry a velocity and are within reach of a tool, in their order, after how many.
-template <template <typename, typename> class Walls, typename Real, typename Lattice, typename Data>
+template <template <typename, typename> class Walls, typename Real, typename Lattice, typename Data, typename Substep>
 inline void list_near(
-    int e, const Lattice& lattice, const Data& data, Real empty, int step, Real fraction,
-    const wp::array_t<Vec3<Real>>& tools, const Rows<Vec4<Real>>& grid_m, const Rows<wp::int32>& near) {
-    const Walls<Real, Data> walls(data, tools, e, step, fraction);
+    int e, const Lattice& lattice, const Data& data, const Substep& now, const wp::array_t<Vec3<Real>>& tools,
+    const Rows<Vec4<Real>>& grid_m, const Rows<wp::int32>& near) {
+    const Walls<Real, Data> walls(data, tools, e, now.step, now.fraction);
+    const Real empty = now.empty;
     const Real* MASS = (const Real*)&wp::index(grid_m, e, 0) + 3;
     int *NEAR = &wp::index(near, e, 0), count = 0;
     for (int i = 0; i < lattice.nx; ++i)
@@ -178,12 +179,12 @@ inline void each_other_node(const Lattice& lattice, const Rows<wp::int32>& near,
 }
 
 // Set the velocities of nodes that are not listed, and the adjoints of their momenta.
-template <template <typename, typename> class Walls, typename Real, typename Lattice, typename Data>
+template <template <typename, typename> class Walls, typename Real, typename Lattice, typename Data, typename Substep>
 inline void velocity_of_others(
-    int e, const Lattice& lattice, const Data& data, Real dt, Real gravity, Real empty, int step, Real fraction,
-    const wp::array_t<Vec3<Real>>& tools, const Rows<Vec4<Real>>& grid_m, const Rows<wp::int32>& near,
-    const Rows<Vec4<Real>>& grid_v) {
-    const Walls<Real, Data> walls(data, tools, e, step, fraction);
+    int e, const Lattice& lattice, const Data& data, const Substep& now, const wp::array_t<Vec3<Real>>& tools,
+    const Rows<Vec4<Real>>& grid_m, const Rows<wp::int32>& near, const Rows<Vec4<Real>>& grid_v) {
+    const Walls<Real, Data> walls(data, tools, e, now.step, now.fraction);
+    const Real dt = now.dt, gravity = now.gravity, empty = now.empty;
     const Quad<Real> zero = {}, *G = (const Quad<Real>*)&wp::index(grid_m, e, 0);
     Quad<Real>* V = (Quad<Real>*)&wp::index(grid_v, e, 0);
     each_other_node(lattice, near, e, [&](int n, int i, int j, int k) {
@@ -198,14 +199,14 @@ inline void velocity_of_others(
         V[n] = v;
     });
 }
-template <template <typename, typename> class Walls, typename Real, typename Lattice, typename Data>
+template <template <typename, typename> class Walls, typename Real, typename Lattice, typename Data, typename Substep>
 inline void adj_velocity_of_others(
-    int e, const Lattice& lattice, const Data& data, Real dt, Real gravity, Real empty, int step, Real fraction,
-    const wp::array_t<Vec3<Real>>& tools, const Rows<Vec4<Real>>& grid_m, const Rows<wp::int32>& near,
-    const Rows<Vec4<Real>>&, int, const Lattice&, const Data&, Real, Real, Real, int, Real,
-    const wp::array_t<Vec3<Real>>&, const Rows<Vec4<Real>>& adj_grid_m, const Rows<wp::int32>&,
-    const Rows<Vec4<Real>>& adj_grid_v) {
-    const Walls<Real, Data> walls(data, tools, e, step, fraction);
+    int e, const Lattice& lattice, const Data& data, const Substep& now, const wp::array_t<Vec3<Real>>& tools,
+    const Rows<Vec4<Real>>& grid_m, const Rows<wp::int32>& near, const Rows<Vec4<Real>>&, int, const Lattice&,
+    const Data&, const Substep&, const wp::array_t<Vec3<Real>>&, const Rows<Vec4<Real>>& adj_grid_m,
+    const Rows<wp::int32>&, const Rows<Vec4<Real>>& adj_grid_v) {
+    const Walls<Real, Data> walls(data, tools, e, now.step, now.fraction);
+    const Real dt = now.dt, gravity = now.gravity, empty = now.empty;
     const Quad<Real> zero = {}, *G = (const Quad<Real>*)&wp::index(grid_m, e, 0);
     const Quad<Real>* VA = (const Quad<Real>*)&wp::index(adj_grid_v, e, 0);
     Quad<Real>* GA = (Quad<Real>*)&wp::index(adj_grid_m, e, 0);

@@ -38,13 +38,13 @@ template <typename Real> struct RowSlopes {
     }
 };
 
-template <typename Real, typename Lattice>
+template <typename Real, typename Lattice, typename Fluid>
 inline void smoothing_spread(
-    int e, const Lattice& lattice, int first, Real slope, const Rows<Real>& volume, const Rows<Vec3<Real>>& x,
-    const Rows<Real>& J, const Rows<Real>& amount, const Rows<Real>& weight) {
-    const Real *X = row_of(x, e, first), *JJ = row_of(J, e), *VOLUME = row_of(volume, e, first);
+    int e, const Lattice& lattice, const Fluid& fluid, const Rows<Real>& amount, const Rows<Real>& weight) {
+    const Real *X = row_of(fluid.x, e, fluid.first), *JJ = row_of(fluid.J, e);
+    const Real *VOLUME = row_of(fluid.volume, e, fluid.first), slope = fluid.slope;
     Real *AMOUNT = row_of(amount, e), *WEIGHT = row_of(weight, e);
-    for (int p = 0, count = J.shape[1]; p < count; p += lanes) {
+    for (int p = 0, count = fluid.J.shape[1]; p < count; p += lanes) {
         const Group group(p, count);
         const Stencils<Real> at(lattice, X, group);
         const RowWeights<Real> weights(at);
@@ -64,13 +64,13 @@ inline void smoothing_spread(
     }
 }
 
-template <typename Real, typename Lattice>
+template <typename Real, typename Lattice, typename Fluid>
 inline void smoothing_collect(
-    int e, const Lattice& lattice, int first, Real slope, Real share, const Rows<Vec3<Real>>& x, const Rows<Real>& J,
-    const Rows<Real>& amount, const Rows<Real>& weight, const Rows<Real>& J_new) {
-    const Real *X = row_of(x, e, first), *JJ = row_of(J, e), *AMOUNT = row_of(amount, e), *WEIGHT = row_of(weight, e);
-    Real* JN = row_of(J_new, e);
-    for (int p = 0, count = J.shape[1]; p < count; p += lanes) {
+    int e, const Lattice& lattice, const Fluid& fluid, const Rows<Real>& amount, const Rows<Real>& weight) {
+    const Real *X = row_of(fluid.x, e, fluid.first), *JJ = row_of(fluid.J, e);
+    const Real *AMOUNT = row_of(amount, e), *WEIGHT = row_of(weight, e), slope = fluid.slope, share = fluid.share;
+    Real* JN = row_of(fluid.J_new, e);
+    for (int p = 0, count = fluid.J.shape[1]; p < count; p += lanes) {
         const Group group(p, count);
         const Stencils<Real> at(lattice, X, group);
         const RowWeights<Real> weights(at);
@@ -93,15 +93,14 @@ inline void smoothing_collect(
     }
 }
 
-template <typename Real, typename Lattice>
+template <typename Real, typename Lattice, typename Fluid>
 inline void smoothing_adjoint_collect(
-    int e, const Lattice& lattice, int first, Real share, const Rows<Vec3<Real>>& x, const Rows<Real>& J_new,
-    const Rows<Real>& amount, const Rows<Real>& weight, const Rows<Real>& adj_J, const Rows<Vec3<Real>>& adj_x,
-    const Rows<Real>& adj_mean) {
-    const Real *X = row_of(x, e, first), *JN = row_of(J_new, e);
-    const Real *AMOUNT = row_of(amount, e), *WEIGHT = row_of(weight, e);
-    Real *MEAN = row_of(adj_mean, e), *JA = row_of(adj_J, e), *XA = row_of(adj_x, e, first);
-    for (int p = 0, count = J_new.shape[1]; p < count; p += lanes) {
+    int e, const Lattice& lattice, const Fluid& fluid, const Rows<Real>& amount, const Rows<Real>& weight,
+    const Rows<Real>& adj_mean, const Rows<Real>& adj_J, const Rows<Vec3<Real>>& adj_x) {
+    const Real *X = row_of(fluid.x, e, fluid.first), *JN = row_of(fluid.J_new, e);
+    const Real *AMOUNT = row_of(amount, e), *WEIGHT = row_of(weight, e), share = fluid.share;
+    Real *MEAN = row_of(adj_mean, e), *JA = row_of(adj_J, e), *XA = row_of(adj_x, e, fluid.first);
+    for (int p = 0, count = fluid.J_new.shape[1]; p < count; p += lanes) {
         const Group group(p, count);
         const Stencils<Real> at(lattice, X, group);
         const RowWeights<Real> weights(at);
@@ -126,15 +125,15 @@ inline void smoothing_adjoint_collect(
     }
 }
 
-template <typename Real, typename Lattice>
+template <typename Real, typename Lattice, typename Fluid>
 inline void smoothing_adjoint_spread(
-    int e, const Lattice& lattice, int first, Real slope, Real share, const Rows<Real>& volume,
-    const Rows<Vec3<Real>>& x, const Rows<Real>& J, const Rows<Real>& amount, const Rows<Real>& weight,
+    int e, const Lattice& lattice, const Fluid& fluid, const Rows<Real>& amount, const Rows<Real>& weight,
     const Rows<Real>& adj_mean, const Rows<Real>& adj_J, const Rows<Vec3<Real>>& adj_x) {
-    const Real *X = row_of(x, e, first), *JJ = row_of(J, e), *VOLUME = row_of(volume, e, first);
+    const Real *X = row_of(fluid.x, e, fluid.first), *JJ = row_of(fluid.J, e);
+    const Real *VOLUME = row_of(fluid.volume, e, fluid.first), slope = fluid.slope, share = fluid.share;
     const Real *AMOUNT = row_of(amount, e), *WEIGHT = row_of(weight, e), *MEAN = row_of(adj_mean, e);
-    Real *JA = row_of(adj_J, e), *XA = row_of(adj_x, e, first);
-    for (int p = 0, count = J.shape[1]; p < count; p += lanes) {
+    Real *JA = row_of(adj_J, e), *XA = row_of(adj_x, e, fluid.first);
+    for (int p = 0, count = fluid.J.shape[1]; p < count; p += lanes) {
         const Group group(p, count);
         const Stencils<Real> at(lattice, X, group);
         const RowWeights<Real> weights(at);

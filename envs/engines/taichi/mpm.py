@@ -766,7 +766,19 @@ class Solver:
         model, tape = self.model, self.tape
         scale = -model.dt * 4.0 / model.dx**2
         return [
-            (s, batch, first, model.dt, scale, *body.material.constants(), self.mass, self.volume, tape.C, S, self.A)
+            (
+                s,
+                batch,
+                first,
+                model.dt,
+                scale,
+                *body.material.constants().values(),
+                self.mass,
+                self.volume,
+                tape.C,
+                S,
+                self.A,
+            )
             for body, first, S in zip(model.bodies, self.first[:-1], tape.S, strict=True)
         ]
 

@@ -5,6 +5,7 @@ import torch
 import warp as wp
 
 from gradscape.envs.engines import cpp
+from gradscape.envs.engines.mpm.boundaries import substep_struct
 from gradscape.envs.engines.mpm.materials.adjoints import alone
 from gradscape.envs.engines.mpm.stencil import lattice
 from gradscape.envs.engines.runtime import precision, to_torch
@@ -67,11 +68,11 @@ class MaterialBench:
         return pairs
 
     def _launch(self, which, dt, given, wanted):
-        count = len(given[0])
+        count, law = len(given[0]), self.material.law(self.types.name)
+        law.dt, law.scale = dt, SCALE
         each = [wp.array(np.full((1, count), value), dtype=self.types.real) for value in (MASS, VOLUME)]
         results = [self._array(torch.zeros_like(like)) for like in wanted]
-        inputs = [0, dt, SCALE, *self.material.constants(), *each, *map(self._array, given), *results]
-        kernel = self.kernels[which]
+        inputs, kernel = [law, *each, *map(self._array, given), *results], self.kernels[which]
         wp.launch(kernel, (1, cpp.threads(kernel, count)), inputs, record_tape=False)
         return tuple(to_torch(array)[0].double().clone() for array in results)
 
@@ -117,7 +118,7 @@ class BoundaryBench:
         self.boundary, self.rate, self.types = boundary, rate, precision("float64")
         contact, Data = boundary.function("float64")
         self.data = boundary.data("float64", "cpu")
-        real, vec3 = self.types.real, self.types.vec3
+        vec3, Substep = self.types.vec3, substep_struct("float64")
 
         @wp.kernel(module="unique", module_options=cpp.options())
         def apply(
@@ -125,15 +126,14 @@ class BoundaryBench:
             p: wp.array[vec3],
             tools: wp.array3d[vec3],
             sums: wp.array2d[wp.int64],
-            fraction: real,
-            rate: real,
+            now: Substep,
             v: wp.array[vec3],
             out: wp.array[vec3],
         ):
             i = wp.tid()
-            out[i] = contact(data, p[i], v[i], 0, 0, tools, sums, 0, fraction, rate)
+            out[i] = contact(data, p[i], v[i], 0, 0, tools, sums, now)
 
-        self.kernel = apply
+        self.kernel, self.substep = apply, Substep
 
     def __call__(self, p, v, tools, fraction=0.0):
         """Return the velocities of nodes at p [m]; `tools`, shape (2, slot, 3), are those of one control step."""
@@ -144,14 +144,16 @@ class BoundaryBench:
     def adjoint(self, p, v, tools, adj_out, fraction=0.0):
         """Return the adjoints of v and tools."""
         inputs = self._inputs(p, v, tools, fraction)
-        adj_tools, adj_v = wp.zeros_like(inputs[2]), wp.zeros_like(inputs[6])
-        adjoints = [type(self.data)(), None, adj_tools, None, None, None, adj_v, self._array(adj_out)]
+        adj_tools, adj_v = wp.zeros_like(inputs[2]), wp.zeros_like(inputs[5])
+        adjoints = [type(self.data)(), None, adj_tools, None, self.substep(), adj_v, self._array(adj_out)]
         wp.launch(self.kernel, len(v), inputs, adj_inputs=adjoints, adj_outputs=[], adjoint=True, record_tape=False)
         return to_torch(adj_v).clone(), to_torch(adj_tools)[0].clone()
 
     def _inputs(self, p, v, tools, fraction):
         at, places, before, after = (self._array(t) for t in (p.expand_as(v), tools[None], v, torch.zeros_like(v)))
-        return [self.data, at, places, wp.zeros((1, 1), dtype=wp.int64), fraction, self.rate, before, after]
+        now = self.substep()
+        now.fraction, now.rate = fraction, self.rate
+        return [self.data, at, places, wp.zeros((1, 1), dtype=wp.int64), now, before, after]
 
     def _array(self, values):
         return wp.array(values.contiguous().numpy(), dtype=self.types.vec3, copy=True)

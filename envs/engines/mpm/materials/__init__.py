@@ -10,6 +10,7 @@ against differences of the first. On a GPU the adjoint gathers that of A first (
 that no substep has to keep it. tau is the Kirchhoff stress J sigma [Pa].
 """
 
+import abc
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -17,11 +18,27 @@ import numpy as np
 
 from ...runtime import precision
 from . import elastic, fluid, plasticine
-from .adjoints import after_p2g, alone
+from .adjoints import after_p2g, alone, law_struct
+
+
+class _Material(abc.ABC):
+    """What a solver asks of a material."""
+
+    @abc.abstractmethod
+    def constants(self) -> dict[str, float]:
+        """Return what the kernels take besides state and motion, by name."""
+
+    def law(self, name: str) -> Any:
+        """Return the struct of one precision that the kernels take, with the constants in it."""
+        constants = self.constants()
+        found = law_struct(name, *constants)()
+        for constant, value in constants.items():
+            setattr(found, constant, value)
+        return found
 
 
 @dataclass(frozen=True)
-class Fluid:
+class Fluid(_Material):
     """A viscous, weakly compressible fluid: density [kg/m^3], bulk modulus [Pa], dynamic viscosity [Pa s].
 
     Its pressure grows with log J, so that however hard a droplet is hit it pushes back, and a lone particle oscillates
@@ -47,9 +64,9 @@ class Fluid:
             found = on_gpu.update, after_p2g(name, on_gpu, 5)
         return found
 
-    def constants(self) -> tuple[float, ...]:
+    def constants(self) -> dict[str, float]:
         """Return what the kernels take besides state and motion."""
-        return self.bulk, self.viscosity
+        return {"bulk": self.bulk, "viscosity": self.viscosity}
 
     def state(self, name: str) -> Any:
         """Return the Warp type of one particle's state."""
@@ -61,7 +78,7 @@ class Fluid:
 
 
 @dataclass(frozen=True)
-class _Solid:
+class _Solid(_Material):
     """What solids share: density [kg/m^3], Young's modulus [Pa], Poisson's ratio; their state is F."""
 
     density: float
@@ -107,9 +124,9 @@ class Elastic(_Solid):
         found = elastic.kernels(name)
         return found.update, after_p2g(name, found, 4) if columns else alone(name, found)
 
-    def constants(self) -> tuple[float, ...]:
+    def constants(self) -> dict[str, float]:
         """Return what the kernels take besides state and motion."""
-        return self.mu, self.lam
+        return {"mu": self.mu, "lam": self.lam}
 
 
 @dataclass(frozen=True)
@@ -126,9 +143,9 @@ class Plasticine(_Solid):
             found = on_gpu.update, after_p2g(name, on_gpu, 4)
         return found
 
-    def constants(self) -> tuple[float, ...]:
-        """Return what the kernels take besides state and motion; the last is the largest deviatoric log strain."""
-        return self.mu, self.lam, self.yield_stress / (2.0 * self.mu)
+    def constants(self) -> dict[str, float]:
+        """Return what the kernels take besides state and motion; `kappa` is the largest deviatoric log strain."""
+        return {"mu": self.mu, "lam": self.lam, "kappa": self.yield_stress / (2.0 * self.mu)}
 
 
 Material = Fluid | Elastic | Plasticine

@@ -8,7 +8,7 @@ the material knows one, and the environment and the particle last.
 
 from collections.abc import Mapping, Sequence
 from functools import cache
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, no_type_check
 
 import warp as wp
 
@@ -16,6 +16,15 @@ from ... import cpp
 from ...launches import blocks
 from ...runtime import precision
 from ..stencil import adjoint_gatherers, layout
+
+
+@cache
+@no_type_check
+def law_struct(name: str, *constants: str) -> Any:
+    """Return the struct of a material's constants, the time step, stress's `scale` in A, and the first particle."""
+    kinds = {"first": int} | dict.fromkeys(("dt", "scale", *constants), precision(name).real)
+    made = type("_".join(["Law", *constants]), (), {"__annotations__": kinds, "__module__": __name__})
+    return wp.struct(made, module=f"gradscape.laws.{name}")
 
 
 class MaterialKernels(NamedTuple):
@@ -42,7 +51,7 @@ def alone(name: str, material: MaterialKernels) -> Any:
     def kernel() -> Any:
         return read_matrix, turn_back, strain  # which Warp finds here by their names
 
-    lines = ["adj_a = read_matrix(adj_A, e, first + p)", *_known(strain), _call("turn_back", turn_back, "p")]
+    lines = ["adj_a = read_matrix(adj_A, e, law.first + p)", *_known(strain), _call("turn_back", turn_back, "p")]
     return _kernel(kernel, kinds, lines, turn_back)
 
 
@@ -59,7 +68,7 @@ def after_p2g(name: str, material: MaterialKernels, count: int) -> Any:
     vec3 = precision(name).vec3
     own = {key: kind for key, kind in _taken(turn_back).items() if key != "adj_a"}
     others = _taken(adjoint_p2g) | _taken(adjoint_g2p) | {"adj_x": wp.array2d[vec3]}
-    kinds = {key: kind for key, kind in others.items() if key not in {*own, "momentum"}} | own
+    kinds = {key: kind for key, kind in others.items() if key not in {*own, "momentum", "dt"}} | own
 
     def kernel() -> Any:
         return adjoint_g2p, adjoint_p2g, turn_back, affine_momentum, strain  # which Warp finds by their names
@@ -68,16 +77,17 @@ def after_p2g(name: str, material: MaterialKernels, count: int) -> Any:
     lines = [
         *_known(strain),
         f"momentum = {_call('affine_momentum', affine_momentum, 'p')}",
-        f"adj_a, adj_x_at_nodes = {_call('adjoint_p2g', adjoint_p2g, 'first + p')}",
+        f"adj_a, adj_x_at_nodes = {_call('adjoint_p2g', adjoint_p2g, 'law.first + p')}",
         _call("turn_back", turn_back, "p"),
-        f"adj_x[e, first + p] = {_call('adjoint_g2p', adjoint_g2p, 'first + p')} + adj_x_at_nodes",
+        f"adj_x[e, law.first + p] = {_call('adjoint_g2p', adjoint_g2p, 'law.first + p')} + adj_x_at_nodes",
     ]
     return _kernel(kernel, kinds, lines, turn_back, called="_after_p2g", module=".columns", **bounds)
 
 
 def _call(name: str, function: Any, particle: str) -> str:
     """Return the call of a function for a particle, with what has its arguments' names."""
-    return f"{name}({', '.join(list(function.input_types)[:-2])}, e, {particle})"
+    given = ["law.dt" if key == "dt" else key for key in list(function.input_types)[:-2]]
+    return f"{name}({', '.join(given)}, e, {particle})"
 
 
 def _known(strain: Any | None) -> list[str]:

@@ -8,7 +8,7 @@ import warp as wp
 from ... import cpp
 from ...runtime import precision
 from ..stencil import layout
-from .adjoints import MaterialKernels
+from .adjoints import MaterialKernels, law_struct
 
 TORN = 1.04  # volume ratio at which a fluid tears
 
@@ -21,7 +21,8 @@ def kernels(name: str) -> MaterialKernels:
     J' = min(exp(dt tr C) J, TORN), tau = K log J' I + J' mu (C + C^T - 2/3 tr C I).
     """
     types = precision(name)
-    real, mat33 = types.real, types.mat33
+    real, mat33, (Reals, _, _, Matrices) = types.real, types.mat33, types.rows
+    Law = law_struct(name, "bulk", "viscosity")
     module = cpp.module(f"gradscape.fluid.{name}")
     read_matrix, write_matrix = layout(name).read_matrix, layout(name).write_matrix
 
@@ -34,71 +35,43 @@ def kernels(name: str) -> MaterialKernels:
         return wp.min(wp.exp(dt * wp.trace(C)) * J, real(TORN))
 
     @wp.func(module=module)
-    def affine_momentum(
-        first: int,
-        dt: real,
-        scale: real,
-        bulk: real,
-        viscosity: real,
-        mass: wp.array2d[real],
-        volume: wp.array2d[real],
-        J: wp.array2d[real],
-        C: wp.array2d[mat33],
-        e: int,
-        p: int,
-    ) -> mat33:
-        c = read_matrix(C, e, first + p)
-        j = grow(dt, J[e, p], c)
-        tau = bulk * wp.log(j) * wp.identity(n=3, dtype=real) + j * viscosity * shear(c)
-        return scale * volume[e, first + p] * tau + mass[e, first + p] * c
+    def affine_momentum(law: Law, mass: Reals, volume: Reals, J: Reals, C: Matrices, e: int, p: int) -> mat33:
+        c = read_matrix(C, e, law.first + p)
+        j = grow(law.dt, J[e, p], c)
+        tau = law.bulk * wp.log(j) * wp.identity(n=3, dtype=real) + j * law.viscosity * shear(c)
+        return law.scale * volume[e, law.first + p] * tau + mass[e, law.first + p] * c
 
     @wp.kernel(module=module, enable_backward=False)
-    def update(
-        first: int,
-        dt: real,
-        scale: real,
-        bulk: real,
-        viscosity: real,
-        mass: wp.array2d[real],
-        volume: wp.array2d[real],
-        J: wp.array2d[real],
-        C: wp.array2d[mat33],
-        J_new: wp.array2d[real],
-        A: wp.array2d[mat33],
-    ):
+    def update(law: Law, mass: Reals, volume: Reals, J: Reals, C: Matrices, J_new: Reals, A: Matrices):
         e, p = wp.tid()
-        a = affine_momentum(first, dt, scale, bulk, viscosity, mass, volume, J, C, e, p)
-        J_new[e, p] = grow(dt, J[e, p], read_matrix(C, e, first + p))
-        write_matrix(A, e, first + p, a)
+        a = affine_momentum(law, mass, volume, J, C, e, p)
+        J_new[e, p] = grow(law.dt, J[e, p], read_matrix(C, e, law.first + p))
+        write_matrix(A, e, law.first + p, a)
 
     @wp.func(module=module)
     def turn_back(
-        first: int,
-        dt: real,
-        scale: real,
-        bulk: real,
-        viscosity: real,
-        mass: wp.array2d[real],
-        volume: wp.array2d[real],
-        J: wp.array2d[real],
-        C: wp.array2d[mat33],
-        adj_J_new: wp.array2d[real],
+        law: Law,
+        mass: Reals,
+        volume: Reals,
+        J: Reals,
+        C: Matrices,
+        adj_J_new: Reals,
         adj_a: mat33,
-        adj_J: wp.array2d[real],
-        adj_C: wp.array2d[mat33],
+        adj_J: Reals,
+        adj_C: Matrices,
         e: int,
         p: int,
     ):
-        c = read_matrix(C, e, first + p)
-        growth = wp.exp(dt * wp.trace(c))
+        c = read_matrix(C, e, law.first + p)
+        growth = wp.exp(law.dt * wp.trace(c))
         j = wp.min(growth * J[e, p], real(TORN))
-        g = (scale * volume[e, first + p]) * adj_a  # the adjoint of tau
-        adj_j = adj_J_new[e, p] + bulk * wp.trace(g) / j + viscosity * wp.ddot(g, shear(c))
+        g = (law.scale * volume[e, law.first + p]) * adj_a  # the adjoint of tau
+        adj_j = adj_J_new[e, p] + law.bulk * wp.trace(g) / j + law.viscosity * wp.ddot(g, shear(c))
         if growth * J[e, p] > real(TORN):
             adj_j = real(0.0)
         adj_J[e, p] = growth * adj_j
-        dilation = dt * j * adj_j * wp.identity(n=3, dtype=real)
-        write_matrix(adj_C, e, first + p, mass[e, first + p] * adj_a + j * viscosity * shear(g) + dilation)
+        dilation = law.dt * j * adj_j * wp.identity(n=3, dtype=real)
+        write_matrix(adj_C, e, law.first + p, mass[e, law.first + p] * adj_a + j * law.viscosity * shear(g) + dilation)
 
     return MaterialKernels(update, turn_back, affine_momentum)
 
@@ -107,12 +80,10 @@ def kernels(name: str) -> MaterialKernels:
 @no_type_check
 def kernels_in_rows(name: str) -> tuple[Any, Any]:
     """Return (update, adjoint) of one precision for a CPU, in C++: eight particles at a time (`native/materials.h`)."""
-    types = precision(name)
-    real, numbers, matrices = types.real, wp.array2d[types.real], wp.array2d[types.mat33]
+    numbers, _, _, matrices = precision(name).rows
     declare = partial(cpp.kernel_in_rows, f"gradscape.fluid.{name}.rows")
-    shared = {"first": int} | dict.fromkeys(("dt", "scale", "bulk", "viscosity"), real)
-    shared |= {"mass": numbers, "volume": numbers, "J": numbers, "C": matrices}
-    update = declare("fluid_update", TORN, **shared, J_new=numbers, A=matrices)
+    given = {"law": law_struct(name, "bulk", "viscosity"), "mass": numbers, "volume": numbers}
+    given |= {"J": numbers, "C": matrices}
     adjoints = {"adj_J_new": numbers, "adj_A": matrices, "adj_J": numbers, "adj_C": matrices}
-    adjoint = declare("fluid_adjoint", TORN, **shared, **adjoints)
-    return update, adjoint
+    update = declare("fluid_update", TORN, **given, J_new=numbers, A=matrices)
+    return update, declare("fluid_adjoint", TORN, **given, **adjoints)

@@ -20,7 +20,7 @@ import warp as wp
 from ... import cpp
 from ...runtime import precision
 from ..stencil import layout
-from .adjoints import MaterialKernels
+from .adjoints import MaterialKernels, law_struct
 
 # ---- Singular value decomposition of deformation gradients, as a Warp function.
 
@@ -242,14 +242,7 @@ def responses(name: str) -> SimpleNamespace:
 
     @wp.func(module=module)
     def turn_back(
-        trial: mat33,
-        strain: Decomposed,
-        mu: real,
-        lam: real,
-        kappa: real,
-        adj_F_new: mat33,
-        weight: real,
-        adj_a: mat33,
+        trial: mat33, strain: Decomposed, mu: real, lam: real, kappa: real, adj_F_new: mat33, weight: real, adj_a: mat33
     ) -> mat33:
         U, s, V = strain.U, strain.s, strain.V
         e = log_strain(s)
@@ -296,84 +289,57 @@ def kernels(name: str) -> MaterialKernels:
 def kernels_of(name: str, found: Any, module: str) -> MaterialKernels:
     """Return the kernels of a material of these `responses`."""
     types = precision(name)
-    real, mat33 = types.real, types.mat33
+    real, mat33, (Reals, _, _, Matrices) = types.real, types.mat33, types.rows
+    Law = law_struct(name, "mu", "lam", "kappa")
     Strain, strain_of, respond, respond_back = found.Strain, found.strain, found.respond, found.turn_back
     read_matrix, write_matrix = layout(name).read_matrix, layout(name).write_matrix
 
     @wp.func(module=module)
-    def strain(first: int, dt: real, F: wp.array2d[mat33], C: wp.array2d[mat33], n: int, p: int):
-        return strain_of((wp.identity(n=3, dtype=real) + dt * read_matrix(C, n, first + p)) * read_matrix(F, n, p))
+    def strain(law: Law, F: Matrices, C: Matrices, n: int, p: int):
+        return strain_of(
+            (wp.identity(n=3, dtype=real) + law.dt * read_matrix(C, n, law.first + p)) * read_matrix(F, n, p)
+        )
 
     @wp.func(module=module)
     def affine_momentum(
-        first: int,
-        dt: real,
-        scale: real,
-        mu: real,
-        lam: real,
-        kappa: real,
-        mass: wp.array2d[real],
-        volume: wp.array2d[real],
-        F: wp.array2d[mat33],
-        C: wp.array2d[mat33],
-        strain: Strain,
-        n: int,
-        p: int,
+        law: Law, mass: Reals, volume: Reals, F: Matrices, C: Matrices, strain: Strain, n: int, p: int
     ) -> mat33:
-        c = read_matrix(C, n, first + p)
-        advance = wp.identity(n=3, dtype=real) + dt * c
-        _, stress = respond(advance * read_matrix(F, n, p), strain, mu, lam, kappa)
-        return scale * volume[n, first + p] * stress + mass[n, first + p] * c
+        c = read_matrix(C, n, law.first + p)
+        advance = wp.identity(n=3, dtype=real) + law.dt * c
+        _, stress = respond(advance * read_matrix(F, n, p), strain, law.mu, law.lam, law.kappa)
+        return law.scale * volume[n, law.first + p] * stress + mass[n, law.first + p] * c
 
     @wp.kernel(module=module, enable_backward=False)
-    def update(
-        first: int,
-        dt: real,
-        scale: real,
-        mu: real,
-        lam: real,
-        kappa: real,
-        mass: wp.array2d[real],
-        volume: wp.array2d[real],
-        F: wp.array2d[mat33],
-        C: wp.array2d[mat33],
-        F_new: wp.array2d[mat33],
-        A: wp.array2d[mat33],
-    ):
+    def update(law: Law, mass: Reals, volume: Reals, F: Matrices, C: Matrices, F_new: Matrices, A: Matrices):
         e, p = wp.tid()
-        c, before = read_matrix(C, e, first + p), read_matrix(F, e, p)
-        trial = before + dt * c * before
-        after, stress = respond(trial, strain_of(trial), mu, lam, kappa)
+        c, before = read_matrix(C, e, law.first + p), read_matrix(F, e, p)
+        trial = before + law.dt * c * before
+        after, stress = respond(trial, strain_of(trial), law.mu, law.lam, law.kappa)
         write_matrix(F_new, e, p, after)
-        write_matrix(A, e, first + p, scale * volume[e, first + p] * stress + mass[e, first + p] * c)
+        write_matrix(A, e, law.first + p, law.scale * volume[e, law.first + p] * stress + mass[e, law.first + p] * c)
 
     @wp.func(module=module)
     def turn_back(
-        first: int,
-        dt: real,
-        scale: real,
-        mu: real,
-        lam: real,
-        kappa: real,
-        mass: wp.array2d[real],
-        volume: wp.array2d[real],
-        F: wp.array2d[mat33],
-        C: wp.array2d[mat33],
+        law: Law,
+        mass: Reals,
+        volume: Reals,
+        F: Matrices,
+        C: Matrices,
         strain: Strain,
-        adj_F_new: wp.array2d[mat33],
+        adj_F_new: Matrices,
         adj_a: mat33,
-        adj_F: wp.array2d[mat33],
-        adj_C: wp.array2d[mat33],
+        adj_F: Matrices,
+        adj_C: Matrices,
         n: int,
         p: int,
     ):
-        advance = wp.identity(n=3, dtype=real) + dt * read_matrix(C, n, first + p)
+        advance = wp.identity(n=3, dtype=real) + law.dt * read_matrix(C, n, law.first + p)
         before = read_matrix(F, n, p)
-        weight, adj_after = scale * volume[n, first + p], read_matrix(adj_F_new, n, p)
-        adj_trial = respond_back(advance * before, strain, mu, lam, kappa, adj_after, weight, adj_a)
+        weight, adj_after = law.scale * volume[n, law.first + p], read_matrix(adj_F_new, n, p)
+        adj_trial = respond_back(advance * before, strain, law.mu, law.lam, law.kappa, adj_after, weight, adj_a)
         write_matrix(adj_F, n, p, wp.transpose(advance) * adj_trial)
-        adj_c = mass[n, first + p] * adj_a + dt * adj_trial * wp.transpose(before)
-        write_matrix(adj_C, n, first + p, adj_c)
+        adj_c = mass[n, law.first + p] * adj_a + law.dt * adj_trial * wp.transpose(before)
+        write_matrix(adj_C, n, law.first + p, adj_c)
 
     return MaterialKernels(update, turn_back, affine_momentum, strain)
 
@@ -382,17 +348,14 @@ def kernels_of(name: str, found: Any, module: str) -> MaterialKernels:
 @no_type_check
 def kernels_in_rows(name: str) -> tuple[Any, Any]:
     """Return (update, adjoint) of one precision for a CPU, in C++: eight particles at a time (`native/materials.h`)."""
-    types = precision(name)
-    real, numbers, matrices = types.real, wp.array2d[types.real], wp.array2d[types.mat33]
+    numbers, _, _, matrices = precision(name).rows
     declare = partial(cpp.kernel_in_rows, f"gradscape.plasticine.{name}.rows")
     constants = [SMALLEST, ROUNDED, ROUND_OFF[name], TINY, SWEEPS]
-    shared = {"first": int} | dict.fromkeys(("dt", "scale", "mu", "lam", "kappa"), real)
-    shared |= {"mass": numbers, "volume": numbers, "F": matrices, "C": matrices}
-    update = declare("plasticine_update", *constants, **shared, F_new=matrices, A=matrices)
-    adjoint = declare(
-        "plasticine_adjoint", *constants, **shared, adj_F_new=matrices, adj_A=matrices, adj_F=matrices, adj_C=matrices
-    )
-    return update, adjoint
+    given = {"law": law_struct(name, "mu", "lam", "kappa"), "mass": numbers, "volume": numbers}
+    given |= {"F": matrices, "C": matrices}
+    adjoints = dict.fromkeys(("adj_F_new", "adj_A", "adj_F", "adj_C"), matrices)
+    update = declare("plasticine_update", *constants, **given, F_new=matrices, A=matrices)
+    return update, declare("plasticine_adjoint", *constants, **given, **adjoints)
 
 
 # ---- Kernels of `plasticine` in float32 for a GPU: by series in its strain, without a decomposition where that is

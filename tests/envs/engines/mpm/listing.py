@@ -7,6 +7,7 @@ from gradscape.envs.engines.mpm.columns import (
     SIZES,
     Lists,
     cell_kernels,
+    count_struct,
     most_walks,
     placing_warps,
     segments,
@@ -23,27 +24,23 @@ class Listing:
         self.stretch, walks = stretch, most_walks(box, stretch)
         self.shape, self.x = x.shape[:2], wp.array(x.numpy(), dtype=precision(name).vec3)
         rows, count, room = *self.shape, segments(box)
-        order, self.cells, self.numbers, self.arrived = (wp.zeros((rows, count), dtype=wp.int32) for _ in range(4))
-        self.counts = wp.zeros((rows, room * SEGMENT), dtype=wp.int32)
-        self.places = wp.zeros((rows, room * SEGMENT), dtype=wp.vec2i)
-        self.used, self.sizes, ranks, planes = (wp.zeros((rows, n), dtype=wp.int32) for n in (2, SIZES, walks, room))
-        unsorted, found = (wp.zeros((rows, walks), dtype=wp.vec4i) for _ in range(2))
-        self.found = [unsorted, ranks]
-        self.needed = wp.zeros(rows, dtype=wp.int32)
-        counts = 2 * box.columns, box.columns, box.cells, 2
-        self.spans, starts, nodes, touched = (wp.zeros((rows, count), dtype=wp.int32) for count in counts)
-        self.lists = Lists(order, wp.zeros(rows, dtype=wp.int32), found, planes, starts, nodes, touched)
+        sizes = {"cells": count, "numbers": count, "arrived": count, "counts": room * SEGMENT, "used": 2}
+        sizes |= {"sizes": SIZES, "ranks": walks, "spans": 2 * box.columns}
+        self.counts = count_struct()()
+        for field, size in sizes.items():
+            setattr(self.counts, field, wp.zeros((rows, size), dtype=wp.int32))
+        self.counts.places = wp.zeros((rows, room * SEGMENT), dtype=wp.vec2i)
+        self.counts.found, found = (wp.zeros((rows, walks), dtype=wp.vec4i) for _ in range(2))
+        self.needed, full = (wp.zeros(rows, dtype=wp.int32) for _ in range(2))
+        sizes = count, room, box.columns, box.cells, 2
+        order, *others = (wp.zeros((rows, size), dtype=wp.int32) for size in sizes)
+        self.lists = Lists(order, full, found, *others)
 
     def run(self):
         """Make the lists, and begin where the last run has ended: at zeros."""
-        lists, counts = self.lists, [self.used, self.sizes]
-        self.launch(self.kernels.count, self.shape, [self.lattice, self.x, self.cells, self.numbers, self.counts])
-        inputs = [self.lattice, self.counts, *counts, self.places, *self.found, lists.planes]
-        inputs += [self.spans, lists.touched, self.stretch]
-        self.launch(self.kernels.place_segments, (self.shape[0], warps(self.box)), inputs)
-        inputs = [self.lattice, self.cells, self.numbers, self.places, *counts, *self.found, self.arrived, lists.full]
-        inputs += [lists.walks, self.spans, lists.touched, lists.starts, lists.nodes]
-        self.launch(self.kernels.place, (self.shape[0], placing_warps(self.shape[1], self.box)), inputs)
-        inputs = [self.lattice, self.cells, self.places, self.arrived, *counts, self.spans, lists.order]
-        self.launch(self.kernels.tidy, self.shape, [*inputs, lists.touched, self.needed])
-        assert not any(to_torch(array).any() for array in (self.counts, *counts, self.spans))
+        rows, count, given = *self.shape, [self.lattice, self.counts, self.lists.struct]
+        self.launch(self.kernels.count, self.shape, [self.lattice, self.x, self.counts])
+        self.launch(self.kernels.place_segments, (rows, warps(self.box)), [*given, self.stretch])
+        self.launch(self.kernels.place, (rows, placing_warps(count, self.box)), given)
+        self.launch(self.kernels.tidy, self.shape, [*given, self.needed])
+        assert not any(to_torch(getattr(self.counts, field)).any() for field in ("counts", "used", "sizes", "spans"))

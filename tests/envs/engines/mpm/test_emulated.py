@@ -6,11 +6,12 @@ import pytest
 import torch
 import warp as wp
 
-from gradscape.envs.engines.mpm.boundaries import Open
+from gradscape.envs.engines.mpm.boundaries import Open, substep_struct
 from gradscape.envs.engines.mpm.columns import GPU_TEAM, PARTS, SEGMENT, STRETCH, column_kernels, segments
 from gradscape.envs.engines.mpm.grid import velocity_on
 from gradscape.envs.engines.mpm.model import Box, place_grid
-from gradscape.envs.engines.mpm.smoothing import smoothing_columns
+from gradscape.envs.engines.mpm.smoothing import smoothed_struct, smoothing_columns
+from gradscape.envs.engines.mpm.stencil import particles
 from gradscape.envs.engines.mpm.transfers import transfers
 from gradscape.envs.engines.runtime import to_torch
 
@@ -41,14 +42,18 @@ class Scattering:
         """Return what nodes add up of what warps leave, [row, node, 4]."""
         parts = wp.array(torch.full((ROWS, segments(self.box) * PARTS, 4), torch.nan).numpy(), dtype=wp.vec4)
         lists = self.listing.lists
-        walked = [self.lattice, ROWS, lists.order, lists.full, lists.walks, *inputs, parts]
-        emulate(kernel, (ROWS, GPU_TEAM.threads(self.box, self.stretch)), walked)
+        emulate(
+            kernel,
+            (ROWS, GPU_TEAM.threads(self.box, self.stretch)),
+            [self.lattice, ROWS, lists.struct, *inputs, parts],
+        )
         momentum, velocity = self.zeros(self.box.cells, wp.vec4), self.zeros(self.box.cells, wp.vec4)
-        numbers = [0.0, 0.0, -1.0, 0, 0.0, 0.0]  # no gravity, and no node is empty
+        now = substep_struct("float32")()
+        now.empty = -1.0  # no node is empty, and there is no gravity
         tools, sums = wp.zeros((ROWS, 1, 1), dtype=wp.vec3), wp.zeros((1, 1), dtype=wp.int64)
-        given = [self.lattice, Open().data("float32", "cpu"), *numbers, tools, sums, momentum, velocity]
+        given = [self.lattice, Open().data("float32", "cpu"), now, tools, sums, momentum, velocity]
         kernel = velocity_on("float32", Open(), columns=True)
-        emulate(kernel, (ROWS, self.box.cells), [*given, lists.planes, lists.touched, lists.nodes, parts])
+        emulate(kernel, (ROWS, self.box.cells), [*given, lists.struct, parts])
         found = torch.zeros(ROWS, self.box.cells, 4)
         for row, (count, _) in enumerate(to_torch(lists.touched).tolist()):
             found[row, to_torch(lists.nodes)[row, :count].long()] = to_torch(momentum)[row, :count]
@@ -67,6 +72,13 @@ class Scattering:
     def array(self, values):
         kind = {2: wp.float32, 3: wp.vec3, 4: wp.mat33}[values.ndim]
         return wp.array(values.contiguous().numpy(), dtype=kind)
+
+    def frame(self, x, v, C=None):
+        """Return particles as kernels take them."""
+        found = particles("float32")()
+        found.x, found.v = self.array(x), self.array(v)
+        found.C = None if C is None else self.side_by_side(C)
+        return found
 
     def side_by_side(self, matrices):
         """Return matrices as they lie on a GPU."""
@@ -90,7 +102,7 @@ def assert_close(got, wanted):
 def test_warps_scatter_momentum_and_mass(scattering):
     """In stretches of any length they give the same bits."""
     s = scattering
-    inputs = [*map(s.array, (s.mass, s.x, s.v)), s.side_by_side(s.A)]
+    inputs = [s.array(s.mass), s.frame(s.x, s.v), s.side_by_side(s.A)]
     got = s.walk(column_kernels("float32", GPU_TEAM).p2g, inputs)
     for other in s.others:
         assert torch.equal(other.walk(column_kernels("float32", GPU_TEAM).p2g, inputs), got)
@@ -101,7 +113,7 @@ def test_warps_scatter_momentum_and_mass(scattering):
 def test_warps_scatter_adjoints_of_velocities(scattering):
     s, dt = scattering, 0.25
     adj_x, adj_C = s.v.flip(1), 0.01 * s.A
-    inputs = [dt, *map(s.array, (s.x, adj_x, s.v)), s.side_by_side(adj_C)]
+    inputs = [dt, s.array(s.x), s.frame(adj_x, s.v, adj_C)]
     got = s.walk(column_kernels("float32", GPU_TEAM).adjoint_g2p, inputs)
     inverse_dx = s.lattice.inv_dx
     wanted = s.transfer(torch.ones_like(s.mass), s.v + dt * adj_x, 4 * inverse_dx**2 * adj_C)
@@ -111,8 +123,9 @@ def test_warps_scatter_adjoints_of_velocities(scattering):
 def test_warps_scatter_what_one_body_smooths(scattering):
     s, slope = scattering, 0.3
     J = 0.9 + 0.2 * s.mass[:, BODY]
-    inputs = [BODY.start, slope, *map(s.array, (s.mass, s.x, J))]
-    got = s.walk(smoothing_columns("float32", GPU_TEAM).spread, inputs)
+    fluid = smoothed_struct("float32")()
+    fluid.first, fluid.slope, fluid.volume, fluid.x, fluid.J = BODY.start, slope, *map(s.array, (s.mass, s.x, J))
+    got = s.walk(smoothing_columns("float32", GPU_TEAM).spread, [fluid])
     volume = torch.zeros_like(s.mass)
     volume[:, BODY] = s.mass[:, BODY]
     q = torch.zeros_like(s.x)

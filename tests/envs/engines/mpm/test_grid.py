@@ -7,7 +7,16 @@ import torch
 import warp as wp
 
 from gradscape.envs.engines import cpp
-from gradscape.envs.engines.mpm.boundaries import STICKY, Kind, LadleInTank, Open, Tool, ToolsInRoom
+from gradscape.envs.engines.mpm.boundaries import (
+    STICKY,
+    Kind,
+    LadleInTank,
+    Open,
+    Sums,
+    Tool,
+    ToolsInRoom,
+    substep_struct,
+)
 from gradscape.envs.engines.mpm.grid import velocity_at, velocity_on
 from gradscape.envs.engines.mpm.stencil import lattice
 from gradscape.envs.engines.runtime import precision
@@ -63,10 +72,11 @@ class Nodes:
         grid_v, adj_grid_m = (self.array(torch.full((BATCH, self.cells, 4), 7.0)) for _ in range(2))
         tools, adj_tools = self.array(self.tools), self.array(torch.zeros_like(self.tools))
         data, sums = self.boundary.data("float32", "cpu"), wp.zeros((1, 1), dtype=wp.int64)
-        inputs = [self.lattice, data, 2e-3, 9.81, 1e-6, STEP, 0.25, 100.0, tools, sums]
-        inputs += [self.array(self.grid_m), grid_v, *near]
+        now, adj_now = (substep_struct("float32")() for _ in range(2))
+        now.dt, now.gravity, now.empty, now.step, now.fraction, now.rate = 2e-3, 9.81, 1e-6, STEP, 0.25, 100.0
+        inputs = [self.lattice, data, now, tools, sums, self.array(self.grid_m), grid_v, *near]
         wp.launch(kernel, (BATCH, size), inputs, record_tape=False)
-        adjoints = [type(self.lattice)(), type(data)(), *[None] * 6, adj_tools, None, adj_grid_m]
+        adjoints = [type(self.lattice)(), type(data)(), adj_now, adj_tools, None, adj_grid_m]
         adjoints += [self.array(self.adj_grid_v), *[None] * len(near)]
         how = {"adj_inputs": adjoints, "adj_outputs": [], "adjoint": True}
         wp.launch(kernel, (BATCH, size), inputs, record_tape=False, **how)
@@ -81,34 +91,27 @@ class Nodes:
 def in_warp(boundary):
     """Return the kernel of one node at a time, with the function and the adjoint that a GPU has."""
     types, (function, Data) = precision("float32"), boundary.function("float32")
-    real, vec3, vec4, Lattice = types.real, types.vec3, types.vec4, lattice("float32")
-    velocity_at_node = velocity_at("float32", function, Data)
+    real, vec4, Paths, Nodes = types.real, types.vec4, wp.array3d[types.vec3], types.rows[2]
+    Lattice, Substep, velocity_at_node = (
+        lattice("float32"),
+        substep_struct("float32"),
+        velocity_at("float32", function, Data),
+    )
 
     @cpp.func_native(called="read_node", adjoint="set_adj_read_node")
-    def read(grid: wp.array2d[vec4], e: int, i: int) -> vec4: ...
+    def read(grid: Nodes, e: int, i: int) -> vec4: ...
 
     @cpp.func_native(called="write_node", adjoint="set_adj_write_node", replay=False)
-    def write(grid: wp.array2d[vec4], e: int, i: int, value: vec4): ...
+    def write(grid: Nodes, e: int, i: int, value: vec4): ...
 
     @wp.kernel(module="unique", module_options=cpp.options())
     def velocity(
-        lattice: Lattice,
-        boundary: Data,
-        dt: real,
-        gravity: real,
-        empty: real,
-        step: int,
-        fraction: real,
-        rate: real,
-        tools: wp.array3d[vec3],
-        sums: wp.array2d[wp.int64],
-        grid_m: wp.array2d[vec4],
-        grid_v: wp.array2d[vec4],
+        lattice: Lattice, boundary: Data, now: Substep, tools: Paths, sums: Sums, grid_m: Nodes, grid_v: Nodes
     ):
         e, i = wp.tid()
         g = read(grid_m, e, i)
-        if g[3] > empty:
-            v = velocity_at_node(lattice, boundary, dt, gravity, g, e, i, tools, sums, step, fraction, rate)
+        if g[3] > now.empty:
+            v = velocity_at_node(lattice, boundary, now, g, e, i, tools, sums)
             write(grid_v, e, i, vec4(v[0], v[1], v[2], real(0.0)))
         else:
             write(grid_v, e, i, vec4())
