@@ -7,8 +7,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Unpack
 
-from cyclopts import Parameter
-
 from ..jobs.scene import environment_of, with_policy
 from .call import current, verb
 from .options import (
@@ -21,8 +19,8 @@ from .options import (
     Point,
     Scene,
     SceneKeywords,
+    SceneOptions,
     Scheduler,
-    Settings,
     Share,
     Side,
     Window,
@@ -131,9 +129,7 @@ def bounce(
     window: Window | None = None,
     fidelity: str = "standard",
     device: Device = "auto",
-    options: Annotated[
-        Settings, Parameter(name="--set", help="An option of the environment, as name=value. It may be repeated.")
-    ] = (),
+    options: SceneOptions = (),
     figure_width_mm: FigureWidth = (),
     out: Out = None,
     force: Force = False,

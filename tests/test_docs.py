@@ -9,7 +9,7 @@ import shutil
 import subprocess
 import sys
 import tomllib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -20,7 +20,7 @@ from gradscape.cli import main, verbs
 from gradscape.gallery.files import DATA
 from gradscape.jobs.workers import workers
 
-from .command import Said
+from .command import Run
 
 pytestmark = pytest.mark.docs
 
@@ -188,7 +188,7 @@ def address() -> Iterator[str]:
 
 @pytest.mark.parametrize("command", ONCE)
 def test_every_command_runs(
-    run: Callable[..., Said], desk: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest, command: str
+    run: Run, desk: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest, command: str
 ) -> None:
     """What serves is stopped at once, what opens a viewer is kept from it."""
     opened: list[Path] = []
@@ -204,8 +204,7 @@ def test_every_command_runs(
     if "taichi" in command.split() and find_spec("taichi") is None:
         pytest.skip("Taichi has no wheels past Python 3.12")
     words = [request.getfixturevalue("address") if word == "ADDRESS" else word for word in small(command)]
-    done = run(*words, cwd=desk)
-    assert done.returncode == 0, (small(command), done.stderr)
+    run.ok(*words, cwd=desk)
     assert bool(opened) == ("view" in command)
 
 

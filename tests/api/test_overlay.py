@@ -56,15 +56,6 @@ def test_a_slice_is_cut_anew_through_the_best_point(tmp_path: Path) -> None:
     assert laid.slice.folder.parent == tmp_path / "over"
 
 
-def test_what_does_not_belong_together_is_refused(cut: gs.Slice, tmp_path: Path) -> None:
-    other = gs.optimize("ackley", "random", budget=2, out=tmp_path / "run")
-    with pytest.raises(ValueError, match="objective is 'branin' there and 'ackley' here"):
-        gs.overlay(cut, other)
-    with pytest.raises(ValueError, match="--plane takes pca"):
-        gs.overlay(cut, other, plane="tsne")
-    assert not Path("out/overlay").exists()
-
-
 def test_points_of_other_programs_lie_where_a_run_lies(cut: gs.Slice, tmp_path: Path) -> None:
     run = gs.optimize("branin", "random", budget=8, out=tmp_path / "run")
     expected = gs.overlay(cut, run, out=tmp_path / "over").runs[0]
@@ -128,6 +119,8 @@ def test_files_that_are_no_tables_are_refused(cut: gs.Slice, name: str, tmp_path
         gs.overlay(cut, tmp_path / name)
     with pytest.raises(ValueError, match="what is laid over a slice are runs"):
         gs.overlay(cut, 3)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="--plane takes pca"):
+        gs.overlay(cut, tmp_path / name, plane="tsne")  # type: ignore[arg-type]
 
 
 def test_a_study_of_optuna_is_laid_over_a_slice(cut: gs.Slice, tmp_path: Path) -> None:

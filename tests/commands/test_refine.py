@@ -1,7 +1,6 @@
 """`landscape slice --refine` and `--budget`, and what a slice says of what its samples hide."""
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -18,9 +17,8 @@ from gradscape.landscapes.draw.figures.profile import profile_figure
 from gradscape.landscapes.objective import Status
 from gradscape.landscapes.storage.store import open_slice
 
-from ..command import Said
+from ..command import Run
 
-Run = Callable[..., Said]
 REFINED = "slice pinball-2 --dims 0 1 --resolution 33 --refine 5% --json --device cpu --fidelity draft --out"
 
 
@@ -30,44 +28,23 @@ def foot(figure: object) -> str:
 
 
 def test_a_refined_slice_says_what_was_sampled_and_is_there_the_second_time(run: Run, tmp_path: Path) -> None:
-    first = run(*REFINED.split(), "made", cwd=tmp_path)
-    assert first.returncode == 0, first.stderr
+    first = run.ok(*REFINED.split(), "made")
     said = json.loads(first.stdout)
     assert said["status"]["ok"] + said["status"]["interpolated"] == 33 * 33
     assert said["refinement"]["sampled"] == said["status"]["ok"] == said["episodes"]
     assert "up to 1089 episodes with gradients to compute" in first.stderr
     assert f"{said['episodes']} of 1089 points sampled" in first.stderr
-    again = json.loads(run(*REFINED.split(), "made", cwd=tmp_path).stdout)
+    again = run.json(*REFINED.split(), "made")
     assert (again["episodes"], again["resumed"]) == (0, said["episodes"])
     assert {name: again[name] for name in ("status", "loss", "undersampled")} == {
         name: said[name] for name in ("status", "loss", "undersampled")
     }
-    other = run(*REFINED.replace("5%", "4%").split(), "made", cwd=tmp_path)
-    assert other.returncode == 2
-    assert "refinement.share: wanted 0.04, found 0.05" in other.stderr
-    plain = run(*REFINED.replace("--refine 5%", "--force").split(), "made", cwd=tmp_path)
+    run.refuse(*REFINED.replace("5%", "4%").split(), "made", said="refinement.share: wanted 0.04, found 0.05")
+    plain = run(*REFINED.replace("--refine 5%", "--force").split(), "made")
     assert json.loads(plain.stdout)["refinement"] is None
     assert sorted(path.name for path in (tmp_path / "made").iterdir()) == [
         "landscape.png", "slice.zarr", "summary.json",
     ]  # fmt: skip
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        ("--refine much", "--refine takes a share such as 1% or 0.01; got 'much'"),
-        ("--refine 0", "a share of the range between 0 and 1; got 0"),
-        ("--refine nan", "a share of the range between 0 and 1; got nan"),
-        ("--refine 120%", "a share of the range between 0 and 1; got 1.2"),
-        ("--budget 9", "begins with 81 points; got a budget of 9"),
-    ],
-)
-def test_what_is_no_share_or_too_small_is_refused_in_a_line(run: Run, tmp_path: Path, words: str, said: str) -> None:
-    done = run(*["slice", "branin", "--dims", "0", "1", "--resolution", "33"], *words.split(), cwd=tmp_path)
-    assert done.returncode == 2
-    assert said in done.stderr
-    assert len(done.stderr.splitlines()) == 1
-    assert not any(tmp_path.iterdir())
 
 
 class Impatient(Watch):
