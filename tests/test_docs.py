@@ -10,6 +10,7 @@ import subprocess
 import sys
 import tomllib
 from collections.abc import Iterator
+from contextlib import chdir
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -174,11 +175,11 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def address() -> Iterator[str]:
+def address(desk: Path) -> Iterator[str]:
     """Give the address of a scheduler with a worker, whose keys Dask's configuration has: one for all commands."""
     import dask
 
-    with workers("local:1", "cpu") as executor:
+    with chdir(desk), workers("local:1", "cpu") as executor:  # in a folder that is there as long as the worker is
         client = executor._client  # type: ignore[union-attr]
         keys = client.security
         named = {"ca-file": keys.tls_ca_file, "client.cert": keys.tls_client_cert, "client.key": keys.tls_client_key}

@@ -197,7 +197,7 @@ def test_a_pendulum_with_fidelities_and_a_horizon_is_studied_like_a_scene(
     here: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("gradscape.studies.samples.REPETITION", 0.0)
-    Path("pendulum.py").write_text(PENDULUM)
+    (here / "pendulum.py").write_text(PENDULUM)
     f = "pendulum.py:pendulum"
     for words in (
         f"check {f} --points 2",

@@ -105,8 +105,8 @@ def test_a_class_in_a_file_says_what_there_is_to_say(run: Run, folder: Path) -> 
 def test_a_line_has_one_dimension(run: Run, folder: Path, words: list[str], last: bool) -> None:
     env = ["arm.py:TwoLinkArm"]
     command = ["slice", *words, *env] if last else ["slice", *env, *words]
-    done = run.json(*command, "--resolution", "5", "--out", "line", cwd=folder)
-    assert done["dims"] == ["elbow"]
+    found = run.json(*command, "--resolution", "5", "--out", "line", cwd=folder)
+    assert found["dims"] == ["elbow"]
     line = gs.open_slice(folder / "line").data
     np.testing.assert_allclose(line["loss"], (line["u"] - 1) ** 2 + 0.5)
     assert (folder / "line/landscape.png").exists()

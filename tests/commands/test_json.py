@@ -36,8 +36,8 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize("words", PRINTED)
 def test_what_is_printed_is_json(run: Run, desk: Path, words: str) -> None:
-    done = run.json(*words.split(), cwd=desk)
-    assert done
+    found = run.json(*words.split(), cwd=desk)
+    assert found
 
 
 def test_every_verb_with_the_option_is_tried() -> None:

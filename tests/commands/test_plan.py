@@ -49,8 +49,8 @@ def test_a_plan_counts_what_the_verb_evaluates(
 
 @pytest.mark.parametrize("words", ["check branin --points 2", "pairs ackley --samples 2", "report ackley"])
 def test_verbs_whose_episodes_depend_on_what_they_find_are_planned_too(run: Run, tmp_path: Path, words: str) -> None:
-    done = run.json("plan", *words.split())
-    assert done["episodes"] > 10
+    found = run.json("plan", *words.split())
+    assert found["episodes"] > 10
     assert list(tmp_path.iterdir()) == []
 
 
@@ -64,8 +64,8 @@ def test_what_samples_a_slice_first_is_planned_by_that_slice(run: Run, tmp_path:
         ("overlay cut run --through best", 16),
         ("overlay cut run --through best --resolution 6", 36),
     ):
-        done = run.json("plan", *words.split())
-        assert done["gradients"] == points
+        found = run.json("plan", *words.split())
+        assert found["gradients"] == points
     assert "simulates nothing" in run("plan overlay cut run").stderr
     assert sorted(tmp_path.rglob("*")) == before
 

@@ -27,8 +27,8 @@ def names(folder: Path) -> list[str]:
 
 def test_through_several_points_there_is_a_sweep_for_each(run: Run, tmp_path: Path) -> None:
     words = "sweep bounce --dims 0 1 --over horizon --frames 2 --resolution 3 --through center,random:1 --device cpu"
-    done = run.json(f"{words} --out moved")
-    assert [one["folder"] for one in done["sweeps"]] == ["moved/center", "moved/random-1"]
+    found = run.json(f"{words} --out moved")
+    assert [one["folder"] for one in found["sweeps"]] == ["moved/center", "moved/random-1"]
     space = gradscape.make("bounce", device="cpu").space
     for folder, point in (("center", space.center), ("random-1", space.uniform(1, seed=1)[0])):
         assert names(tmp_path / "moved" / folder) == FILES
@@ -102,8 +102,8 @@ def test_force_begins_anew_and_another_sweep_is_not_overwritten(run: Run) -> Non
 
 @pytest.mark.drawn
 def test_smoothing_averages_one_slice(run: Run) -> None:
-    done = run.json("sweep branin --dims 0 1 --over smoothing --frames 3 --resolution 9 --out soft")
-    summary, dataset = done, open_slice("soft/slice.zarr")
+    found = run.json("sweep branin --dims 0 1 --over smoothing --frames 3 --resolution 9 --out soft")
+    summary, dataset = found, open_slice("soft/slice.zarr")
     assert [frame["value"] for frame in summary["frames"]] == [0.0, 12.5, 25.0]
     assert summary["episodes"] == 81
     for frame in summary["frames"]:
@@ -115,8 +115,8 @@ def test_over_the_horizon_each_frame_is_a_shorter_episode(run: Run) -> None:
     sweep = (
         "sweep bounce --dims 0 1 --over horizon --frames 2 --resolution 4 --through example:aim --device cpu --out late"
     )
-    done = run.json(f"{sweep}")
-    assert [frame["value"] for frame in done["frames"]] == [50.0, 100.0]
+    found = run.json(f"{sweep}")
+    assert [frame["value"] for frame in found["frames"]] == [50.0, 100.0]
     half, whole = (open_slice(f"late/frames/{number:03d}.zarr") for number in range(2))
     assert [stored_identity(one)["options"]["horizon"] for one in (half, whole)] == [0.5, 1.0]
     env = gradscape.make("bounce", device="cpu", horizon=0.5)

@@ -1,6 +1,5 @@
 """Optimisers of other packages: found by entry point, imported only when made, refused where names clash."""
 
-import json
 import subprocess
 import sys
 
@@ -53,18 +52,15 @@ def package(tmp_path, monkeypatch):
     sys.modules.pop("gradscape_test_corners", None)
 
 
-def test_another_packages_method_is_listed_then_searches_by_the_command(package, run, tmp_path):
+def test_another_packages_method_is_listed_then_searches_by_the_command(package, run):
     package({"corners": "gradscape_test_corners:Corners"})
     method = methods()["corners"]
     assert (method.target, method.summary) == ("gradscape_test_corners:Corners", "registered by corners-of-mine")
     assert "gradscape_test_corners" not in sys.modules  # listing imports nothing
-    assert "corners-of-mine" in run("methods", cwd=tmp_path).stdout
-    assert "lower corner" in run("methods", "corners", cwd=tmp_path).stdout
-    done = run(*["optimize", "branin", "--method", "corners", "--budget", "5", "--json"], cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert json.loads(done.stdout)["kinds"]["population"] == 5
-    done = run(*["race", "branin", "--methods", "corners,random", "--budget", "4", "--seeds", "2"], cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    assert "corners-of-mine" in run("methods").stdout
+    assert "lower corner" in run("methods corners").stdout
+    assert run.json("optimize branin --method corners --budget 5")["kinds"]["population"] == 5
+    run.ok("race branin --methods corners,random --budget 4 --seeds 2")
 
 
 @pytest.mark.parametrize("target", ["gradscape_no_such_module:Corners", "gradscape_test_corners:Middle"])

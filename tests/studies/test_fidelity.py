@@ -159,8 +159,8 @@ def test_a_variant_is_gone_when_the_next_one_is_measured(run: Run, monkeypatch: 
         return simulate(self, x, grad=grad)
 
     monkeypatch.setattr(Converging, "_evaluate", followed)
-    done = run.json(*TRADE, "--settings", "precision")
-    assert len(simulated) == 2 + len(done["variants"])  # one to verify by, one for the estimate
+    found = run.json(*TRADE, "--settings", "precision")
+    assert len(simulated) == 2 + len(found["variants"])  # one to verify by, one for the estimate
 
 
 def test_a_dt_that_does_not_divide_the_episode_is_refused() -> None:
