@@ -88,7 +88,7 @@ def said_with(verb: tuple[str, ...], option: Option, value: str) -> list[str]:
 
 def test_a_path_nobody_meant_ends_with_a_message(run: Run, desk: Path) -> None:
     for words in (said_with(verb, option, value) for verb, option in PATHS for value in HOSTILE):
-        done = run(*words, cwd=desk)
+        done = run(*words)
         assert done.returncode in (0, 1, 2, 130), (words, done.stderr)
         assert done.returncode == 0 or done.stderr.strip(), words
         assert "\\[" not in done.stdout + done.stderr, words
@@ -99,7 +99,7 @@ def test_an_option_of_a_scene_is_not_called_as_what_every_scene_has(run: Run, de
     names = sorted({*signature(make).parameters, *signature(Environment.__init__).parameters})
     setting = [verb for verb, one in VERBS.items() if any(option.names == ("--set",) for option in one.options)]
     for words in ([*WORDS[verb], "--set", f"{name}=1"] for verb in setting for name in names):
-        done = run(*words, cwd=desk)
+        done = run(*words)
         assert done.returncode == 2, words
         assert len(done.stderr.splitlines()) == 1, words
         assert words[-1].removesuffix("=1") in done.stderr, words
@@ -113,7 +113,7 @@ def test_every_verb_is_tried() -> None:
 
 def test_what_is_said_of_a_name_is_the_name(run: Run, desk: Path) -> None:
     for name, shown in (("[/b]", "[/b]"), (":warning:", ":warning:"), ("caf\udce9", "caf\\udce9")):
-        done = run("gallery", "list", "--data", name, cwd=desk)
+        done = run("gallery", "list", "--data", name)
         assert (done.returncode, done.stderr) == (0, "")
         assert f"figures in {shown}" in done.stdout
 
@@ -157,7 +157,7 @@ def test_a_loop_of_links_is_no_path(desk: Path) -> None:
 
 
 def test_a_path_too_long_for_the_system_ends_in_a_line(run: Run, desk: Path) -> None:
-    done = run("slice", "branin", "--dims", "0", "1", "--out", f"{DEEP}/{DEEP}", cwd=desk)
+    done = run("slice", "branin", "--dims", "0", "1", "--out", f"{DEEP}/{DEEP}")
     assert done.returncode == 1
     assert len(done.stderr.splitlines()) == 1
     assert "file name too long; give another path" in done.stderr

@@ -29,7 +29,7 @@ def desk(both: Path, tmp_path: Path) -> Path:
 
 
 def test_two_slices_are_compared_and_nothing_is_sampled(run: Run, desk: Path) -> None:
-    done = run.ok("compare a b --out both --json", cwd=desk)
+    done = run.ok("compare a b --out both --json")
     assert sorted(file.name for file in (desk / "both").iterdir()) == ["compare.json", "compare.png"]
     said = json.loads(done.stdout)
     kept = json.loads((desk / "both/compare.json").read_text())
@@ -46,18 +46,18 @@ def test_two_slices_are_compared_and_nothing_is_sampled(run: Run, desk: Path) ->
 
 def test_an_environment_is_sampled_on_the_slices_own_plane_as_it_would_be_by_itself(run: Run, desk: Path) -> None:
     command = (*STANDARD.split(), "--json")
-    done = run.ok(*command, cwd=desk)
+    done = run.ok(*command)
     (folder,) = (path for path in (desk / "made").iterdir() if path.is_dir())
     np.testing.assert_array_equal(open_slice(folder)["loss"], open_slice(desk / "b")["loss"])
-    given = run.json("compare a b --out both", cwd=desk)
+    given = run.json("compare a b --out both")
     assert json.loads(done.stdout)["loss"] == given["loss"]
-    again = run(*command, cwd=desk)
+    again = run(*command)
     assert "all 25 episodes with gradients are there already" in again.stderr
     assert json.loads(again.stdout) == json.loads(done.stdout)
 
 
 def test_options_are_those_of_b(run: Run, desk: Path) -> None:
-    done = run.ok("compare a bounce --set drag=0.1 --device cpu --out made", cwd=desk)
+    done = run.ok("compare a bounce --set drag=0.1 --device cpu --out made")
     assert "options.drag: 0.0 in A, 0.1 in B" in done.stdout
     assert "settings.dt" not in done.stdout
 
@@ -73,13 +73,13 @@ def test_what_lies_off_the_box_is_left_out_of_b_where_it_is_of_a(run: Run) -> No
 
 
 def test_another_comparison_is_replaced_by_force_alone(run: Run, desk: Path) -> None:
-    run.ok("compare a b --out both", cwd=desk)
+    run.ok("compare a b --out both")
     run.refuse(
         "compare b a --out both",
         cwd=desk,
         said="both holds a comparison made by other settings (a.fidelity: wanted 'standard', found 'draft'",
     )
-    run.ok("compare b a --out both --force", cwd=desk)
+    run.ok("compare b a --out both --force")
     assert json.loads((desk / "both/compare.json").read_text())["a"] == "bounce · standard"
 
 

@@ -36,7 +36,7 @@ def results(made: Path, tmp_path: Path) -> Path:
 def test_a_table_has_a_row_for_each_sample_with_its_place_loss_status_and_gradient(
     run: Run, results: Path, kind: str
 ) -> None:
-    done = run.ok("export", "cut", "--to", kind, cwd=results)
+    done = run.ok("export", "cut", "--to", kind)
     assert done.stderr == f"cut/slice{SUFFIXES[kind]}: 25 samples\n"
     table, slice_ = READ[kind](results / f"cut/slice{SUFFIXES[kind]}"), gradscape.open_slice(results / "cut").data
     gradients = [f"gradient by velocity {axis} [m²/(m/s)]" for axis in "xyz"]
@@ -50,7 +50,7 @@ def test_a_table_has_a_row_for_each_sample_with_its_place_loss_status_and_gradie
 
 @pytest.mark.parametrize("kind", list(READ))
 def test_a_run_has_a_row_for_each_episode(run: Run, results: Path, kind: str) -> None:
-    run.ok("export", "searched", "--to", kind, "--out", f"my{kind}", cwd=results)
+    run.ok("export", "searched", "--to", kind, "--out", f"my{kind}")
     table, rows = READ[kind](results / f"my{kind}"), gradscape.open_run(results / "searched").data
     assert table["episode"].tolist() == [1, 2, 3, 4, 5, 6, 7]
     np.testing.assert_array_equal(table["loss [m²]"], rows["loss"])
@@ -62,7 +62,7 @@ def test_a_run_has_a_row_for_each_episode(run: Run, results: Path, kind: str) ->
 
 @pytest.mark.parametrize(("folder", "store"), [("cut", "slice"), ("line", "slice"), ("searched", "run")])
 def test_netcdf_keeps_arrays_names_and_units(run: Run, results: Path, folder: str, store: str) -> None:
-    run.ok("export", folder, "--to", "netcdf", cwd=results)
+    run.ok("export", folder, "--to", "netcdf")
     ours = {"slice": gradscape.open_slice, "run": gradscape.open_run}[store](results / folder).data
     with xr.open_dataset(results / folder / f"{store}.nc") as back:
         for name in ours.data_vars:
@@ -80,5 +80,5 @@ def test_what_is_there_is_not_replaced_unless_asked_for(run: Run, results: Path)
         said="mine.csv exists already; write elsewhere with --out, or replace it with --force",
     )
     assert (results / "mine.csv").read_text() == "precious"
-    run.ok("export cut --out mine.csv --force", cwd=results)
+    run.ok("export cut --out mine.csv --force")
     assert len(pd.read_csv(results / "mine.csv")) == 25

@@ -18,7 +18,8 @@ def desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder of what verbs leave, as far as `view` looks at it, on a machine without a display."""
     for name in view.DISPLAYS:
         monkeypatch.delenv(name, raising=False)
-    for file in ("cut/landscape.png", "cut/slice.zarr/zarr.json", "run/progress.png", "site/index.html", "empty/a.txt"):
+    files = ("cut/landscape.png", "cut/slice.zarr/zarr.json", "run/progress.png", "empty/a.txt")
+    for file in (*files, "site/index.html", "my site/index.html"):
         (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / file).write_text("")
     (tmp_path / "some.rrd").write_bytes(b"RRF2")
@@ -40,25 +41,29 @@ def desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 )
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems always have a display")
 def test_what_cannot_be_shown_is_refused_in_one_line(run: Run, desk: Path, command: str, said: str) -> None:
-    done = run(command, cwd=desk)
+    done = run(command)
     assert done.returncode == 2
     assert len(done.stderr.splitlines()) == 1
     assert said in done.stderr
 
 
-@pytest.mark.parametrize(
-    ("command", "opened"), [("view cut", "cut/landscape.png"), ("view site/index.html", "site/index.html")]
-)
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems always have a display")
+@pytest.mark.parametrize("serve", [(), ("--serve",)])
+def test_a_site_says_how_it_is_served(run: Run, desk: Path, serve: tuple[str, ...]) -> None:
+    run.refuse("view", "my site", *serve, said="landscape gallery serve --out 'my site'")
+
+
+@pytest.mark.parametrize(("command", "opened"), [("view cut", "cut/landscape.png"), ("view site", "site/index.html")])
 def test_a_picture_opens_in_the_systems_own_program(
     run: Run, desk: Path, monkeypatch: pytest.MonkeyPatch, command: str, opened: str
 ) -> None:
     monkeypatch.setenv("DISPLAY", ":1")
     launched: list[str] = []
     monkeypatch.setattr("gradscape.api.view.launch", lambda path: launched.append(str(path)) or True)
-    run.ok(command, cwd=desk)
+    run.ok(command)
     assert launched == [str((desk / opened).resolve())]
     monkeypatch.setattr("gradscape.api.view.launch", lambda path: False)
-    refused = run(command, cwd=desk)
+    refused = run(command)
     assert (refused.returncode, "no program of this system opens" in refused.stderr) == (1, True)
 
 
@@ -66,7 +71,7 @@ def test_a_recording_needs_a_display_or_is_served_until_it_is_stopped(
     run: Run, desk: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if sys.platform == "linux":
-        said = run("view some.rrd", cwd=desk).stderr
+        said = run("view some.rrd").stderr
         assert "look at it in a browser: landscape view some.rrd --serve" in said
     served: list[str] = []
 
@@ -80,6 +85,6 @@ def test_a_recording_needs_a_display_or_is_served_until_it_is_stopped(
 
     monkeypatch.setattr(viewer, "serve_recording", serve)
     monkeypatch.setattr("time.sleep", stopped)
-    done = run("view some.rrd --serve", cwd=desk)
+    done = run("view some.rrd --serve")
     assert (done.returncode, served) == (0, ["some.rrd"])
     assert "some.rrd is at http://127.0.0.1:1/?url=... until Ctrl-C" in done.stderr
