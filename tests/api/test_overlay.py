@@ -15,11 +15,11 @@ from matplotlib.text import Text
 
 import gradscape as gs
 from gradscape.jobs.foreign import tables_over
-from gradscape.jobs.watch import Watch
 from gradscape.landscapes.export import save_as
 from gradscape.landscapes.foreign import points_table
 
 from ..command import make
+from ..watches import Told
 
 
 @pytest.fixture(scope="module")
@@ -169,16 +169,6 @@ def test_values_that_a_study_maximises_are_negated_and_its_name_says_so(
     assert laid.runs[0].attrs["label"] == "optuna-gain (negated)"
     assert "optuna-gain (negated): " in " ".join(text.get_text() for text in laid.plot().findobj(Text))
     assert not capfd.readouterr().err  # a recording takes any name
-
-
-class Told(Watch):
-    """Keep what a job tells."""
-
-    def __init__(self) -> None:
-        self.lines: list[str] = []
-
-    def note(self, text: str) -> None:
-        self.lines.append(text)
 
 
 COMMAS = "X0;x1;LOSS;note\n[m];[m];[J];\n1,5;2,25;3,5;a\n\n1,5;failed;3;b\n2,5;;1e0;\n-0,5;1;failed;c;;\n;;;\n"

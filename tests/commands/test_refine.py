@@ -9,7 +9,7 @@ import pytest
 import gradscape as gs
 from gradscape.gallery.site.page_data import count_numbers
 from gradscape.jobs.slice import SliceJob
-from gradscape.jobs.watch import Stopped, Watch
+from gradscape.jobs.watch import Stopped
 from gradscape.landscapes.convert import to_json
 from gradscape.landscapes.draw.figures.contour import landscape_figure
 from gradscape.landscapes.draw.figures.multiples import thumbnail_figure
@@ -18,6 +18,7 @@ from gradscape.landscapes.objective import Status
 from gradscape.landscapes.storage.store import open_slice
 
 from ..command import Run
+from ..watches import Stop, Told
 
 REFINED = "slice pinball-2 --dims 0 1 --resolution 33 --refine 5% --json --device cpu --fidelity draft --out"
 
@@ -47,36 +48,6 @@ def test_a_refined_slice_says_what_was_sampled_and_is_there_the_second_time(run:
     ]  # fmt: skip
 
 
-class Impatient(Watch):
-    """Stop a job at every so many steps, as Ctrl-C does."""
-
-    def progress(self, total: int, what: str = "episodes"):  # type: ignore[no-untyped-def]
-        from contextlib import contextmanager
-
-        @contextmanager
-        def counting():  # type: ignore[no-untyped-def]
-            calls = 0
-
-            def advance(done: int, text: str = "") -> None:
-                nonlocal calls
-                calls += 1
-                if calls == 4:
-                    raise KeyboardInterrupt
-
-            yield advance
-
-        return counting()
-
-
-class Noted(Watch):
-    """Hear what is said of a job."""
-
-    said = ""
-
-    def note(self, text: str) -> None:
-        self.said += text
-
-
 def test_a_job_that_is_stopped_keeps_what_it_has_and_draws_it(tmp_path: Path) -> None:
     from gradscape.envs.registry import make
     from gradscape.jobs.scene import plane_through
@@ -90,12 +61,14 @@ def test_a_job_that_is_stopped_keeps_what_it_has_and_draws_it(tmp_path: Path) ->
 
     whole = job("one").run()
     with pytest.raises(Stopped, match="of 1089 points are kept"):
-        job("two").run(Impatient())
+        job("two").run(Stop(100))
     assert (tmp_path / "two" / "landscape.png").exists()
-    kept, patient = job("two").kept(), Noted()
+    kept, patient = job("two").kept(), Told()
     rest = job("two").run(patient)
     assert f"{rest.resumed} of 1089 points are kept" in kept
-    assert f"up to {1089 - rest.resumed} episodes with gradients to compute, {rest.resumed} are there" in patient.said
+    assert f"up to {1089 - rest.resumed} episodes with gradients to compute, {rest.resumed} are there" in "".join(
+        patient.lines
+    )
     assert rest.resumed > 0
     assert rest.episodes + rest.resumed == whole.episodes
     one, two = (open_slice(tmp_path / name) for name in ("one", "two"))
