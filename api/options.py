@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from ..envs.base import Fidelity
 
     Point: TypeAlias = str | Float[Tensor, " dim"]
-    Points: TypeAlias = Point
     Window: TypeAlias = float | str | tuple[float, float]
     Share: TypeAlias = float | str
     Settings: TypeAlias = Mapping[str, Any] | Sequence[str]
@@ -40,7 +39,7 @@ if TYPE_CHECKING:
     Resolution: TypeAlias = int | Sequence[int]
     Parameter_: TypeAlias = int | str
 else:
-    Point = Points = Share = FidelityName = Parameter_ = str
+    Point = Share = FidelityName = Parameter_ = str
     Window = Annotated[str, Parameter(allow_leading_hyphen=True)]  # -0.4:0.9
     Names = Settings = MethodSettings = list[str]
     Dims = Annotated[list[str], Parameter(consume_multiple=(1, 2))]
@@ -61,7 +60,6 @@ Scene = Annotated[
 its like make one of a function) or its class, a `SceneSpec`, or an object of one's own with `space` and `evaluate`."""
 
 Count = Annotated[int, at_least(1)]
-Budget = Annotated[int, at_least(1)]
 Side = Annotated[Resolution, at_least(2)]
 Seed = Annotated[int, at_least(0), Parameter(help="Random seed.")]
 Out = Annotated[str | Path | None, Parameter(help="Folder of the results; by default one named after them, in out/.")]
@@ -103,6 +101,11 @@ Data = Annotated[
 ]
 
 
+SceneOptions = Annotated[
+    Settings, Parameter(name="--set", help="An option of the environment, as name=value. It may be repeated.")
+]
+
+
 class MadeKeywords(TypedDict, total=False):
     """The keywords by which a scene is made, with the defaults of `SceneSpec`."""
 
@@ -118,10 +121,7 @@ class MadeKeywords(TypedDict, total=False):
             "taichi, as an independent reference."
         ),
     ]
-    options: Annotated[
-        Settings,
-        Parameter(name="--set", help="An option of the environment, as name=value. It may be repeated."),
-    ]
+    options: SceneOptions
 
 
 class SceneKeywords(MadeKeywords, total=False):

@@ -27,13 +27,13 @@ from ..landscapes.plain import printable
 
 
 class Console(rich.Console):
-    """Print text as it is: names, paths and errors are other people's, and may hold [brackets] and :colons:.
+    """Print text as it is, in one colour: names, paths and errors are other people's, with [brackets] and :colons:.
 
     Control characters, which a terminal would obey, are shown as their escapes.
     """
 
     def __init__(self, **look: Any) -> None:
-        super().__init__(markup=False, emoji=False, **look)
+        super().__init__(markup=False, emoji=False, highlight=False, **look)
 
     def render_str(self, text: str, **look: Any) -> Text:
         """Lay out text, its control characters escaped before it is measured."""
@@ -65,7 +65,7 @@ class Bars(Watch):
     """Show what a job tells on a console: notes as lines, and bars while it works."""
 
     def __init__(self, console: Console | None = None) -> None:
-        self.console = console or Console(stderr=True, soft_wrap=True, highlight=False)
+        self.console = console or Console(stderr=True, soft_wrap=True)
 
     folder: Path | None = None  # of the last job that has finished
 
@@ -114,5 +114,5 @@ def _columns() -> tuple[ProgressColumn, ...]:
 
 def default_watch() -> Watch:
     """Return what shows progress where somebody sees it: in a notebook or a terminal, not in a pipe."""
-    console = Console(stderr=True, soft_wrap=True, highlight=False)
+    console = Console(stderr=True, soft_wrap=True)
     return Bars(console) if console.is_jupyter or sys.stderr.isatty() else Watch()

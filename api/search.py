@@ -12,7 +12,6 @@ from cyclopts import Parameter
 from .call import current, verb
 from .options import (
     ARGUMENT,
-    Budget,
     Count,
     FigureWidth,
     Force,
@@ -40,12 +39,21 @@ if TYPE_CHECKING:
 else:
     Scenes = list[str]
 
+Methods = Annotated[
+    Names,
+    Parameter(
+        help="Methods to race, a,b or repeated. The default is all that can run here; `landscape methods` lists them."
+    ),
+]
+RunBudget = Annotated[Count, Parameter(help="Number of episodes of each run. It is never exceeded.")]
+Seeds = Annotated[Count, Parameter(help="Number of runs per method, with seeds 0, 1, ...")]
 Workers = Annotated[
     int | None,
     Parameter(
+        name="--workers",
         help="Number of processes that fit Gaussian processes. The default is one per core for the command, and 1 in "
         "Python, where more need a script whose own work stands under `if __name__ == '__main__':`. Results do not "
-        "depend on it."
+        "depend on it.",
     ),
 ]
 
@@ -55,7 +63,7 @@ def optimize(
     scene: Scene,
     method: str = "bo-leap",
     *,
-    budget: Budget = 1000,
+    budget: Count = 1000,
     seed: Seed = 0,
     method_options: Annotated[Settings, Parameter(name="--option")] = (),
     figure_width_mm: FigureWidth = (),
@@ -104,12 +112,12 @@ def optimize(
 @verb
 def race(
     scene: Scene,
-    methods: Names = (),
+    methods: Methods = (),
     *,
-    budget: Budget = 1000,
-    seeds: Count = 10,
+    budget: RunBudget = 1000,
+    seeds: Seeds = 10,
     method_options: Annotated[MethodSettings, Parameter(name="--option")] = (),
-    workers: Annotated[Workers, Parameter(name="--workers")] = None,
+    workers: Workers = None,
     scheduler: Scheduler = None,
     best_known: float | None = None,
     figure_width_mm: FigureWidth = (),
@@ -131,12 +139,6 @@ def race(
 
     Parameters
     ----------
-    methods
-        Methods to race, a,b or repeated. The default is all that can run here; `landscape methods` lists them.
-    budget
-        Number of episodes of each run. It is never exceeded.
-    seeds
-        Number of runs per method, with seeds 0, 1, ...
     method_options
         An option of a method, as METHOD.NAME=VALUE. It may be repeated.
     best_known
@@ -166,11 +168,11 @@ def race(
 @verb
 def league(
     scenes: Annotated[Scenes, ARGUMENT, Parameter(name="env")] = (),
-    methods: Names = (),
+    methods: Methods = (),
     *,
-    budget: Budget = 1000,
-    seeds: Count = 10,
-    workers: Annotated[Workers, Parameter(name="--workers")] = None,
+    budget: RunBudget = 1000,
+    seeds: Seeds = 10,
+    workers: Workers = None,
     scheduler: Scheduler = None,
     figure_width_mm: FigureWidth = (),
     out: Out = None,
@@ -194,12 +196,6 @@ def league(
     ----------
     scenes
         Environments to race in, as ENV or ENV@FIDELITY. The default is all sixteen that gradscape simulates itself.
-    methods
-        Methods to race, a,b or repeated. The default is all that can run here; `landscape methods` lists them.
-    budget
-        Number of episodes of each run. It is never exceeded.
-    seeds
-        Number of runs per method, with seeds 0, 1, ...
     """
     from ..optim.registry import check_methods
 

@@ -7,8 +7,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Unpack
 
-from cyclopts import Parameter
-
 from ..jobs.scene import environment_of, with_policy
 from .call import current, verb
 from .options import (
@@ -21,8 +19,8 @@ from .options import (
     Point,
     Scene,
     SceneKeywords,
+    SceneOptions,
     Scheduler,
-    Settings,
     Share,
     Side,
     Window,
@@ -94,11 +92,32 @@ def slice(
         Sample over the weights of a neural policy instead of the parameters of the environment: mlp:32x32 has two
         hidden layers of 32. It has losses only.
     """
-    return _slice(
-        scene, dims, keywords, along=along, resolution=resolution, through=through, window=as_window(window),
-        refine=as_share(refine, "--refine"), budget=budget, policy=policy, gradients=gradients,
-        scheduler=scheduler, widths=as_widths(figure_width_mm), out=as_path(out), force=force,
-    )  # fmt: skip
+    from ..jobs.cut import cut, describe_cut, refuse_cut
+
+    refuse_cut(dims, along)
+    call, fine, window = current(), as_share(refine, "--refine"), as_window(window)
+    env = environment(scene, keywords, dims=dims if policy is None else None)
+    from ..landscapes.objective import BoxedObjective
+    from ..landscapes.sampling.refine import Refinement
+    from ..landscapes.space import as_stride
+
+    objective, stride = with_policy(env, policy), as_stride(gradients or 0) if policy is None else 0
+    in_memory = is_in_memory(env, out)
+    begun: dict[str, Any] = {"out": as_path(out), "gradients": stride, "refinement": Refinement.of(fine, budget)}
+    where: dict[str, Any] = {"through": through, "extent": window, "resolution": resolution}
+    plane = cut(objective, dims, along, **where, kept=None if force or in_memory else begun)
+    if in_memory:
+        return _sample_in_memory(BoxedObjective(objective) if along else objective, plane, begun["refinement"], stride)
+    from ..jobs.slice import SliceJob
+    from ..jobs.workers import workers
+
+    with workers(scheduler, env.device) as executor:
+        job = SliceJob.of(
+            objective, plane, command=call.command, cut=describe_cut(along, through, window), force=force,
+            executor=executor, prints=as_widths(figure_width_mm), **begun,
+        )  # fmt: skip
+        job.run(call.watch)
+    return _open(job.folder, None, lambda: objective)
 
 
 @verb
@@ -110,9 +129,7 @@ def bounce(
     window: Window | None = None,
     fidelity: str = "standard",
     device: Device = "auto",
-    options: Annotated[
-        Settings, Parameter(name="--set", help="An option of the environment, as name=value. It may be repeated.")
-    ] = (),
+    options: SceneOptions = (),
     figure_width_mm: FigureWidth = (),
     out: Out = None,
     force: Force = False,
@@ -140,58 +157,10 @@ def bounce(
     """
     if axis not in ("x", "y", "z"):
         raise ValueError(f"bounce varies the velocity along axis x, y or z; got {axis!r}")
-    return _slice(
-        "bounce", (f"velocity {axis}",), {"fidelity": fidelity, "device": device, "options": options},
-        resolution=resolution, through=through, window=as_window(window), widths=as_widths(figure_width_mm),
-        out=as_path(out), force=force,
+    return slice(
+        "bounce", (f"velocity {axis}",), resolution=resolution, through=through, window=window, fidelity=fidelity,
+        device=device, options=options, figure_width_mm=figure_width_mm, out=out, force=force,
     )  # fmt: skip
-
-
-def _slice(
-    scene: Scene,
-    dims: Dims | None,
-    keywords: SceneKeywords,
-    *,
-    resolution: Any,
-    through: Any,
-    window: float | tuple[float, float] | None,
-    widths: list[float],
-    out: Path | None,
-    force: bool,
-    along: str | None = None,
-    refine: float | None = None,
-    budget: int | None = None,
-    policy: str | None = None,
-    gradients: bool | int | None = True,
-    scheduler: str | None = None,
-) -> Slice:
-    from ..jobs.cut import cut, describe_cut, refuse_cut
-
-    refuse_cut(dims, along)
-    call = current()
-    env = environment(scene, keywords, dims=dims if policy is None else None)
-    from ..landscapes.objective import BoxedObjective
-    from ..landscapes.sampling.refine import Refinement
-    from ..landscapes.space import as_stride
-
-    objective, stride = with_policy(env, policy), as_stride(gradients or 0) if policy is None else 0
-
-    fine, in_memory = Refinement.of(refine, budget), is_in_memory(env, out)
-    begun: dict[str, Any] = {"out": out, "gradients": stride, "refinement": fine}
-    where: dict[str, Any] = {"through": through, "extent": window, "resolution": resolution}
-    plane = cut(objective, dims, along, **where, kept=None if force or in_memory else begun)
-    if in_memory:
-        return _sample_in_memory(BoxedObjective(objective) if along else objective, plane, fine, stride)
-    from ..jobs.slice import SliceJob
-    from ..jobs.workers import workers
-
-    with workers(scheduler, env.device) as executor:
-        job = SliceJob.of(
-            objective, plane, command=call.command, cut=describe_cut(along, through, window), force=force,
-            executor=executor, prints=widths, **begun,
-        )  # fmt: skip
-        job.run(call.watch)
-    return _open(job.folder, None, lambda: objective)
 
 
 def sample(scene: Scene, plane: Plane, *, gradients: bool | int = True) -> xr.Dataset:

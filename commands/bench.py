@@ -15,24 +15,23 @@ if TYPE_CHECKING:
 
 def show(found: Bench, console: Console) -> None:
     """Print what was measured as compact tables."""
-    console.print(_subject(found), highlight=False)
+    console.print(_subject(found))
     console.print(_rates(found.rates))
     for rate in found.rates:
         if rate.ratio_forward is not None:
             ratios = f"{rate.ratio_forward:.2f} forward, {rate.ratio_with_gradient:.2f} with gradient"
-            console.print(f"batch {rate.batch}, {rate.engine} : {found.against} = {ratios}", highlight=False)
+            console.print(f"batch {rate.batch}, {rate.engine} : {found.against} = {ratios}")
         if rate.failed:
-            console.print(f"batch {rate.batch}, {rate.engine}: {rate.failed} episodes failed", highlight=False)
+            console.print(f"batch {rate.batch}, {rate.engine}: {rate.failed} episodes failed")
     if found.kernels and found.kernels["forward"].kernels:
         console.print(_kernels(*found.kernels.values()))
     if one := found.adapter:
         console.print(
             f"a batch of {one.batch}: {one.forward:.1%} of the time is not the engine's own program, "
             f"{one.with_gradient:.1%} with gradient",
-            highlight=False,
         )
     said = f"sampling {found.sampler.points} points: {found.sampler.share:.1%} of the time is the sampler's own"
-    console.print(said, highlight=False)
+    console.print(said)
 
 
 def _subject(found: Bench) -> str:

@@ -15,7 +15,7 @@ def show(found: Census, console: Console) -> None:
     from rich.box import SIMPLE
 
     many = f"{len(found.slices)} slices, {found.episodes} episodes"
-    console.print(f"{found.env} · {found.fidelity}: {many}", highlight=False)
+    console.print(f"{found.env} · {found.fidelity}: {many}")
     words = table("word", "slices that it fits", box=SIMPLE)
     for word, share in sorted(found.words.items(), key=lambda one: -one[1].value):
         if share.value > 0:
@@ -33,7 +33,6 @@ def show(found: Census, console: Console) -> None:
     console.print(
         "point, cut, both: shares of a measure's variance over the slices that go with the base point, with the cut, "
         f"with what they do together. halved: the variance that half the resolution adds{at}, as a share of the same.",
-        highlight=False,
     )
 
 

@@ -16,13 +16,13 @@ def show(found: SliceComparison, console: Console) -> None:
     """Print a row for each number, where losses part, and the settings that differ."""
     from rich.box import SIMPLE
 
-    console.print(f"A: {found.a}\nB: {found.b}", highlight=False)
+    console.print(f"A: {found.a}\nB: {found.b}")
     rows = table("measure", "value, 95 % interval", box=SIMPLE, padding=(0, 1))
     for name, one in found.table().iterrows():
         rows.add_row(str(name), _format(one))
     console.print(rows)
     for line in lines(found):
-        console.print(line, highlight=False)
+        console.print(line)
 
 
 def _format(row: Any) -> str:

@@ -29,7 +29,7 @@ def show_entries(found: list[Entry], console: Console) -> None:
     console.print(shown)
     for line in sorted({installs(entry) for entry in found} - {""}):
         names = ", ".join(entry.name for entry in found if installs(entry) == line)
-        console.print(f"not installed: {names}; {line}", markup=False, soft_wrap=True)
+        console.print(f"not installed: {names}; {line}", soft_wrap=True)
     console.print("`landscape envs NAME` shows one in full: bounds, options, examples, fidelities, what it models.")
 
 

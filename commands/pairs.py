@@ -32,14 +32,13 @@ def show(ranking: PairRanking, console: Console, *, top: Annotated[int, at_least
         found.add_row(" ".join(map(str, pair.dims)), ranking.name(pair), *cells)
     failed = f", {ranking.failed} failed" if ranking.failed else ""
     said = f"{ranking.env} · {ranking.fidelity}: {ranking.episodes} episodes{failed}; {len(ranking.pairs)} pairs"
-    console.print(said, highlight=False)
+    console.print(said)
     console.print(found)
     console.print(
         "sensitivity: share of the loss's variance that a slice shows on average; interaction: what both do only "
         "together; ruggedness: ups and downs along a tenth of the box, in standard deviations; disagreement of "
         "gradients with slopes over a twentieth of it: 0 none, 1 zero or opposite; "
         "score: sensitivity x (1 + the others).",
-        highlight=False,
     )
     for line in _leaders(ranking):
         console.print(line)

@@ -25,7 +25,7 @@ def show(found: Plan, console: Console) -> None:
     for part in found.parts:
         each = {"a loss": part.seconds_per_loss, "a gradient": part.seconds_per_gradient}
         said = ", ".join(f"{seconds:.3g} s {what}" for what, seconds in each.items() if seconds)
-        console.print(f"{part.env}: {said}, {part.rate}", highlight=False)
+        console.print(f"{part.env}: {said}, {part.rate}")
     console.print(
         f"{found.episodes} episodes, {duration(found.seconds)} of simulation, {size(found.disk)} on disk; "
         "what pictures and search methods take is not in it",

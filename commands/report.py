@@ -17,7 +17,7 @@ def show(report: Report, console: Console) -> None:
         found.add_row(name, text)
     console.print(found)
     for line in report.verdict_lines():
-        console.print(line, highlight=False)
+        console.print(line)
 
 
 def show_several(found: Reports, console: Console) -> int:

@@ -26,9 +26,6 @@ MEANING = (
 
 def show(found: StudyRecord, console: Console) -> None:
     """Print a study: what it is of, its tables, its verdicts, and what was refused."""
-    from .terminal import Console
-
-    console = Console(file=console.file, width=console.width, highlight=False)
     for part in SHOWN[found.kind](found):
         console.print(part, soft_wrap=found.kind == "mixed" and isinstance(part, str))  # lines of Python stay whole
     for why in dict.fromkeys(refused.why for refused in found.refused):

@@ -20,7 +20,7 @@ from ..landscapes.space import as_whole
 from ..landscapes.storage.files import check_free, clear, refuse_others, visible_files
 from ..landscapes.threads import one_torch_thread
 from ..optim.claims import Claims, check_claims
-from ..optim.memory import SearchSize, require_method, require_runs, run_need
+from ..optim.memory import SearchSize, require_runs, run_need
 from ..optim.processes import workers_worth
 from ..optim.race import Competitor, Race, name_seeds, race
 from ..optim.registry import check_methods, optimizer_class
@@ -295,7 +295,7 @@ def _require_memory(
     require_runs(env.space.dim, budget, seeds, folder, abreast=len(methods))
     for method in methods:
         optimizer = make_optimizer(method, env, options=options.get(method))
-        require_method(type(optimizer), optimizer.options, SearchSize(env.space.dim, env.decisions, budget))
+        optimizer.require_memory(optimizer.options, SearchSize(env.space.dim, env.decisions, budget))
 
 
 def _competitor(env: Environment, method: str, seed: int, options: Mapping[str, Any], run: RunStore) -> Competitor:

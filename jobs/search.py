@@ -17,7 +17,7 @@ from ..landscapes.space import as_whole
 from ..landscapes.storage.files import check_free, clear, tidy, write_json
 from ..landscapes.threads import one_torch_thread
 from ..optim.base import Kind
-from ..optim.memory import SearchSize, require_method, require_runs, run_need
+from ..optim.memory import SearchSize, require_runs, run_need
 from ..optim.registry import methods, optimizer_class
 from ..optim.runs.run import Run
 from ..optim.runs.store import RunStore
@@ -115,7 +115,7 @@ class SearchJob(Job[SearchSummary]):
         budget, identity = as_whole(budget, "a budget", least=1), run_identity(env, optimizer)
         folder = out or run_folder(identity)
         require_runs(env.space.dim, budget, 1, folder)
-        require_method(type(optimizer), optimizer.options, SearchSize(env.space.dim, env.decisions, budget))
+        optimizer.require_memory(optimizer.options, SearchSize(env.space.dim, env.decisions, budget))
         RUN.check(folder)
         if replaced := force and (folder / STORE).exists():
             check_free(folder)
@@ -242,7 +242,7 @@ def make_optimizer(
 
     kind = optimizer_class(method)
     chosen = read_options(method, kind.Options, options or {})
-    require_method(kind, chosen, SearchSize(objective.space.dim, objective.decisions))
+    kind.require_memory(chosen, SearchSize(objective.space.dim, objective.decisions))
     return kind.on(objective, seed=seed, options=chosen)
 
 
@@ -252,7 +252,7 @@ def divide_methods(env: Environment, names: Sequence[str] = (), *, budget: int =
     for method in names or methods():
         try:
             made = make_optimizer(method, env)
-            require_method(type(made), made.options, SearchSize(env.space.dim, env.decisions, budget))
+            made.require_memory(made.options, SearchSize(env.space.dim, env.decisions, budget))
         except ValueError as error:
             unable[method] = " ".join(str(error).split())
         else:

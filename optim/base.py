@@ -5,8 +5,9 @@ from __future__ import annotations
 import abc
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from enum import IntEnum
+from functools import partial
 from typing import Any, ClassVar, Self, final
 
 import numpy as np
@@ -15,6 +16,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ..landscapes.capacity import Need, require
 from ..landscapes.objective import Evaluation, Objective
 from ..landscapes.options import NoOptions as NoOptions
 from ..landscapes.space import ParameterSpace, as_whole
@@ -99,6 +101,26 @@ class Optimizer(abc.ABC):
         """Estimate what a search takes at most [bytes]; `options` holds a value for each of the method's options."""
         return 100 * FLOAT * size.dim
 
+    @final
+    @classmethod
+    def require_memory(cls, options: Any, size: SearchSize) -> None:
+        """Refuse options that take more memory than there is; `options` is the method's dataclass.
+
+        The dimension is judged first, with the method's defaults, then one option after the other, so that the error
+        names what is too much. Raises TooLargeError.
+        """
+        known = asdict(type(options)())
+        number = f"{cls.name}: number of parameters"
+        require(number, size.dim, lambda dim: Need(cls.memory(known, replace(size, dim=dim))))
+        for name, value in asdict(options).items():
+            if type(value) is int and value > 0:
+                require(f"{cls.name} option {name}", value, partial(cls._need_with, known, size, name))
+            known[name] = value
+
+    @classmethod
+    def _need_with(cls, options: Mapping[str, Any], size: SearchSize, option: str, value: int) -> Need:
+        return Need(float(cls.memory({**options, option: value}, size)))
+
     def attach(self, objective: Objective) -> None:
         """Take the objective in hand, for methods that ask it for more; `search` calls it, after a restart too."""
         self.objective = objective
@@ -120,20 +142,6 @@ class Optimizer(abc.ABC):
     @final
     def tell(self, x: Float[Tensor, "count dim"], evaluation: Evaluation) -> None:
         """Take what the points that were asked for came out as; `x` are all of them, in their order."""
-        self._tell(*self._take_in(x, evaluation))
-
-    @final
-    def inform(self, x: Float[Tensor, "count dim"], evaluation: Evaluation) -> None:
-        """Take in points that it did not ask for, before it asks: what later proposals take is measured by that."""
-        self._inform(*self._take_in(x, evaluation))
-
-    @property
-    def remembers(self) -> bool:
-        """Whether what a proposal takes depends on all points so far, so that `inform` makes it that of a late one."""
-        return type(self)._inform is not Optimizer._inform
-
-    def _take_in(self, x: Float[Tensor, "count dim"], evaluation: Evaluation) -> tuple[Points, Points, Points | None]:
-        """Return points and what they came out as, as the hooks see them."""
         ok = evaluation.has_loss.numpy()
         loss = np.where(ok, evaluation.loss.numpy(), math.inf)
         if ok.any():
@@ -142,7 +150,7 @@ class Optimizer(abc.ABC):
             self._told_any = True
         half = ((self.space.upper - self.space.lower) / 2).numpy()
         grad = None if evaluation.grad is None else np.where(ok[:, None], evaluation.grad.numpy() * half, 0.0)
-        return (2.0 * self.space.to_unit(x) - 1.0).numpy(), loss, grad
+        self._tell((2.0 * self.space.to_unit(x) - 1.0).numpy(), loss, grad)
 
     @final
     def state(self) -> dict[str, Any]:
@@ -174,9 +182,6 @@ class Optimizer(abc.ABC):
     def penalise(self, loss: Points) -> Points:
         """Return losses for models that take finite numbers only: a failure counts as the worst loss so far."""
         return np.where(np.isfinite(loss), loss, self.worst)
-
-    def _inform(self, z: Points, loss: Points, grad: Points | None) -> None:  # noqa: B027 -- most do not remember
-        """Take in points as `_tell` does, of a method that keeps all of them."""
 
     def _setup(self) -> None:  # noqa: B027 -- nothing, for the simplest methods
         """Prepare the first `_ask`."""

@@ -46,15 +46,10 @@ PLACES, AROUND, RADIUS = 8, 64, 0.02  # neighbourhoods, points of each, how far 
 
 @dataclass(frozen=True)
 class DivergenceRate:
-    """Hold how a distance grows: `rate` [1/s], over `duration` [s], and whether it is `saturated` before the end.
-
-    `factor` is what the distance is at last, as a multiple of the first that is not zero; NaN where it is always zero.
-    """
+    """Hold how a distance grows: `rate` [1/s], over `duration` [s]."""
 
     rate: float
     duration: float
-    factor: float
-    saturated: bool
 
     @property
     def chaotic(self) -> bool:
@@ -72,16 +67,14 @@ def fit_rate(time: Array, distance: Array, *, extent: float) -> DivergenceRate:
     known = np.flatnonzero(distance > 0)
     whole = float(time[-1] - time[0])
     if not known.size:
-        return DivergenceRate(0.0, whole, math.nan, False)
+        return DivergenceRate(0.0, whole)
     large = np.flatnonzero(distance >= SATURATION * extent)
     end = int(large[0]) if large.size else len(time) - 1
     middle = (time[known[0]] + time[end]) / 2
     chosen = [k for k in known if middle <= time[k] <= time[end]]
-    factor = float(distance[-1] / distance[known[0]])
     if len(chosen) < MIN_INSTANTS:
-        return DivergenceRate(math.nan, whole, factor, bool(large.size))
-    rate = fit_line(time[chosen], np.log(distance[chosen])).slope
-    return DivergenceRate(rate, whole, factor, bool(large.size))
+        return DivergenceRate(math.nan, whole)
+    return DivergenceRate(fit_line(time[chosen], np.log(distance[chosen])).slope, whole)
 
 
 @dataclass(frozen=True)

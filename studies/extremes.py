@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from ..envs.records import Fidelity
 from ..landscapes.identity import MODEL_VERSION
+from ..landscapes.sampling.memory import free_memory
 from .samples import Sample
 from .settings import BOX, DT, MAX_WORK, RESOLUTION, Pair, SceneSettings, Setting, Values, values_key
 from .stability import Cell, ask, bisect, bracket, islands, judge, refuse
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
 
     from ..envs.base import Environment
     from ..jobs.watch import Advance, Watch
-    from .variants import Expected, Study, StudyOptions, StudyRecord, one_line, precision_cost
+    from .variants import StudyOptions
 
 GRID, WIDTH, TOLERANCE = 8, 0.05, 0.1  # by default
 MAP_REACH = 2.0  # times the limit, or less by that, a map reaches; of an option, whose effect goes with its root:
@@ -255,10 +256,6 @@ class ExtremesStudy(Study):
         """Return what the study's folder is named after."""
         return [self.kind, self.env.name, self.env.fidelity.name, len(self.x)]
 
-    def describe_kept(self) -> str:
-        """Say how much of it is on disk."""
-        return f"{self.checkpoint.count()} settings are kept in {self.checkpoint.folder}"
-
     def describe_left(self) -> str:
         """Say how much there is to measure."""
         kept = f", {self.checkpoint.count()} are there already" if self.checkpoint.count() else ""
@@ -434,8 +431,6 @@ class ExtremesStudy(Study):
         return self.answers[name]
 
     def _try(self, values: Values, precision: str, fidelity: str | None) -> Sample:
-        from ..landscapes.sampling.memory import free_memory
-
         if self.env.device == "cuda":
             free_memory()
         try:

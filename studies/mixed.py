@@ -24,6 +24,7 @@ from .fidelity import FidelityRecord, FidelityStudy, MeasuredVariant
 from .samples import Sample
 from .variants import (
     Refused,
+    Study,
     StudyRecord,
     Variant,
     expected_work,
@@ -151,6 +152,7 @@ class MixedStudy(FidelityStudy):
     """
 
     kind = MIXED
+    describe_kept = Study.describe_kept  # nobody knows how many there will be
     takes = ("max_cost", "time_limit", "chaotic")
     advice = "and then a search among their neighbours, of --time-limit seconds at most"
 
@@ -173,10 +175,6 @@ class MixedStudy(FidelityStudy):
         """Return what decides the numbers."""
         limits = {"max_cost": self.max_cost, "time_limit": self.time_limit, "chaotic": self.chaotic}
         return {**super().identity(), **limits}
-
-    def describe_kept(self) -> str:
-        """Say how much of it is on disk."""
-        return f"{self.checkpoint.count()} variants are kept in {self.checkpoint.folder}"
 
     def run(self, watch: Watch, provenance: Mapping[str, Any], command: str) -> MixedRecord:  # type: ignore[override]
         """Measure what is missing, the reference and the named fidelities first, and return the record.

@@ -290,9 +290,9 @@ class Study(abc.ABC):
     def expected(self) -> Iterator[Expected]:
         """Yield what is left to simulate."""
 
-    @abc.abstractmethod
     def describe_kept(self) -> str:
         """Say how much of it is on disk."""
+        return f"{self.checkpoint.count()} {self.what} are kept in {self.checkpoint.folder}"
 
     @abc.abstractmethod
     def describe_left(self) -> str:

@@ -1,5 +1,6 @@
 """What tests of the command share: what it makes, what it printed and what it imports."""
 
+import json
 import math
 import subprocess
 import sys
@@ -23,6 +24,34 @@ class Said:
     returncode: int
     stdout: str
     stderr: str
+
+
+@dataclass(frozen=True)
+class Run:
+    """Run the command in this process: its words one by one or as one text, in the test's folder unless in another."""
+
+    call: Callable[..., Said]
+
+    def __call__(self, *words: str, cwd: Path | None = None, width: int = 160) -> Said:
+        return self.call(*(words[0].split() if len(words) == 1 else words), cwd=cwd, width=width)
+
+    def ok(self, *words: str, cwd: Path | None = None, width: int = 160) -> Said:
+        """Run what must succeed."""
+        done = self(*words, cwd=cwd, width=width)
+        assert done.returncode == 0, done.stderr
+        return done
+
+    def json(self, *words: str, cwd: Path | None = None) -> Any:
+        """Run what must succeed with --json, and return what it prints."""
+        split = words[0].split() if len(words) == 1 else words
+        return json.loads(self.ok(*split, *(() if "--json" in split else ("--json",)), cwd=cwd).stdout)
+
+    def refuse(self, *words: str, said: str, cwd: Path | None = None) -> Said:
+        """Run what must be refused with exit code 2 and these words, whose lines a terminal may have folded."""
+        done = self(*words, cwd=cwd)
+        assert done.returncode == 2, done
+        assert said in " ".join(done.stderr.split())
+        return done
 
 
 def options(verb: Verb) -> dict[str, bool]:

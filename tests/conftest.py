@@ -16,7 +16,7 @@ from hypothesis import HealthCheck, settings
 from gradscape.cli import main
 from gradscape.envs import registry
 
-from .command import NO_BROWSER, PATIENCE, Said, leave_blank
+from .command import NO_BROWSER, PATIENCE, Run, Said, leave_blank
 
 # A shell that is not interactive starts what it sends to the background deaf to Ctrl-C; commands that tests interrupt
 # would inherit that.
@@ -82,16 +82,17 @@ def blank(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> No
 
 
 @pytest.fixture
-def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Callable[..., Said]:
+def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
     """Run the command in this process, in a folder of its own, on a wide screen unless another width is given.
 
     What a job takes is foretold by one episode or two and no more.
     """
     for name in ("MOMENT", "ENOUGH", "WARM_UP"):
         monkeypatch.setattr(f"gradscape.landscapes.cost.{name}", 0.0)
+    monkeypatch.chdir(tmp_path)
 
-    def command(*arguments: str, cwd: Path, width: int = 160) -> Said:
-        monkeypatch.chdir(cwd)
+    def command(*arguments: str, cwd: Path | None, width: int) -> Said:
+        monkeypatch.chdir(cwd or tmp_path)
         monkeypatch.setattr(sys, "argv", ["landscape", *arguments])
         monkeypatch.setenv("COLUMNS", str(width))
         capsys.readouterr()
@@ -99,7 +100,7 @@ def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> 
             main(list(arguments))
         return Said(int(left.value.code or 0), *capsys.readouterr())
 
-    return command
+    return Run(command)
 
 
 @pytest.fixture

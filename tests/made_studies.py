@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from gradscape.envs.records import Fidelity
 from gradscape.landscapes.objective import Status
@@ -30,9 +31,10 @@ from gradscape.studies.variants import Refused
 POINTS = 40
 
 
-def sample(loss: np.ndarray, *, failed: int = 0, slope: float = 1.0) -> Sample:
+def sample(losses: ArrayLike, *, failed: int = 0, slope: float = 1.0) -> Sample:
     """Return a sample whose last points `failed` and whose gradients have a slope."""
-    status, loss = np.full(len(loss), Status.OK, dtype=np.int8), loss.astype(float).copy()
+    loss = np.array(losses, float)
+    status = np.full(len(loss), Status.OK, dtype=np.int8)
     if failed:
         status[-failed:], loss[-failed:] = Status.NONFINITE, np.nan
     return Sample(loss, np.full((len(loss), 2), slope), status, 0.1, 0.3, 4)

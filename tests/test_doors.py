@@ -12,7 +12,7 @@ import gradscape as gs
 from gradscape.cli import verbs
 from gradscape.envs.registry import as_environment, entries
 
-from .command import Said, leave_blank
+from .command import Run, leave_blank
 
 pytestmark = pytest.mark.e2e
 
@@ -155,9 +155,9 @@ def test_every_function_takes_it_or_says_what_it_lacks(name: str, here: Path) ->
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_every_verb_takes_it_or_says_what_it_lacks(name: str, here: Path, run: Callable[..., Said]) -> None:
+def test_every_verb_takes_it_or_says_what_it_lacks(name: str, here: Path, run: Run) -> None:
     for verb, words in commands(f"doors.py:{name}", f"verb-{name}").items():
-        said = run(*words.split(), cwd=here)
+        said = run(words, cwd=here)
         if verb in LACKING:
             assert said.returncode == 2, (words, said)
             assert LACKING[verb] in said.stderr
@@ -194,10 +194,10 @@ pendulum = gs.from_jax(
 
 
 def test_a_pendulum_with_fidelities_and_a_horizon_is_studied_like_a_scene(
-    here: Path, run: Callable[..., Said], monkeypatch: pytest.MonkeyPatch
+    here: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("gradscape.studies.samples.REPETITION", 0.0)
-    Path("pendulum.py").write_text(PENDULUM)
+    (here / "pendulum.py").write_text(PENDULUM)
     f = "pendulum.py:pendulum"
     for words in (
         f"check {f} --points 2",
@@ -209,8 +209,7 @@ def test_a_pendulum_with_fidelities_and_a_horizon_is_studied_like_a_scene(
         f"race {f} --methods random,l-bfgs-b --budget 12 --seeds 2 --out p/race",
         f"study extremes {f} --points 4 --settings damping --pairs none --precisions float64 --out p/extremes",
     ):
-        said = run(*words.split(), cwd=here)
-        assert said.returncode == 0, (words, said)
+        run.ok(words, cwd=here)
     errors = gs.study(
         "fidelity", vars(_module(here, "pendulum.py"))["pendulum"], points=4, settings=("dt",), out="p/fidelity"
     )

@@ -1,9 +1,8 @@
 """A simulator that was edited does not go on with what was stored before: it is refused with both numbers."""
 
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -19,11 +18,12 @@ from gradscape import Environment, Evaluation, Fidelity, ParameterSpace, Plane
 from gradscape.envs.functions import Branin
 from gradscape.envs.records import ModelPart
 from gradscape.jobs.slice import SliceJob
-from gradscape.jobs.watch import Stopped, Watch
+from gradscape.jobs.watch import Stopped
 from gradscape.landscapes.identity import StoreMismatchError
 from gradscape.landscapes.sampling.refine import Refinement
 
 from .processes import alone, landscape
+from .watches import Stop
 
 pytestmark = pytest.mark.e2e
 
@@ -48,21 +48,6 @@ def loss_of(fn: Loss) -> Any:
 def bits(folder: Path) -> dict[str, bytes]:
     """Return the content of every file of a store."""
     return {str(file.relative_to(folder)): file.read_bytes() for file in folder.rglob("*") if file.is_file()}
-
-
-class Stop(Watch):
-    """Interrupt a job once so much of it is done."""
-
-    def __init__(self, at: int) -> None:
-        self.at = at
-
-    @contextmanager
-    def progress(self, total: int, what: str = "episodes") -> Iterator[Any]:
-        def advance(done: int, said: str = "") -> None:
-            if done >= self.at:
-                raise KeyboardInterrupt
-
-        yield advance
 
 
 PLANE = Plane.through(SPACE, SPACE.center, DIMS, resolution=24)

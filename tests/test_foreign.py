@@ -1,8 +1,7 @@
 """Somebody else's simulator: a class in a file, registered by a program, short of what a scene of ours has."""
 
-import json
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +12,7 @@ import gradscape as gs
 from gradscape.envs import registry
 from gradscape.landscapes.identity import stored_identity
 
-from .command import Said
+from .command import Run
 
 pytestmark = pytest.mark.e2e
 
@@ -65,14 +64,12 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_a_class_in_a_file_is_sliced_measured_searched_and_shown(run: Callable[..., Said], folder: Path) -> None:
-    cut = run("slice", "arm.py:TwoLinkArm", "--dims", "elbow", "0", "--resolution", "9", "--out", "cut", cwd=folder)
-    assert cut.returncode == 0, cut.stderr
+def test_a_class_in_a_file_is_sliced_measured_searched_and_shown(run: Run, folder: Path) -> None:
+    run.ok("slice arm.py:TwoLinkArm --dims elbow 0 --resolution 9 --out cut", cwd=folder)
     dataset = gs.open_slice(folder / "cut").data
     assert stored_identity(dataset)["objective"] == "two-link-arm"
     assert dataset["loss"].attrs["units"] == "J"
-    found = run("optimize", "arm.py:TwoLinkArm", "--method", "descents", "--budget", "9", "--out", "run", cwd=folder)
-    assert found.returncode == 0, found.stderr
+    run.ok("optimize arm.py:TwoLinkArm --method descents --budget 9 --out run", cwd=folder)
     for command in (
         ["report", "cut", "--env", "arm.py:TwoLinkArm", "--points-per-axis", "6", "--out", "told"],
         ["overlay", "cut", "run", "--env", "arm.py:TwoLinkArm", "--through", "best", "--out", "over"],
@@ -82,15 +79,12 @@ def test_a_class_in_a_file_is_sliced_measured_searched_and_shown(run: Callable[.
         ["pairs", "arm.py:TwoLinkArm", "--samples", "2", "--out", "paired"],
     ):
         registry.entries().pop("two-link-arm", None)  # as in another process
-        done = run(*command, cwd=folder)
-        assert done.returncode == 0, (command, done.stderr)
+        run.ok(*command, cwd=folder)
     registry.entries().pop("two-link-arm")
-    unknown = run("report", "cut", "--out", "elsewhere", cwd=folder)
-    assert unknown.returncode == 2
-    assert "say where it is, --env FILE.py:NAME, or env= in Python" in unknown.stderr
+    run.refuse("report cut --out elsewhere", cwd=folder, said="say where it is, --env FILE.py:NAME, or env= in Python")
 
 
-def test_a_class_in_a_file_says_what_there_is_to_say(run: Callable[..., Said], folder: Path) -> None:
+def test_a_class_in_a_file_says_what_there_is_to_say(run: Run, folder: Path) -> None:
     bare, worded = (run("envs", f"arm.py:{name}", cwd=folder).stdout for name in ("TwoLinkArm", "Arm"))
     for said in (bare, worded):
         for part in ("3 parameters", "elbow", "rad", "fidelity", "stiffness=a number (default 1.0)"):
@@ -108,12 +102,11 @@ def test_a_class_in_a_file_says_what_there_is_to_say(run: Callable[..., Said], f
 
 @pytest.mark.parametrize("words", [["--dims", "1"], ["--dims", "elbow"]])
 @pytest.mark.parametrize("last", [True, False])
-def test_a_line_has_one_dimension(run: Callable[..., Said], folder: Path, words: list[str], last: bool) -> None:
+def test_a_line_has_one_dimension(run: Run, folder: Path, words: list[str], last: bool) -> None:
     env = ["arm.py:TwoLinkArm"]
     command = ["slice", *words, *env] if last else ["slice", *env, *words]
-    done = run(*command, "--resolution", "5", "--out", "line", "--json", cwd=folder)
-    assert done.returncode == 0, done.stderr
-    assert json.loads(done.stdout)["dims"] == ["elbow"]
+    found = run.json(*command, "--resolution", "5", "--out", "line", cwd=folder)
+    assert found["dims"] == ["elbow"]
     line = gs.open_slice(folder / "line").data
     np.testing.assert_allclose(line["loss"], (line["u"] - 1) ** 2 + 0.5)
     assert (folder / "line/landscape.png").exists()
@@ -132,9 +125,7 @@ def test_a_line_has_one_dimension(run: Callable[..., Said], folder: Path, words:
         ("fluid.py:Mine", "fluid.py:Mine is called 'fluid', and so is gradscape.envs.mpm.fluid:Fluid"),
     ],
 )
-def test_a_file_without_the_class_is_refused_by_name(
-    run: Callable[..., Said], folder: Path, name: str, said: str
-) -> None:
+def test_a_file_without_the_class_is_refused_by_name(run: Run, folder: Path, name: str, said: str) -> None:
     (folder / "broken.py").write_text("Arm = 1 / 0")
     (folder / "leaves.py").write_text("import sys\nArm = sys.exit(3)")
     (folder / "fluid.py").write_text(
@@ -154,13 +145,11 @@ class Spring(gs.Environment):
         return gs.Evaluation.from_results(x[:, 0] ** 2, 2 * x if grad else None)
 
 
-def test_a_program_registers_a_class_and_the_command_finds_it(run: Callable[..., Said], tmp_path: Path) -> None:
+def test_a_program_registers_a_class_and_the_command_finds_it(run: Run) -> None:
     assert gs.register(Spring) is Spring
     assert isinstance(gs.make("spring"), Spring)
-    done = run("slice", "spring", "--dims", "0", "--resolution", "4", "--out", "cut", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    report = run("report", "cut", "--points-per-axis", "2", "--out", "told", cwd=tmp_path)
-    assert report.returncode == 0, report.stderr
+    run.ok("slice spring --dims 0 --resolution 4 --out cut")
+    run.ok("report cut --points-per-axis 2 --out told")
     gs.register(Spring)  # again, as a cell of a notebook does
     with pytest.raises(ValueError, match="an environment called 'fluid' exists already"):
         gs.register(type("Fluid", (Spring,), {"name": "fluid"}))

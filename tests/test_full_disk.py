@@ -2,7 +2,6 @@
 
 import errno
 import os
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +10,10 @@ import pytest
 from gradscape.cli import verbs
 from gradscape.studies import samples
 
-from .command import Said
+from .command import Run
 
 pytestmark = pytest.mark.e2e
 
-Command = Callable[..., Said]
 SLICE = "slice branin --dims 0 1 --resolution 4 --out"
 SEARCH = "optimize branin --method random --budget 4 --out"
 SWEEP = "sweep ackley --set dim=3 --dims 0 1 --over 2 --frames 2 --resolution 4 --no-gradients --out made"
@@ -64,7 +62,7 @@ def test_every_verb_that_writes_is_tried() -> None:
 
 @pytest.mark.parametrize("verb", WRITING)
 def test_a_full_disk_says_what_is_kept_and_the_same_command_goes_on(
-    run: Command, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, verb: str
+    run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, verb: str
 ) -> None:
     monkeypatch.setattr("gradscape.studies.kept.user_data_path", lambda name: tmp_path / "data" / name)
     for name in ("REPETITION", "LARGEST"):
@@ -73,7 +71,7 @@ def test_a_full_disk_says_what_is_kept_and_the_same_command_goes_on(
     command, last, kept = WRITING[verb]
     for needed, made in (("cut", SLICE), ("run", SEARCH)):
         if needed in command.split():
-            assert run(*made.split(), needed, cwd=tmp_path).returncode == 0
+            run.ok(*made.split(), needed)
     replace, full = os.replace, [True]
 
     def put(source: Any, target: Any) -> None:
@@ -82,13 +80,12 @@ def test_a_full_disk_says_what_is_kept_and_the_same_command_goes_on(
         replace(source, target)
 
     monkeypatch.setattr(os, "replace", put)
-    ended = run(*command.split(), cwd=tmp_path)
+    ended = run(command)
     assert ended.returncode == 1, ended.stderr
     assert "landscape: the disk is full" in ended.stderr
     assert kept in ended.stderr
     assert "same command" in ended.stderr
     assert not list(tmp_path.rglob(last))
     full.clear()
-    done = run(*command.split(), cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    run.ok(command)
     assert not [path for path in tmp_path.rglob(".*") if path.name.startswith(".")]

@@ -1,8 +1,10 @@
-"""Jobs of all kinds that are killed end in the bits of undisturbed ones, and what a kill leaves is in nobody's way."""
+"""Jobs of all kinds that are stopped end in the bits of undisturbed ones, and what a kill leaves is in nobody's way."""
 
+import json
+import re
 from functools import partial
 from pathlib import Path
-from signal import SIGKILL
+from signal import SIGINT, SIGKILL
 
 import pytest
 
@@ -18,6 +20,10 @@ SEARCH = ["--budget", "4", "--fidelity", "draft"]
 JOBS = {
     "slice": ("slice bounce --dims 0 1 --resolution 12 --fidelity draft --out made", "landscape.png"),
     "sweep": ("sweep bounce --dims 0 1 --over 2 --frames 2 --resolution 8 --fidelity draft --out made", "sweep.gif"),
+    "optimize": (
+        "optimize rastrigin --set dim=5 --method cma-es --budget 70 --out made",
+        "progress.png",
+    ),
     "race": ("race bounce --methods random,descents --seeds 2 --budget 12 --fidelity draft --out made", "race.png"),
     "league": (
         "league bounce@draft branin --methods random,descents --seeds 2 --budget 12 --device cpu --out made",
@@ -35,7 +41,7 @@ INSTANTS = {"pairs": [Instant(1), Instant(1, "moved-0"), Instant(1, "crossed-0")
 
 
 @pytest.mark.parametrize(
-    "job", [one if one == "slice" else pytest.param(one, marks=pytest.mark.nightly) for one in JOBS]
+    "job", [one if one in ("slice", "optimize") else pytest.param(one, marks=pytest.mark.nightly) for one in JOBS]
 )
 def test_four_kills_change_no_bit(job: str, tmp_path: Path) -> None:
     """One before anything is there, one before a tile's losses, one before a status, one when all values are there."""
@@ -46,11 +52,49 @@ def test_four_kills_change_no_bit(job: str, tmp_path: Path) -> None:
         folder.mkdir()
     for instant in four:
         assert alone(work, killed, instant).returncode == -SIGKILL
-    for folder in (killed, whole):
-        done = alone(work, folder)
+    ended = {folder: alone(work, folder) for folder in (killed, whole)}
+    for done in ended.values():
         assert done.returncode == 0, done.stderr
+    assert "there already" in ended[killed].stderr
     assert numbers(killed) == numbers(whole) != {}
     assert not [path for path in killed.rglob(".*") if path.suffix in (".making", ".partial")]
+
+
+STOPPED = {  # the command and the instant of Ctrl-C, and how many points or episodes it has in all
+    "slice": ("slice bounce --dims 0 1 --resolution 16 --fidelity standard --out made", 9, 256),
+    "sweep": ("sweep bounce --dims 0 1 --over 2 --frames 4 --resolution 8 --device cpu --out made", 20, 256),
+    "optimize": ("optimize rastrigin --set dim=5 --method cma-es --budget 70 --out made", 9, 70),
+    "race": (
+        "race bounce --methods random,descents --fidelity draft --budget 40 --seeds 2 --workers 2 --out made", 9, 160,
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("job", STOPPED)
+def test_ctrl_c_says_what_is_kept_and_how_to_go_on_and_changes_no_bit(job: str, tmp_path: Path) -> None:
+    command, change, count = STOPPED[job]
+    work, stopped, whole = partial(landscape, *command.split(), "--json"), tmp_path / "stopped", tmp_path / "whole"
+    for folder in (stopped, whole):
+        folder.mkdir()
+    done = alone(work, stopped, Instant(change, "status/c", SIGINT))
+    assert (done.returncode, done.stdout) == (130, "")
+    assert "Traceback" not in done.stderr
+    assert f"the same command continues from there: landscape {command}" in done.stderr
+    kept = re.search(rf"stopped: (\d+) of {count} (points|episodes) are kept", done.stderr)
+    assert kept
+    assert 0 < int(kept[1]) < count
+    assert (stopped / "made/progress.png").exists() == (job == "optimize")
+    again = alone(work, stopped)
+    assert again.returncode == alone(work, whole).returncode == 0, again.stderr
+    assert "are there already" in again.stderr
+    assert f"all {count}" not in again.stderr
+    summary = json.loads(again.stdout)
+    if job == "race":
+        assert "The paper compares no optimisers here" in summary["silence"]
+        assert summary["loss_unit"] == "m²"
+    else:
+        assert (summary["resumed"], summary["episodes"]) == (int(kept[1]), count - int(kept[1]))
+    assert numbers(stopped) == numbers(whole) != {}
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,5 @@
 """`--figure-width-mm`: pictures for print beside those for a screen, drawn again without computing anything."""
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -9,11 +8,10 @@ import xarray as xr
 
 from gradscape.landscapes.storage.records import open_bundle, save_bundle
 
-from .command import Said
+from .command import Run
 
 pytestmark = pytest.mark.e2e
 
-Run = Callable[..., Said]
 SLICE = ("slice", "branin", "--dims", "0", "1", "--resolution", "5", "--out", "cut")
 
 
@@ -44,24 +42,20 @@ def test_a_command_repeated_with_print_draws_and_computes_nothing(
     run: Run, tmp_path: Path, command: tuple[str, ...], picture: str, resumed: str
 ) -> None:
     command = (*command, "--json", *(() if "--out" in command else ("--out", "cut")))
-    first = run(*command, cwd=tmp_path)
-    assert first.returncode == 0, first.stderr
+    run.ok(*command)
     assert not [file for file in (tmp_path / "cut").iterdir() if file.suffix in (".pdf", ".svg")]
-    again = run(*command, "--figure-width-mm", "85", "--figure-width-mm", "170", cwd=tmp_path)
-    assert again.returncode == 0, again.stderr
+    again = run.ok(*command, "--figure-width-mm", "85", "--figure-width-mm", "170")
     assert resumed in again.stderr
     wanted = prints(picture, 85, 170)
     assert whole(tmp_path / "cut", wanted)
     assert wanted[0] in again.stderr
-    third = run(*command, cwd=tmp_path)  # a folder with prints is still its own
-    assert third.returncode == 0, third.stderr
+    run.ok(*command)
     assert whole(tmp_path / "cut", wanted)
 
 
 def test_what_begins_anew_leaves_no_print_of_what_was(run: Run, tmp_path: Path) -> None:
-    run(*SLICE, "--figure-width-mm", "85", cwd=tmp_path)
-    done = run(*SLICE, "--force", "--resolution", "4", "--json", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    run(*SLICE, "--figure-width-mm", "85")
+    run.ok(*SLICE, "--force", "--resolution", "4", "--json")
     assert not list((tmp_path / "cut").glob("*.pdf"))
 
 
@@ -69,7 +63,7 @@ def test_overlays_comparisons_surfaces_and_replays_are_printed_too(run: Run, tmp
     cut = ("slice", "bounce", "--dims", "0", "1", "--resolution", "5", "--device", "cpu", "--out", "cut")
     search = ("optimize", "bounce", "--method", "random", "--budget", "6", "--device", "cpu", "--out", "run")
     for command in (cut, search):
-        assert run(*command, cwd=tmp_path).returncode == 0
+        run.ok(*command)
     for name, command in (
         ("overlay", ("overlay", "cut", "run", "--out", "overlay")),
         ("compare", ("compare", "cut", "cut", "--out", "compare")),
@@ -77,17 +71,15 @@ def test_overlays_comparisons_surfaces_and_replays_are_printed_too(run: Run, tmp
         ("episode", ("replay", "bounce", "--no-film", "--device", "cpu", "--out", "episode")),
     ):
         for _ in range(2):  # the second time into a folder that has prints
-            done = run(*command, "--figure-width-mm", "85", cwd=tmp_path)
-            assert done.returncode == 0, done.stderr
+            done = run.ok(*command, "--figure-width-mm", "85")
             assert whole(tmp_path / name, prints(name, 85))
             assert prints(name, 85)[-1] in done.stderr
 
 
 def test_a_report_is_printed_from_what_it_kept(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    run(*SLICE, cwd=tmp_path)
+    run(*SLICE)
     command = ("report", "cut", "--points-per-axis", "2", "--out", "told")
-    first = run(*command, "--figure-width-mm", "85", cwd=tmp_path)
-    assert first.returncode == 0, first.stderr
+    run.ok(*command, "--figure-width-mm", "85")
     name = prints("gradient-quality", 85)[0]
     before = (tmp_path / "told" / name).read_bytes()
     (tmp_path / "told" / name).unlink()
@@ -96,25 +88,22 @@ def test_a_report_is_printed_from_what_it_kept(run: Run, tmp_path: Path, monkeyp
         raise AssertionError("it is measured again")
 
     monkeypatch.setattr("gradscape.jobs.report.measure", compute)
-    again = run(*command, "--figure-width-mm", "85", cwd=tmp_path)
-    assert again.returncode == 0, again.stderr
+    run.ok(*command, "--figure-width-mm", "85")
     assert (tmp_path / "told" / name).read_bytes() == before
     for file in (tmp_path / "told").iterdir():
         (tmp_path / "cut" / file.name).write_bytes(file.read_bytes())
-    beside = run("report", "cut", "--points-per-axis", "2", "--out", "copied", "--figure-width-mm", "85", cwd=tmp_path)
+    beside = run("report cut --points-per-axis 2 --out copied --figure-width-mm 85")
     assert "copied is copied from cut" in beside.stderr
     assert (tmp_path / "copied" / name).read_bytes() == before
     (tmp_path / "told/gradient-quality.npz").unlink()
-    older = run(*command, "--figure-width-mm", "85", cwd=tmp_path)
+    older = run(*command, "--figure-width-mm", "85")
     assert older.returncode == 2
     assert older.stderr.splitlines()[-1].endswith("delete it to measure it anew")
 
 
 @pytest.mark.parametrize("width", ["40", "wide"])
 def test_no_page_is_so_wide(run: Run, tmp_path: Path, width: str) -> None:
-    done = run(*SLICE, "--figure-width-mm", width, cwd=tmp_path)
-    assert done.returncode == 2
-    assert "--figure-width-mm" in done.stderr
+    run.refuse(*SLICE, "--figure-width-mm", width, said="--figure-width-mm")
     assert not (tmp_path / "cut").exists()
 
 

@@ -245,8 +245,8 @@ def test_a_slice_and_a_sweep_go_over_an_address(tmp_path, run, address):
     how = ["--dims", "0", "1", "--resolution", "8", "--device", "cpu"]
     film = ["--over", "2", "--frames", "2", "--no-gradients"]
     for verb, more, stores in (("slice", [], [STORE]), ("sweep", film, ["frames/000.zarr", "frames/001.zarr"])):
-        alone = run(verb, "bounce", *how, *more, "--out", f"{verb}-alone", cwd=tmp_path)
-        spread = run(verb, "bounce", *how, *more, "--out", f"{verb}-spread", "--scheduler", address, cwd=tmp_path)
+        alone = run(verb, "bounce", *how, *more, "--out", f"{verb}-alone")
+        spread = run(verb, "bounce", *how, *more, "--out", f"{verb}-spread", "--scheduler", address)
         assert (alone.returncode, spread.returncode) == (0, 0), alone.stderr + spread.stderr
         assert "warning" not in spread.stderr
         for store in stores:
@@ -255,8 +255,8 @@ def test_a_slice_and_a_sweep_go_over_an_address(tmp_path, run, address):
 
 def test_a_race_has_the_same_runs_whoever_searches(tmp_path, run, address):
     how = ["race", "bounce", "--methods", "random,cma-es", "--budget", "20", "--seeds", "2", "--device", "cpu"]
-    assert run(*how, "--out", "alone", cwd=tmp_path).returncode == 0
-    assert run(*how, "--out", "spread", "--scheduler", address, cwd=tmp_path).returncode == 0
+    run.ok(*how, "--out", "alone")
+    run.ok(*how, "--out", "spread", "--scheduler", address)
     runs = sorted(path.relative_to(tmp_path / "alone") for path in (tmp_path / "alone").glob("*/run.zarr"))
     assert len(runs) == 4
     for path in runs:
@@ -267,23 +267,22 @@ def test_a_race_has_the_same_runs_whoever_searches(tmp_path, run, address):
 
 def test_the_gallerys_slices_go_over_an_address(tmp_path, run, address):
     how = ["gallery", "compute", "--only", "bounce", "--part", "slices", "--fidelity", "draft", "--device", "cpu"]
-    done = run(*how, "--resolution", "8", "--data", str(tmp_path / "data"), "--scheduler", address, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    run.ok(*how, "--resolution", "8", "--data", str(tmp_path / "data"), "--scheduler", address)
     assert list((tmp_path / "data").glob(f"*/{STORE}"))
 
 
 @pytest.mark.parametrize("wrong", ["local:0", "local:two"])
-def test_a_number_of_workers_that_is_none_is_refused(tmp_path, run, wrong):
-    said = run("slice", "bounce", "--dims", "0", "1", "--device", "cpu", "--scheduler", wrong, cwd=tmp_path)
-    assert said.returncode == 2
-    assert "local:N for N workers" in said.stderr
+def test_a_number_of_workers_that_is_none_is_refused(run, wrong):
+    run.refuse(
+        "slice", "bounce", "--dims", "0", "1", "--device", "cpu", "--scheduler", wrong, said="local:N for N workers"
+    )
 
 
-def test_what_listens_at_an_address_and_is_no_scheduler_is_not_waited_for(tmp_path, run, monkeypatch):
+def test_what_listens_at_an_address_and_is_no_scheduler_is_not_waited_for(run, monkeypatch):
     monkeypatch.setattr("gradscape.jobs.workers.ANSWER", 0.1)
     with socket.create_server(("127.0.0.1", 0)) as mute:
         address = f"tcp://127.0.0.1:{mute.getsockname()[1]}"
-        said = run("slice", "branin", "--dims", "0", "1", "--scheduler", address, cwd=tmp_path)
+        said = run("slice", "branin", "--dims", "0", "1", "--scheduler", address)
     assert (said.returncode, said.stderr.count("\n")) == (1, 1)
     assert f"no Dask scheduler answers at {address}: nothing is said there in 0.1 s" in said.stderr
 
@@ -296,27 +295,25 @@ def test_what_listens_at_an_address_and_is_no_scheduler_is_not_waited_for(tmp_pa
     ],
     ids=["none", "gone"],
 )
-def test_an_address_of_tls_takes_certificates(tmp_path, run, named, said):
+def test_an_address_of_tls_takes_certificates(run, named, said):
     with dask.config.set({f"distributed.comm.tls.{name}": value for name, value in named.items()}):
-        done = run("slice", "branin", "--dims", "0", "1", "--scheduler", "tls://127.0.0.1:9", cwd=tmp_path)
+        done = run("slice branin --dims 0 1 --scheduler tls://127.0.0.1:9")
     assert (done.returncode, done.stderr.count("\n")) == (2, 1)
     assert said in done.stderr
 
 
-def test_an_address_where_nothing_answers_and_a_missing_dask_are_said(tmp_path, run, monkeypatch):
+def test_an_address_where_nothing_answers_and_a_missing_dask_are_said(run, monkeypatch):
     monkeypatch.setattr("gradscape.jobs.workers.ANSWER", 1.0)
     how = ["slice", "bounce", "--dims", "0", "1", "--device", "cpu", "--scheduler", "tcp://127.0.0.1:9"]
-    said = run(*how, cwd=tmp_path)
+    said = run(*how)
     assert said.returncode == 1
     assert "no Dask scheduler answers at tcp://127.0.0.1:9" in said.stderr
     monkeypatch.setitem(sys.modules, "distributed", None)
-    said = run(*how, cwd=tmp_path)
-    assert said.returncode == 2
-    assert "pip install '.[distributed]'" in said.stderr
+    said = run.refuse(*how, said="pip install '.[distributed]'")
 
 
-def test_missing_cryptography_is_said_before_anything_listens(tmp_path, run, monkeypatch):
+def test_missing_cryptography_is_said_before_anything_listens(run, monkeypatch):
     monkeypatch.setitem(sys.modules, "cryptography", None)
-    said = run("slice", "branin", "--dims", "0", "1", "--scheduler", "local:1", cwd=tmp_path)
+    said = run("slice branin --dims 0 1 --scheduler local:1")
     assert (said.returncode, said.stderr.count("\n")) == (2, 1)
     assert "--scheduler local needs cryptography: pip install '.[distributed]'" in said.stderr

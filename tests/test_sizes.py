@@ -12,7 +12,7 @@ import pytest
 from gradscape.cli import verbs
 from gradscape.envs.registry import make
 from gradscape.landscapes.capacity import TooLargeError
-from gradscape.optim.memory import SearchSize, require_method
+from gradscape.optim.memory import SearchSize
 from gradscape.optim.registry import methods, optimizer_class
 
 from .processes import Ended, alone, landscape
@@ -85,9 +85,9 @@ def test_a_dimension_that_cannot_be_is_refused(desk: Path, dim: str) -> None:
 @pytest.mark.parametrize("name", methods())
 def test_every_method_says_what_it_takes_and_is_refused_where_that_is_too_much(name: str) -> None:
     options = optimizer_class(name).Options()
-    require_method(optimizer_class(name), options, SearchSize(100, budget=1000))
+    optimizer_class(name).require_memory(options, SearchSize(100, budget=1000))
     with pytest.raises(TooLargeError, match=f"{name}: number of parameters 1000000000000"):
-        require_method(optimizer_class(name), options, SearchSize(10**12))
+        optimizer_class(name).require_memory(options, SearchSize(10**12))
 
 
 def huge_options() -> list[tuple[str, str]]:
@@ -105,7 +105,7 @@ def test_an_option_that_takes_too_much_is_refused_by_name(name: str, option: str
     options = optimizer_class(name).Options()
     object.__setattr__(options, option, HUGE)  # whatever else it may be refused for
     with pytest.raises(TooLargeError, match=f"{name} option {option} {HUGE} takes .* would fit"):
-        require_method(optimizer_class(name), options, SearchSize(2, budget=10**9))
+        optimizer_class(name).require_memory(options, SearchSize(2, budget=10**9))
 
 
 def test_a_method_is_refused_before_it_is_made(desk: Path) -> None:

@@ -3,7 +3,6 @@
 import ast
 import os
 import re
-from collections.abc import Callable
 from inspect import signature
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,7 @@ from gradscape.commands.terminal import Console, Described
 from gradscape.envs.registry import make
 from gradscape.landscapes.storage.files import make_folder, resolve
 
-from .command import Said
+from .command import Run
 
 DEEP = "/".join(["d"] * 2000)
 HOSTILE = ["[/b]", "loop", "caf\udce9"]
@@ -87,20 +86,20 @@ def said_with(verb: tuple[str, ...], option: Option, value: str) -> list[str]:
     return [*words[:at], value, *words[at + 1 :]]
 
 
-def test_a_path_nobody_meant_ends_with_a_message(run: Callable[..., Said], desk: Path) -> None:
+def test_a_path_nobody_meant_ends_with_a_message(run: Run, desk: Path) -> None:
     for words in (said_with(verb, option, value) for verb, option in PATHS for value in HOSTILE):
-        done = run(*words, cwd=desk)
+        done = run(*words)
         assert done.returncode in (0, 1, 2, 130), (words, done.stderr)
         assert done.returncode == 0 or done.stderr.strip(), words
         assert "\\[" not in done.stdout + done.stderr, words
 
 
-def test_an_option_of_a_scene_is_not_called_as_what_every_scene_has(run: Callable[..., Said], desk: Path) -> None:
+def test_an_option_of_a_scene_is_not_called_as_what_every_scene_has(run: Run, desk: Path) -> None:
     """Whatever `make` and a scene's class take themselves, and are given by the verb's own options."""
     names = sorted({*signature(make).parameters, *signature(Environment.__init__).parameters})
     setting = [verb for verb, one in VERBS.items() if any(option.names == ("--set",) for option in one.options)]
     for words in ([*WORDS[verb], "--set", f"{name}=1"] for verb in setting for name in names):
-        done = run(*words, cwd=desk)
+        done = run(*words)
         assert done.returncode == 2, words
         assert len(done.stderr.splitlines()) == 1, words
         assert words[-1].removesuffix("=1") in done.stderr, words
@@ -112,9 +111,9 @@ def test_every_verb_is_tried() -> None:
     assert len(PATHS) > 25
 
 
-def test_what_is_said_of_a_name_is_the_name(run: Callable[..., Said], desk: Path) -> None:
+def test_what_is_said_of_a_name_is_the_name(run: Run, desk: Path) -> None:
     for name, shown in (("[/b]", "[/b]"), (":warning:", ":warning:"), ("caf\udce9", "caf\\udce9")):
-        done = run("gallery", "list", "--data", name, cwd=desk)
+        done = run("gallery", "list", "--data", name)
         assert (done.returncode, done.stderr) == (0, "")
         assert f"figures in {shown}" in done.stdout
 
@@ -157,8 +156,8 @@ def test_a_loop_of_links_is_no_path(desk: Path) -> None:
     assert resolve(desk / "not/there") == Path(os.path.realpath(desk)) / "not/there"
 
 
-def test_a_path_too_long_for_the_system_ends_in_a_line(run: Callable[..., Said], desk: Path) -> None:
-    done = run("slice", "branin", "--dims", "0", "1", "--out", f"{DEEP}/{DEEP}", cwd=desk)
+def test_a_path_too_long_for_the_system_ends_in_a_line(run: Run, desk: Path) -> None:
+    done = run("slice", "branin", "--dims", "0", "1", "--out", f"{DEEP}/{DEEP}")
     assert done.returncode == 1
     assert len(done.stderr.splitlines()) == 1
     assert "file name too long; give another path" in done.stderr

@@ -188,9 +188,13 @@ def store_files(arrays: Iterable[str], *others: str) -> Ours:
 
 
 def foreign_files(folder: Path, ours: Ours) -> Iterator[str]:
-    """Yield the files of a folder, at any depth, that are not `ours`, by their paths in it; a link never is."""
+    """Yield the files of a folder, at any depth, that are not `ours`, by their paths in it.
+
+    A link is ours only if it leads nowhere: a damaged disk may leave one instead of a file of ours.
+    """
     for path, name in _files(folder):
-        if path.is_symlink() or not (ours(name) or any(map(MAKING.fullmatch, Path(name).parts))):
+        leads_somewhere = path.is_symlink() and path.exists()
+        if leads_somewhere or not (ours(name) or any(map(MAKING.fullmatch, Path(name).parts))):
             yield name
 
 

@@ -75,9 +75,6 @@ class BO(Optimizer):
     def _tell(self, z: Points, loss: Points, grad: Points | None) -> None:
         self.surrogate.add(z, loss)
 
-    def _inform(self, z: Points, loss: Points, grad: Points | None) -> None:
-        self.surrogate.add(z, loss)
-
 
 @dataclass(frozen=True)
 class BODescentsOptions(SurrogateOptions, DescentOptions):
@@ -160,9 +157,6 @@ class BOGradient(BO):
     def _tell(self, z: Points, loss: Points, grad: Points | None) -> None:
         assert grad is not None  # as asked
         self.surrogate.learn(z, loss, grad)
-
-    def _inform(self, z: Points, loss: Points, grad: Points | None) -> None:
-        self._tell(z, loss, grad)
 
 
 class SlopeSurrogate(Surrogate):

@@ -94,9 +94,6 @@ class BOLeap(Optimizer):
         if self.descent.done:
             self.local.leap(self.descent.at)
 
-    def _inform(self, z: Points, loss: Points, grad: Points | None) -> None:
-        self.surrogate.add(z, loss)
-
     def _state(self) -> dict[str, Any]:
         return super()._state() | {"local": self.local and self.local.state()}
 

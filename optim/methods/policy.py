@@ -153,7 +153,6 @@ class PolicySearch(Optimizer):
     are put back afterwards: searches in other threads neither see nor change them. Simulations are not under the lock.
     """
 
-    algorithm: ClassVar[Any]
     _rollout: Rollout  # between `_ask` and `_tell`
 
     def _setup(self) -> None:
@@ -262,7 +261,6 @@ class PPO(PolicySearch):
 
     name: ClassVar[str] = "ppo"
     Options: ClassVar[type[Any]] = PPOOptions
-    algorithm: ClassVar[Any] = sb3.PPO
 
     @classmethod
     def memory(cls, options: Mapping[str, Any], size: SearchSize) -> float:
@@ -309,7 +307,6 @@ class SAC(PolicySearch):
 
     name: ClassVar[str] = "sac"
     Options: ClassVar[type[Any]] = SACOptions
-    algorithm: ClassVar[Any] = sb3.SAC
 
     @classmethod
     def memory(cls, options: Mapping[str, Any], size: SearchSize) -> float:

@@ -59,12 +59,3 @@ def test_a_slice_without_gradients_asks_for_none(tmp_path: Path) -> None:
     assert found.slopes is None
     assert "gradients" not in found.differing
     assert found.plot()._repr_png_().startswith(b"\x89PNG")
-
-
-def test_what_does_not_belong_together_is_refused(tmp_path: Path) -> None:
-    a = gs.slice("bounce", (0, 1), resolution=4, out=tmp_path / "a")
-    with pytest.raises(ValueError, match="fidelity are of an environment to sample; b is there already"):
-        gs.compare(a, a, fidelity="draft")
-    with pytest.raises(ValueError, match="A has velocity x where B has x"):
-        gs.compare(a, gs.from_torch(bowl, SPACE))
-    assert not Path("out").exists() or not list(Path("out").glob("compare-*"))

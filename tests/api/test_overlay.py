@@ -15,11 +15,11 @@ from matplotlib.text import Text
 
 import gradscape as gs
 from gradscape.jobs.foreign import tables_over
-from gradscape.jobs.watch import Watch
 from gradscape.landscapes.export import save_as
 from gradscape.landscapes.foreign import points_table
 
 from ..command import make
+from ..watches import Told
 
 
 @pytest.fixture(scope="module")
@@ -54,15 +54,6 @@ def test_a_slice_is_cut_anew_through_the_best_point(tmp_path: Path) -> None:
     assert laid.slice.plane.resolution == (5, 5)
     assert laid.slice.folder is not None
     assert laid.slice.folder.parent == tmp_path / "over"
-
-
-def test_what_does_not_belong_together_is_refused(cut: gs.Slice, tmp_path: Path) -> None:
-    other = gs.optimize("ackley", "random", budget=2, out=tmp_path / "run")
-    with pytest.raises(ValueError, match="objective is 'branin' there and 'ackley' here"):
-        gs.overlay(cut, other)
-    with pytest.raises(ValueError, match="--plane takes pca"):
-        gs.overlay(cut, other, plane="tsne")
-    assert not Path("out/overlay").exists()
 
 
 def test_points_of_other_programs_lie_where_a_run_lies(cut: gs.Slice, tmp_path: Path) -> None:
@@ -128,6 +119,8 @@ def test_files_that_are_no_tables_are_refused(cut: gs.Slice, name: str, tmp_path
         gs.overlay(cut, tmp_path / name)
     with pytest.raises(ValueError, match="what is laid over a slice are runs"):
         gs.overlay(cut, 3)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="--plane takes pca"):
+        gs.overlay(cut, tmp_path / name, plane="tsne")  # type: ignore[arg-type]
 
 
 def test_a_study_of_optuna_is_laid_over_a_slice(cut: gs.Slice, tmp_path: Path) -> None:
@@ -176,16 +169,6 @@ def test_values_that_a_study_maximises_are_negated_and_its_name_says_so(
     assert laid.runs[0].attrs["label"] == "optuna-gain (negated)"
     assert "optuna-gain (negated): " in " ".join(text.get_text() for text in laid.plot().findobj(Text))
     assert not capfd.readouterr().err  # a recording takes any name
-
-
-class Told(Watch):
-    """Keep what a job tells."""
-
-    def __init__(self) -> None:
-        self.lines: list[str] = []
-
-    def note(self, text: str) -> None:
-        self.lines.append(text)
 
 
 COMMAS = "X0;x1;LOSS;note\n[m];[m];[J];\n1,5;2,25;3,5;a\n\n1,5;failed;3;b\n2,5;;1e0;\n-0,5;1;failed;c;;\n;;;\n"

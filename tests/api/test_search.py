@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,12 +13,12 @@ import torch
 import gradscape as gs
 from gradscape.landscapes.identity import StoreError, StoreMismatchError
 
-from ..command import Said
+from ..command import Run
 
 
-def test_a_run_of_python_is_the_command_s(run: Callable[..., Said], tmp_path: Path) -> None:
+def test_a_run_of_python_is_the_command_s(run: Run, tmp_path: Path) -> None:
     command = "optimize branin --method cma-es --budget 20 --seed 3 --option population=5 --json"
-    done = run(*command.split(), cwd=tmp_path)
+    done = run(command)
     folder = tmp_path / json.loads(done.stdout)["folder"]
     theirs = gs.open_run(folder)
     ours = gs.optimize("branin", "cma-es", budget=20, seed=3, method_options={"population": 5})
@@ -29,7 +29,7 @@ def test_a_run_of_python_is_the_command_s(run: Callable[..., Said], tmp_path: Pa
     assert again.identity == theirs.identity
     for name in ("x", "loss", "status", "kind"):
         np.testing.assert_array_equal(again.data[name], theirs.data[name])
-    assert run("export", "again", cwd=tmp_path).returncode == 0
+    run.ok("export again")
 
 
 def test_a_larger_budget_goes_on_and_another_run_is_refused_but_by_force(tmp_path: Path) -> None:
@@ -83,26 +83,6 @@ def test_where_nothing_succeeded_there_is_no_best_and_it_is_said() -> None:
         _ = found.best
 
 
-@pytest.mark.parametrize(
-    ("wrong", "said"),
-    [
-        ({"method": "cma"}, "no method is called 'cma'; did you mean cma-es"),
-        ({"method": "random", "budget": 0}, "optimize takes budget >= 1; got 0"),
-        ({"method": "random", "method_options": {"sigma": 1}}, "random has no option 'sigma'"),
-        ({"method": "random", "budget": 2.5}, "optimize takes a whole number as budget; got 2.5"),
-        ({"method": "random", "seed": -1}, "optimize takes seed >= 0; got -1"),
-        ({"method": "random", "fidelity": "best"}, "has fidelities exact; got 'best'"),
-    ],
-)
-def test_what_a_search_does_not_have_is_refused(
-    wrong: dict, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)  # a checkout has a folder `out` after `make demo`
-    with pytest.raises(ValueError, match=said):
-        gs.optimize("branin", **wrong)
-    assert not Path("out").exists()
-
-
 def test_what_is_no_run_is_not_opened(tmp_path: Path) -> None:
     with pytest.raises(StoreError, match="there is no run at"):
         gs.open_run(tmp_path / "nothing")
@@ -118,9 +98,9 @@ def test_a_number_of_threads_is_left_as_it_was(tmp_path: Path) -> None:
         torch.set_num_threads(before)
 
 
-def test_a_race_of_python_is_the_command_s(run: Callable[..., Said], tmp_path: Path) -> None:
+def test_a_race_of_python_is_the_command_s(run: Run, tmp_path: Path) -> None:
     command = "race branin --methods random,cma-es --budget 12 --seeds 2 --option cma-es.population=5 --json"
-    kept = json.loads(run(*command.split(), cwd=tmp_path).stdout)
+    kept = run.json(command)
     options = {"cma-es": {"population": 5}}
     ours = gs.race("branin", ["random", "cma-es"], budget=12, seeds=2, method_options=options)
     assert ours.folder is not None
@@ -164,17 +144,20 @@ def test_a_race_tells_pairs_and_running_times(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("wrong", "said"),
+    ("verb", "wrong", "said"),
     [
-        ({"methods": ["random", "magic"]}, "no method is called 'magic'"),
-        ({"methods": "random", "seeds": 0}, "race takes seeds >= 1; got 0"),
-        ({"methods": "random", "workers": 0}, "a number of workers is a whole number of at least 1"),
+        (gs.optimize, {"method": "random", "budget": 0}, "optimize takes budget >= 1; got 0"),
+        (gs.optimize, {"method": "random", "budget": 2.5}, "optimize takes a whole number as budget; got 2.5"),
+        (gs.optimize, {"method": "random", "seed": -1}, "optimize takes seed >= 0; got -1"),
+        (gs.race, {"methods": "random", "seeds": 0}, "race takes seeds >= 1; got 0"),
+        (gs.race, {"methods": "random", "workers": 0}, "a number of workers is a whole number of at least 1"),
     ],
 )
-def test_what_a_race_does_not_have_is_refused(
-    wrong: dict, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_numbers_that_cannot_be_are_refused(
+    verb: Any, wrong: dict[str, Any], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Words that cannot be are refused by the command in the same way."""
     monkeypatch.chdir(tmp_path)  # a checkout has a folder `out` after `make demo`
     with pytest.raises(ValueError, match=said):
-        gs.race("branin", **wrong)
+        verb("branin", **wrong)
     assert not Path("out").exists()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +15,7 @@ from gradscape.landscapes.convert import from_json
 from gradscape.landscapes.identity import StoreMismatchError, stored_identity
 from gradscape.landscapes.objective import Objective
 
-from ..command import Said
+from ..command import Run
 
 BOX = gs.ParameterSpace.box(["a", "b"], -1.0, 1.0)
 
@@ -25,8 +24,8 @@ def bowl() -> gs.Objective:
     return gs.from_torch(lambda x: (x**2).sum(dim=1), BOX)
 
 
-def test_a_slice_of_python_is_the_command_s(run: Callable[..., Said], tmp_path: Path) -> None:
-    done = run(*["slice", "branin", "--dims", "0", "1", "--resolution", "6", "--json"], cwd=tmp_path)
+def test_a_slice_of_python_is_the_command_s(run: Run, tmp_path: Path) -> None:
+    done = run("slice branin --dims 0 1 --resolution 6 --json")
     folder = tmp_path / json.loads(done.stdout)["folder"]
     theirs = gs.open_slice(folder)
     ours = gs.slice("branin", (0, 1), resolution=6)  # finds it there, as the folder's name is the same
@@ -38,7 +37,7 @@ def test_a_slice_of_python_is_the_command_s(run: Callable[..., Said], tmp_path: 
     assert again.identity == theirs.identity
     for name in ("loss", "grad", "status"):
         np.testing.assert_array_equal(again.data[name], theirs.data[name])
-    assert run("export", "again", cwd=tmp_path).returncode == 0
+    run.ok("export again")
 
 
 def test_another_slice_is_refused_and_replaced_by_force(tmp_path: Path) -> None:

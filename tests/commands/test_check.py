@@ -2,7 +2,7 @@
 
 import json
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from itertools import takewhile
 from pathlib import Path
 
@@ -13,7 +13,7 @@ from gradscape.jobs import check as job
 from gradscape.jobs.scene import SceneSpec
 from gradscape.landscapes.conformance import suite as conformance
 
-from ..command import Said
+from ..command import Run
 
 RUGGED = ("ackley", "griewank", "pinball-2", "pinball-16")  # over a hundredth of the box, at two points
 FUNCTIONS = [name for name, entry in entries().items() if set(entry.fidelities) == {"exact"}]
@@ -56,9 +56,8 @@ def bowl(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     sys.modules.pop("bowl_package")
 
 
-def test_bounce_passes_at_draft(run: Callable[..., Said], tmp_path: Path) -> None:
-    done = run("check", "bounce", "--device", "cpu", "--json", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+def test_bounce_passes_at_draft(run: Run, tmp_path: Path) -> None:
+    done = run.ok("check bounce --device cpu --json")
     report = json.loads(done.stdout)
     assert (report["env"], report["fidelity"], report["passed"]) == ("bounce", "draft", True)
     checks = {found["check"]: found for found in report["checks"]}
@@ -77,8 +76,8 @@ def test_bounce_passes_at_draft(run: Callable[..., Said], tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("name", [*FUNCTIONS, "pinball-2", "pinball-16"])
-def test_quick_environments_pass_at_draft(name: str, run: Callable[..., Said], tmp_path: Path) -> None:
-    done = run("check", name, "--points", "2", "--device", "cpu", "--json", cwd=tmp_path)
+def test_quick_environments_pass_at_draft(name: str, run: Run) -> None:
+    done = run("check", name, "--points", "2", "--device", "cpu", "--json")
     said = {found["check"]: found["outcome"] for found in json.loads(done.stdout)["checks"]}
     step = said.pop("an optimiser's step")
     assert set(said.values()) <= {"pass", "skip"}
@@ -97,8 +96,8 @@ def test_slow_environments_keep_their_promises_at_draft(name: str) -> None:
     )
 
 
-def test_a_time_step_is_checked_once_however_it_is_called(run: Callable[..., Said], tmp_path: Path) -> None:
-    done = run("check", "cartpole", "--points", "2", "--device", "cpu", cwd=tmp_path)
+def test_a_time_step_is_checked_once_however_it_is_called(run: Run) -> None:
+    done = run("check cartpole --points 2 --device cpu")
     nearest = "the nearest step that fits into a control step is that of dt 1x"
     lines = [line for line in done.stdout.splitlines() if " dt " in line.partition("(")[0]]
     assert [line.split("(")[-1].rstrip(")") for line in lines[1:]] == [nearest] * 3
@@ -108,17 +107,13 @@ def test_a_time_step_is_checked_once_however_it_is_called(run: Callable[..., Sai
 
 @pytest.mark.nightly
 @pytest.mark.parametrize("name", sorted(name for name, entry in entries().items() if not entry.extra))
-def test_the_whole_check_of_every_environment_passes(run: Callable[..., Said], tmp_path: Path, name: str) -> None:
+def test_the_whole_check_of_every_environment_passes(run: Run, name: str) -> None:
     """Seconds each, of soft bodies four to fifteen minutes; engines of others are not ours to vouch for."""
-    done = run("check", name, "--device", "cpu", cwd=tmp_path)
-    assert done.returncode == 0, done.stdout
+    run.ok("check", name, "--device", "cpu")
 
 
-def test_anyone_s_environment_is_checked_and_each_check_has_a_line(
-    run: Callable[..., Said], tmp_path: Path, bowl: None
-) -> None:
-    done = run("check", "bowl", "--points", "3", "--seed", "5", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+def test_anyone_s_environment_is_checked_and_each_check_has_a_line(run: Run, bowl: None) -> None:
+    done = run.ok("check bowl --points 3 --seed 5")
     for shown in (
         "pass      shapes                    loss (3,), grad (3, 2), status (3,)",
         "pass      dt 8x                     2 finite",
@@ -130,20 +125,20 @@ def test_anyone_s_environment_is_checked_and_each_check_has_a_line(
     assert "fail" not in done.stdout.replace("failed", "")
 
 
-def test_a_failure_is_exit_code_1_and_names_itself(run: Callable[..., Said], tmp_path: Path, bowl: None) -> None:
-    done = run("check", "bowl", "--set", "wrong=true", cwd=tmp_path)
+def test_a_failure_is_exit_code_1_and_names_itself(run: Run, bowl: None) -> None:
+    done = run("check bowl --set wrong=true")
     assert done.returncode == 1
     failed = [line.split("  ")[0] for line in done.stdout.splitlines() if line.startswith("fail ")]
     assert len(failed) == 3
     assert "sign right 0%" in done.stdout
     assert done.stdout.splitlines()[-1].startswith("fails: ")
-    report = json.loads(run("check", "bowl", "--set", "wrong=true", "--json", cwd=tmp_path).stdout)
+    report = json.loads(run("check bowl --set wrong=true --json").stdout)
     assert not report["passed"]
     assert report["options"] == {"wrong": True, "drifting": False}
 
 
-def test_json_knows_no_infinity(run: Callable[..., Said], tmp_path: Path, bowl: None) -> None:
-    done = run("check", "bowl", "--set", "drifting=true", "--json", cwd=tmp_path)
+def test_json_knows_no_infinity(run: Run, bowl: None) -> None:
+    done = run("check bowl --set drifting=true --json")
     assert done.returncode == 1
     assert "Infinity" not in done.stdout
     found = {found["check"]: found for found in json.loads(done.stdout)["checks"]}["determinism"]
@@ -151,14 +146,13 @@ def test_json_knows_no_infinity(run: Callable[..., Said], tmp_path: Path, bowl: 
 
 
 def test_a_known_exception_is_printed_with_its_reason_until_it_is_none(
-    run: Callable[..., Said], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bowl: None
+    run: Run, monkeypatch: pytest.MonkeyPatch, bowl: None
 ) -> None:
     reasons = dict.fromkeys(("finite differences", "special places", "gradcheck"), "its gradient points downhill")
     monkeypatch.setattr(environment_class("bowl"), "known_failures", {"only": reasons})
-    excused = run("check", "bowl", "--set", "wrong=true", cwd=tmp_path)
-    assert excused.returncode == 0
+    excused = run.ok("check bowl --set wrong=true")
     assert excused.stdout.count("known: its gradient points downhill") == 3
-    no_longer = run("check", "bowl", cwd=tmp_path)
+    no_longer = run("check bowl")
     assert no_longer.returncode == 1
     assert "it passes, so this is no longer true: its gradient points downhill" in no_longer.stdout
 
@@ -169,32 +163,12 @@ def test_known_failures_are_of_fidelities_there_are() -> None:
         assert set(kind.known_failures) <= set(kind.fidelities), name
 
 
-def test_an_interrupt_says_that_nothing_is_kept(
-    run: Callable[..., Said], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_interrupt_says_that_nothing_is_kept(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setitem(conformance.PROMISES, "determinism", interrupted)
-    done = run("check", "branin", cwd=tmp_path)
+    done = run("check branin")
     assert done.returncode == 130
     assert "stopped: 4 checks are done, and nothing is kept of them; the same command begins again" in done.stderr
     assert "Traceback" not in done.stderr
-
-
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (["bonce"], "did you mean bounce?"),
-        (["bounce", "--points", "1"], "--points"),
-        (["bounce", "--fidelity", "best"], "bounce has fidelities draft, standard, reference; got 'best'"),
-        (["bounce", "--set", "wind=1"], "bounce has no option 'wind'"),
-    ],
-)
-def test_bad_input_gets_one_line_and_exit_code_2(
-    run: Callable[..., Said], tmp_path: Path, arguments: list[str], said: str
-) -> None:
-    done = run("check", *arguments, cwd=tmp_path)
-    assert done.returncode == 2
-    assert said in done.stderr
-    assert len(done.stderr.splitlines()) == 1

@@ -2,7 +2,6 @@
 
 import json
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -10,9 +9,8 @@ import pytest
 
 from gradscape.landscapes.storage.store import open_slice
 
-from ..command import Said, make
+from ..command import Run, make
 
-Run = Callable[..., Said]
 CUT = "slice bounce --dims 0 1 --resolution 5 --device cpu"
 
 STANDARD = "compare a bounce --fidelity standard --device cpu --out made"
@@ -31,8 +29,7 @@ def desk(both: Path, tmp_path: Path) -> Path:
 
 
 def test_two_slices_are_compared_and_nothing_is_sampled(run: Run, desk: Path) -> None:
-    done = run("compare", "a", "b", "--out", "both", "--json", cwd=desk)
-    assert done.returncode == 0, done.stderr
+    done = run.ok("compare a b --out both --json")
     assert sorted(file.name for file in (desk / "both").iterdir()) == ["compare.json", "compare.png"]
     said = json.loads(done.stdout)
     kept = json.loads((desk / "both/compare.json").read_text())
@@ -49,28 +46,26 @@ def test_two_slices_are_compared_and_nothing_is_sampled(run: Run, desk: Path) ->
 
 def test_an_environment_is_sampled_on_the_slices_own_plane_as_it_would_be_by_itself(run: Run, desk: Path) -> None:
     command = (*STANDARD.split(), "--json")
-    done = run(*command, cwd=desk)
-    assert done.returncode == 0, done.stderr
+    done = run.ok(*command)
     (folder,) = (path for path in (desk / "made").iterdir() if path.is_dir())
     np.testing.assert_array_equal(open_slice(folder)["loss"], open_slice(desk / "b")["loss"])
-    given = json.loads(run("compare", "a", "b", "--out", "both", "--json", cwd=desk).stdout)
+    given = run.json("compare a b --out both")
     assert json.loads(done.stdout)["loss"] == given["loss"]
-    again = run(*command, cwd=desk)
+    again = run(*command)
     assert "all 25 episodes with gradients are there already" in again.stderr
     assert json.loads(again.stdout) == json.loads(done.stdout)
 
 
 def test_options_are_those_of_b(run: Run, desk: Path) -> None:
-    done = run("compare", "a", "bounce", "--set", "drag=0.1", "--device", "cpu", "--out", "made", cwd=desk)
-    assert done.returncode == 0, done.stderr
+    done = run.ok("compare a bounce --set drag=0.1 --device cpu --out made")
     assert "options.drag: 0.0 in A, 0.1 in B" in done.stdout
     assert "settings.dt" not in done.stdout
 
 
-def test_what_lies_off_the_box_is_left_out_of_b_where_it_is_of_a(run: Run, tmp_path: Path) -> None:
+def test_what_lies_off_the_box_is_left_out_of_b_where_it_is_of_a(run: Run) -> None:
     cut = "slice bounce --along random:3 --through random:1 --resolution 5 --window 1.5 --device cpu --out a"
-    assert run(*cut.split(), cwd=tmp_path).returncode == 0
-    done = run(*STANDARD.split(), "--json", cwd=tmp_path)
+    run.ok(cut)
+    done = run(*STANDARD.split(), "--json")
     said = json.loads(done.stdout)
     assert said["statuses"] == []
     assert 0 < said["compared"] < said["points"] == 25
@@ -78,46 +73,18 @@ def test_what_lies_off_the_box_is_left_out_of_b_where_it_is_of_a(run: Run, tmp_p
 
 
 def test_another_comparison_is_replaced_by_force_alone(run: Run, desk: Path) -> None:
-    assert run("compare", "a", "b", "--out", "both", cwd=desk).returncode == 0
-    refused = run("compare", "b", "a", "--out", "both", cwd=desk)
-    assert refused.returncode == 2
-    assert (
-        "both holds a comparison made by other settings (a.fidelity: wanted 'standard', found 'draft'" in refused.stderr
+    run.ok("compare a b --out both")
+    run.refuse(
+        "compare b a --out both",
+        cwd=desk,
+        said="both holds a comparison made by other settings (a.fidelity: wanted 'standard', found 'draft'",
     )
-    assert run("compare", "b", "a", "--out", "both", "--force", cwd=desk).returncode == 0
+    run.ok("compare b a --out both --force")
     assert json.loads((desk / "both/compare.json").read_text())["a"] == "bounce · standard"
 
 
-def test_lines_are_compared_too(run: Run, tmp_path: Path) -> None:
+def test_lines_are_compared_too(run: Run) -> None:
     line = "slice bounce --dims 1 --resolution 8 --device cpu --out a"
-    assert run(*line.split(), cwd=tmp_path).returncode == 0
-    done = run(*STANDARD.split(), cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    run.ok(line)
+    done = run.ok(STANDARD)
     assert "farthest apart at velocity y [m/s]" in done.stdout
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        ("a b --fidelity draft", "b is there already: leave them out"),
-        ("a b --set drag=1", "b is there already: leave them out"),
-        ("a cartpole", "A has velocity x where B has t0 cart velocity"),
-        ("a nothing", "no environment is called 'nothing'"),
-        ("bounce a", "there is no slice at bounce; give the folder of one"),
-        ("a b --out a", "a holds other files and no comparison"),
-    ],
-)
-def test_what_cannot_be_compared_is_refused_in_a_line(run: Run, desk: Path, words: str, said: str) -> None:
-    done = run("compare", *words.split(), cwd=desk)
-    assert done.returncode == 2
-    assert said in done.stderr
-    assert len(done.stderr.splitlines()) == 1
-    assert not (desk / "out").exists()
-
-
-def test_slices_of_two_planes_are_refused_with_what_to_do(run: Run, desk: Path) -> None:
-    assert run(*CUT.replace("0 1", "0 2").split(), "--out", "c", cwd=desk).returncode == 0
-    done = run("compare", "a", "c", cwd=desk)
-    assert done.returncode == 2
-    assert "A is along velocity x, velocity y and B is along velocity x, velocity z" in done.stderr
-    assert "give the name of an environment as B" in done.stderr

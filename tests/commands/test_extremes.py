@@ -1,7 +1,6 @@
 """`landscape study extremes` and what `landscape envs NAME` says of it: what they leave, say and refuse."""
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -17,9 +16,8 @@ from gradscape.landscapes.space import ParameterSpace
 from gradscape.landscapes.storage.records import read_json, write_record
 from gradscape.studies.extremes import ExtremesRecord
 
-from ..command import Said, modules
+from ..command import Run, modules
 
-Command = Callable[..., Said]
 TURN = ["study", "extremes", "stepping", "--points", "4", "--device", "cpu", "--out", "turned"]
 
 
@@ -53,13 +51,9 @@ def own_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.mark.drawn
-def test_a_study_leaves_a_record_a_picture_and_the_margin(run: Command, tmp_path: Path) -> None:
-    assert (
-        "stability: not measured; `landscape study extremes stepping` measures it"
-        in run("envs", "stepping", cwd=tmp_path).stdout
-    )
-    done = run(*TURN, "--grid", "3", "--json", "--figure-width-mm", "85", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+def test_a_study_leaves_a_record_a_picture_and_the_margin(run: Run, tmp_path: Path) -> None:
+    assert "stability: not measured; `landscape study extremes stepping` measures it" in run("envs stepping").stdout
+    done = run.ok(*TURN, "--grid", "3", "--json", "--figure-width-mm", "85")
     report = json.loads(done.stdout)
     assert {**read_json(tmp_path / "turned/extremes.json"), "folder": "turned"} == report
     assert (tmp_path / "turned/extremes.png").read_bytes().startswith(b"\x89PNG")
@@ -73,74 +67,45 @@ def test_a_study_leaves_a_record_a_picture_and_the_margin(run: Command, tmp_path
         assert limit["stable"] <= truth <= limit["failed"]
         assert limit["beyond"] == "NONFINITE"
     assert "settings to measure at 4 points" in done.stderr
-    said = run("envs", "stepping", cwd=tmp_path).stdout
+    said = run("envs stepping").stdout
     share = 0.1 / limits["dt", "float32"]["stable"]
     assert f"standard's step is {share:.2g} of the largest stable one" in said
     assert "float64; warp on cpu, 4 points" in said
 
 
-def test_envs_says_where_a_margin_is_of_another_model_and_of_other_options_nothing(
-    run: Command, tmp_path: Path, own_data: Path
-) -> None:
-    assert run(*TURN, "--settings", "dt", "--precisions", "float32", cwd=tmp_path).returncode == 0
+def test_envs_says_where_a_margin_is_of_another_model_and_of_other_options_nothing(run: Run, own_data: Path) -> None:
+    run.ok(*TURN, "--settings", "dt", "--precisions", "float32")
     (path,) = own_data.rglob("*.json")
     record = read_json(path)
     write_record(path, {**record, "identity": {**record["identity"], "model_version": 0}})
-    assert "by stepping model 0, this is model 1" in run("envs", "stepping", cwd=tmp_path).stdout
+    assert "by stepping model 0, this is model 1" in run("envs stepping").stdout
     write_record(path, {**record, "identity": {**record["identity"], "options": {"soft": 1.0}}})
-    assert "stability: not measured" in run("envs", "stepping", cwd=tmp_path).stdout
+    assert "stability: not measured" in run("envs stepping").stdout
     path.write_text("{}")
-    damaged = run("envs", "stepping", cwd=tmp_path)
-    assert damaged.returncode == 2
-    assert path.name in damaged.stderr
+    run.refuse("envs stepping", said=path.name)
 
 
 def test_shipped_extremes_are_found_where_nothing_of_the_users_own_is(
-    run: Command, tmp_path: Path, own_data: Path, monkeypatch: pytest.MonkeyPatch
+    run: Run, tmp_path: Path, own_data: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    run(*TURN, "--settings", "dt", "--precisions", "float32", cwd=tmp_path)
+    run(*TURN, "--settings", "dt", "--precisions", "float32")
     (path,) = own_data.rglob("*.json")
     shipped = tmp_path / "package" / "data" / "studies" / "stepping-cpu.extremes.json"
     shipped.parent.mkdir(parents=True)
     path.rename(shipped)
     monkeypatch.setattr("gradscape.studies.kept.resources.files", lambda package: tmp_path / "package")
-    assert "of the largest stable one" in run("envs", "stepping", cwd=tmp_path).stdout
+    assert "of the largest stable one" in run("envs stepping").stdout
 
 
-def test_the_table_says_what_is_beyond(run: Command, tmp_path: Path) -> None:
-    said = run(*TURN, "--settings", "dt,box", cwd=tmp_path, width=200).stdout
+def test_the_table_says_what_is_beyond(run: Run) -> None:
+    said = run(*TURN, "--settings", "dt,box", width=200).stdout
     assert "stepping: standard on cpu, 4 points, judged by reference (accurate: 10% of the spread)" in said
     assert "then NONFINITE" in " ".join(said.split())
 
 
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (["--settings", "speed"], "stepping has settings dt, box; got speed"),
-        (["--pairs", "dt"], "--pairs takes two settings as dt:box, or none; got 'dt'"),
-        (["--tolerance", "-1"], "--tolerance takes a share"),
-        (["--reference", "exact"], "to be judged by; got 'exact'"),
-    ],
-)
-def test_what_cannot_be_is_refused(arguments: list[str], said: str, run: Command, tmp_path: Path) -> None:
-    done = run(*TURN, *arguments, cwd=tmp_path)
-    assert done.returncode == 2
-    assert said in done.stderr
-    assert not (tmp_path / "turned").exists()
-
-
-def test_another_study_is_not_overwritten(run: Command, tmp_path: Path) -> None:
-    run(*TURN, "--settings", "dt", cwd=tmp_path)
-    before = (tmp_path / "turned/extremes.json").read_bytes()
-    other = run(*TURN, "--settings", "dt", "--seed", "1", cwd=tmp_path)
-    assert other.returncode == 2
-    assert "seed: wanted 1, found 0" in other.stderr
-    assert (tmp_path / "turned/extremes.json").read_bytes() == before
-
-
 @pytest.mark.drawn
-def test_a_map_shows_each_outcome_the_boundary_and_the_base(run: Command, tmp_path: Path) -> None:
-    run(*TURN, "--grid", "4", cwd=tmp_path)
+def test_a_map_shows_each_outcome_the_boundary_and_the_base(run: Run, tmp_path: Path) -> None:
+    run(*TURN, "--grid", "4")
     found = from_json(ExtremesRecord, read_json(tmp_path / "turned/extremes.json"))
     picture = found.plot()
     maps = [ax for ax in picture.axes if ax.get_title().endswith("dt against box")]

@@ -277,29 +277,3 @@ def test_without_a_checkout_s_data_results_go_to_the_folder_where_one_stands(
     assert gallery("build") == 0
     assert (tmp_path / "out/gallery/branin/index.html").exists()
     assert sorted(path.name for path in installed.rglob("*")) == ["studies"]
-
-
-def test_view_opens_the_site(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert gallery("build", "--data", str(data), "--out", str(tmp_path / "my site")) == 0
-    opened: list[str] = []
-    monkeypatch.setattr("gradscape.api.view.launch", lambda path: opened.append(str(path)) or True)
-    monkeypatch.setenv("DISPLAY", ":0")
-    with pytest.raises(SystemExit) as left:
-        main(["view", str(tmp_path / "my site")])
-    assert not left.value.code
-    assert opened == [str(tmp_path / "my site" / "index.html")]
-
-
-@pytest.mark.parametrize("serve", [[], ["--serve"]])
-def test_view_says_how_a_site_is_served(
-    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], serve: list[str]
-) -> None:
-    (tmp_path / "my site").mkdir()
-    (tmp_path / "my site" / "index.html").touch()
-    for display in ("DISPLAY", "WAYLAND_DISPLAY"):
-        monkeypatch.delenv(display, raising=False)
-    monkeypatch.setattr("sys.platform", "linux")
-    with pytest.raises(SystemExit) as left:
-        main(["view", str(tmp_path / "my site"), *serve])
-    assert left.value.code == 2
-    assert f"landscape gallery serve --out '{tmp_path / 'my site'}'" in capsys.readouterr().err

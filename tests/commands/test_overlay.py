@@ -1,9 +1,6 @@
 """`landscape overlay`: what it leaves, cuts anew, and refuses."""
 
 import shutil
-import sys
-from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -11,72 +8,46 @@ import pytest
 import torch
 
 import gradscape
-from gradscape.cli import main
 from gradscape.jobs.scene import named_point
 from gradscape.landscapes.identity import plane_of
 from gradscape.landscapes.overlay import best_point, overlay
 from gradscape.landscapes.storage.store import open_slice
 from gradscape.optim.runs.store import RunStore
 
-from ..command import make
-
-
-@dataclass(frozen=True)
-class Said:
-    returncode: int
-    stderr: str
+from ..command import Run, make
 
 
 @pytest.fixture(scope="module")
 def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Make a slice of bounce off the runs' best point, two runs of it, and a slice and a run of another landscape."""
+    """Make a slice of bounce off the runs' best point, and two runs of it."""
     return make(
         tmp_path_factory.mktemp("results"),
         "slice bounce --dims 0 1 --resolution 6 --out cut --device cpu",
         "optimize bounce --method cma-es --budget 24 --out race/cma-es-0 --device cpu",
         "optimize bounce --method descents --budget 16 --out race/descents-0 --device cpu",
-        "slice ackley --dims 0 1 --resolution 3 --set dim=3 --out other",
-        "optimize ackley --method random --budget 4 --out small",
     )
 
 
-@pytest.fixture
-def run(
-    results: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> Callable[..., Said]:
+@pytest.fixture(autouse=True)
+def desk(results: Path, tmp_path: Path) -> None:
+    """Work in a folder with the results."""
     shutil.copytree(results, tmp_path, dirs_exist_ok=True)
-    monkeypatch.chdir(tmp_path)
-    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
-        monkeypatch.delenv(name, raising=False)
-
-    def command(text: str) -> Said:
-        monkeypatch.setattr(sys, "argv", ["landscape", *text.split()])
-        with pytest.raises(SystemExit) as left:
-            main(text.split())
-        return Said(int(left.value.code or 0), capsys.readouterr().err)
-
-    return command
 
 
 @pytest.mark.drawn
-def test_a_race_is_laid_over_a_slice(run: Callable[..., Said], tmp_path: Path) -> None:
-    done = run("overlay cut race --out over")
-    assert done.returncode == 0, done.stderr
+def test_a_race_is_laid_over_a_slice(run: Run, tmp_path: Path) -> None:
+    done = run.ok("overlay cut race --out over")
     assert sorted(file.name for file in Path("over").iterdir()) == ["overlay.png", "overlay.rrd"]
     assert (tmp_path / "over/overlay.png").read_bytes().startswith(b"\x89PNG")
     tables = [RunStore.open(path / "run.zarr").dataset() for path in sorted(Path("race").iterdir())]
     away = max(float(laid["distance"].max()) for laid in overlay(open_slice("cut/slice.zarr"), tables))
     assert f"2 runs, 40 points: 0 beyond the map, 0 failed; the farthest is {away:.2g} half-widths" in done.stderr
-    assert run("overlay cut race").returncode == 0
+    run.ok("overlay cut race")
     assert len(list(Path("out").glob("overlay-bounce-*"))) == 1
 
 
-def test_a_slice_cut_through_the_best_point_shows_its_loss(run: Callable[..., Said]) -> None:
-    done = run("overlay cut race/cma-es-0 race/descents-0/run.zarr --through best --out over --device cpu")
-    assert done.returncode == 0, done.stderr
+def test_a_slice_cut_through_the_best_point_shows_its_loss(run: Run) -> None:
+    run.ok("overlay cut race/cma-es-0 race/descents-0/run.zarr --through best --out over --device cpu")
     (folder,) = (path for path in Path("over").iterdir() if path.is_dir())
     dataset = open_slice(folder / "slice.zarr")
     tables = [RunStore.open(path / "run.zarr").dataset() for path in sorted(Path("race").iterdir())]
@@ -93,18 +64,16 @@ def test_a_slice_cut_through_the_best_point_shows_its_loss(run: Callable[..., Sa
 
 
 @pytest.mark.parametrize("point", ["random:2", "center", "best:race/descents-0", "race/descents-0", "example:aim"])
-def test_a_slice_is_cut_anew_through_any_point_that_has_a_name(run: Callable[..., Said], point: str) -> None:
-    done = run(f"overlay cut race --through {point} --resolution 3 --out over --device cpu")
-    assert done.returncode == 0, done.stderr
+def test_a_slice_is_cut_anew_through_any_point_that_has_a_name(run: Run, point: str) -> None:
+    run.ok(f"overlay cut race --through {point} --resolution 3 --out over --device cpu")
     (folder,) = (path for path in Path("over").iterdir() if path.is_dir())
     env = gradscape.make("bounce", device="cpu")
     x = named_point(env, f"best:{point}" if point == "race/descents-0" else point)
     assert float(plane_of(open_slice(folder / "slice.zarr")).distance(x)) < 1e-12
 
 
-def test_a_principal_plane_lies_nearer_to_the_run_than_the_slice_did(run: Callable[..., Said]) -> None:
-    done = run("overlay cut race/cma-es-0 --plane pca --resolution 4 --out over --device cpu")
-    assert done.returncode == 0, done.stderr
+def test_a_principal_plane_lies_nearer_to_the_run_than_the_slice_did(run: Run) -> None:
+    run.ok("overlay cut race/cma-es-0 --plane pca --resolution 4 --out over --device cpu")
     (folder,) = (path for path in Path("over").iterdir() if path.is_dir())
     table = RunStore.open("race/cma-es-0/run.zarr").dataset()
     slices = (open_slice(path) for path in (folder / "slice.zarr", "cut/slice.zarr"))
@@ -113,8 +82,8 @@ def test_a_principal_plane_lies_nearer_to_the_run_than_the_slice_did(run: Callab
     assert not principal["outside"].any()
 
 
-def test_samples_beyond_the_box_are_left_out_of_a_principal_plane(run: Callable[..., Said]) -> None:
-    assert run("overlay cut race --plane pca --resolution 7 --out over --device cpu").returncode == 0
+def test_samples_beyond_the_box_are_left_out_of_a_principal_plane(run: Run) -> None:
+    run.ok("overlay cut race --plane pca --resolution 7 --out over --device cpu")
     (folder,) = (path for path in Path("over").iterdir() if path.is_dir())
     dataset = open_slice(folder / "slice.zarr")
     u, v = np.meshgrid(dataset["u"], dataset["v"])
@@ -125,38 +94,7 @@ def test_samples_beyond_the_box_are_left_out_of_a_principal_plane(run: Callable[
     np.testing.assert_array_equal(dataset["status"] == gradscape.Status.ESCAPED, beyond)
 
 
-def test_another_fidelity_is_drawn_with_a_warning(run: Callable[..., Said]) -> None:
+def test_another_fidelity_is_drawn_with_a_warning(run: Run) -> None:
     run("optimize bounce --method random --budget 4 --fidelity standard --out fine --device cpu")
-    done = run("overlay cut fine --out over")
-    assert done.returncode == 0
+    done = run.ok("overlay cut fine --out over")
     assert "(bounce, random, seed 0) are simulated differently (fidelity 'draft' there, 'standard' here)" in done.stderr
-
-
-@pytest.mark.parametrize(
-    ("command", "said"),
-    [
-        ("overlay other race", "objective is 'ackley' there and 'bounce' here"),
-        ("overlay other small", "options is {'dim': 3} there and {'dim': 2} here"),
-        ("overlay cut cut", "is no run"),
-        ("overlay cut nowhere", "there is no run at"),
-        ("overlay race race", "is no slice store"),
-        ("overlay cut race --plane tsne", "--plane"),
-        ("overlay cut race --resolution 4", "give --through or --plane too"),
-        ("overlay cut race --through nowhere", "got 'nowhere', which is none of these"),
-        ("overlay cut race --through small", "small searched 2 parameters; the slice has 3"),
-        ("overlay cut race --through best:small", "small holds no runs of bounce alone"),
-        ("overlay cut race --out cut", "cut holds other files"),
-    ],
-)
-def test_what_does_not_belong_together_is_refused(run: Callable[..., Said], command: str, said: str) -> None:
-    done = run(command)
-    assert done.returncode == 2
-    assert len(done.stderr.splitlines()) == 1
-    assert said in done.stderr
-
-
-def test_a_missing_display_is_said_before_anything_is_sampled(run: Callable[..., Said]) -> None:
-    done = run("overlay cut race --through best --out over --spawn")
-    assert (done.returncode, len(done.stderr.splitlines())) == (2, 1)
-    assert "there is no display here to open over/overlay.rrd on; leave out --spawn, or take --serve" in done.stderr
-    assert not Path("over").exists()

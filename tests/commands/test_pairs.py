@@ -1,27 +1,19 @@
 """`landscape pairs`: what it prints, keeps and refuses."""
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 
-from ..command import Said
-
-Command = Callable[..., Said]
+from ..command import Run
 
 
-def test_pairs_prints_the_command_that_slices_the_first(run: Command, tmp_path: Path) -> None:
+def test_pairs_prints_the_command_that_slices_the_first(run: Run, tmp_path: Path) -> None:
     how = ["pairs", "rastrigin", "--set", "dim=3", "--samples", "8", "--top", "2"]
-    done = run(*how, "--json", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    done = run.ok(*how, "--json")
     report = json.loads(done.stdout)
     assert len(report["pairs"]) == 3  # of which two are shown
     assert report["episodes"] == 8 * (1 + 5 * 3 + 3)
     first = " ".join(map(str, report["pairs"][0]["dims"]))
     assert f"landscape slice rastrigin --dims {first} --fidelity exact --set dim=3" in done.stderr
-    shown = run(*how, cwd=tmp_path)
+    shown = run(*how)
     assert "152 episodes" in shown.stdout
     assert len(json.loads((tmp_path / report["folder"] / "pairs.json").read_text())["pairs"]) == 3
-
-
-def test_pairs_needs_two_parameters(run: Command, tmp_path: Path) -> None:
-    assert "a pair takes two" in run("pairs", "rastrigin", "--set", "dim=1", cwd=tmp_path).stderr

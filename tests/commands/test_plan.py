@@ -1,7 +1,5 @@
 """The verb `plan`: episodes times what one takes, for any verb, and nothing is written."""
 
-import json
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -10,7 +8,7 @@ import gradscape as gs
 from gradscape.jobs import plan as module
 from gradscape.landscapes.measures.undersampled import probes
 
-from ..command import Said
+from ..command import Run
 
 EACH = {False: 0.5, True: 2.0}  # seconds of a loss and of a gradient
 
@@ -39,11 +37,9 @@ def priced(monkeypatch: pytest.MonkeyPatch) -> None:
     ],
 )
 def test_a_plan_counts_what_the_verb_evaluates(
-    run: Callable[..., Said], tmp_path: Path, words: str, losses: int, gradients: int
+    run: Run, tmp_path: Path, words: str, losses: int, gradients: int
 ) -> None:
-    done = run("plan", *words.split(), "--device", "cpu", "--json", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    found = json.loads(done.stdout)
+    found = run.json("plan", *words.split(), "--device", "cpu")
     assert (found["episodes"], found["gradients"]) == (losses + gradients, gradients)
     assert found["seconds"] == pytest.approx(losses * EACH[False] + gradients * EACH[True])
     assert found["device_hours"] == pytest.approx(found["seconds"] / 3600)
@@ -52,36 +48,32 @@ def test_a_plan_counts_what_the_verb_evaluates(
 
 
 @pytest.mark.parametrize("words", ["check branin --points 2", "pairs ackley --samples 2", "report ackley"])
-def test_verbs_whose_episodes_depend_on_what_they_find_are_planned_too(
-    run: Callable[..., Said], tmp_path: Path, words: str
-) -> None:
-    done = run("plan", *words.split(), "--json", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert json.loads(done.stdout)["episodes"] > 10
+def test_verbs_whose_episodes_depend_on_what_they_find_are_planned_too(run: Run, tmp_path: Path, words: str) -> None:
+    found = run.json("plan", *words.split())
+    assert found["episodes"] > 10
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_samples_a_slice_first_is_planned_by_that_slice(run: Callable[..., Said], tmp_path: Path) -> None:
-    assert run("slice", "bounce", "--dims", "0", "1", "--resolution", "4", "--out", "cut", cwd=tmp_path).returncode == 0
+def test_what_samples_a_slice_first_is_planned_by_that_slice(run: Run, tmp_path: Path) -> None:
+    run.ok("slice bounce --dims 0 1 --resolution 4 --out cut")
     search = ("optimize", "bounce", "--method", "random", "--budget", "3", "--out", "run")
-    assert run(*search, cwd=tmp_path).returncode == 0
+    run.ok(*search)
     before = sorted(tmp_path.rglob("*"))
     for words, points in (
         ("compare cut bounce --fidelity standard", 16),
         ("overlay cut run --through best", 16),
         ("overlay cut run --through best --resolution 6", 36),
     ):
-        done = run("plan", *words.split(), "--json", cwd=tmp_path)
-        assert done.returncode == 0, done.stderr
-        assert json.loads(done.stdout)["gradients"] == points
-    assert "simulates nothing" in run("plan", "overlay", "cut", "run", cwd=tmp_path).stderr
+        found = run.json("plan", *words.split())
+        assert found["gradients"] == points
+    assert "simulates nothing" in run("plan overlay cut run").stderr
     assert sorted(tmp_path.rglob("*")) == before
 
 
-def test_a_plan_takes_as_many_episodes_as_the_slice(run: Callable[..., Said], tmp_path: Path) -> None:
+def test_a_plan_takes_as_many_episodes_as_the_slice(run: Run, tmp_path: Path) -> None:
     words = ("slice", "branin", "--resolution", "6", "--json")
-    planned = json.loads(run("plan", *words, cwd=tmp_path).stdout)
-    made = json.loads(run(*words, cwd=tmp_path).stdout)
+    planned = run.json("plan", *words)
+    made = run.json(*words)
     assert planned["gradients"] == made["episodes"]
     assert planned["episodes"] - planned["gradients"] >= made["undersampled"]["episodes"]
     taken = sum(file.stat().st_size for file in (tmp_path / made["folder"] / "slice.zarr").rglob("*") if file.is_file())
@@ -95,33 +87,15 @@ def test_python_plans_a_function_of_its_own() -> None:
     assert found.command.startswith("gradscape.plan(")
 
 
-def test_a_device_that_is_not_here_is_planned_by_what_was_measured_on_one(
-    run: Callable[..., Said], tmp_path: Path
-) -> None:
+def test_a_device_that_is_not_here_is_planned_by_what_was_measured_on_one(run: Run) -> None:
     pytest.importorskip("torch")
     import torch
 
     if torch.cuda.is_available():
         pytest.skip("there is a CUDA device")
-    found = json.loads(
-        run("plan", "slice", "fluid", "--dims", "6", "8", "--device", "cuda", "--json", cwd=tmp_path).stdout
-    )
+    found = run.json("plan slice fluid --dims 6 8 --device cuda")
     (part,) = found["parts"]
     assert part["device"] == "cuda"
     assert "fluid-cuda" in part["rate"]
     assert part["gpu_memory"] > 0
-    unknown = run("plan", "slice", "branin", "--device", "cuda", cwd=tmp_path)
-    assert unknown.returncode == 2
-    assert "branin" in unknown.stderr
-
-
-def test_what_cannot_be_planned_says_so(run: Callable[..., Said], tmp_path: Path) -> None:
-    for words, said in (
-        (["branin"], "landscape plan slice branin"),
-        (["slice", "brannin"], "did you mean branin?"),
-        (["slice", "branin", "--resolution", "1"], "--resolution"),
-        (["envs"], "envs simulates nothing"),
-    ):
-        done = run("plan", *words, cwd=tmp_path)
-        assert done.returncode == 2
-        assert said in done.stderr
+    run.refuse("plan slice branin --device cuda", said="branin")

@@ -1,9 +1,6 @@
 """`landscape race`: what it computes, keeps, draws, says and refuses."""
 
 import json
-import signal
-from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -13,16 +10,14 @@ from gradscape.landscapes.storage.records import read_json
 from gradscape.optim.registry import methods
 from gradscape.optim.runs.store import RunStore
 
-from ..command import Said
-from ..processes import Instant, alone, landscape
+from ..command import Run
 
 RACE = ["race", "branin", "--methods", "random,cma-es", "--methods", "descents", "--budget", "40", "--seeds", "3"]
 
 
 @pytest.mark.drawn
-def test_race_leaves_runs_picture_and_figures(run: Callable[..., Said], tmp_path: Path) -> None:
-    done = run(*RACE, "--json", "--out", "r", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+def test_race_leaves_runs_picture_and_figures(run: Run, tmp_path: Path) -> None:
+    done = run.ok(*RACE, "--json", "--out", "r")
     said, kept = json.loads(done.stdout), read_json(tmp_path / "r/race.json")
     assert said == {key: kept[key] for key in kept if key not in ("curves", "ecdf")} | {"folder": "r"}
     assert kept["methods"] == ["random", "cma-es", "descents"]
@@ -39,14 +34,14 @@ def test_race_leaves_runs_picture_and_figures(run: Callable[..., Said], tmp_path
         assert kept["curves"]["episodes"][rank["method"]]["mean"][-1] == pytest.approx(np.mean(rank["final"]))
 
 
-def test_more_seeds_methods_and_episodes_go_on_where_the_race_ended(run: Callable[..., Said], tmp_path: Path) -> None:
-    first = run("race", "branin", "--methods", "random", "--budget", "20", "--seeds", "2", cwd=tmp_path)
+def test_more_seeds_methods_and_episodes_go_on_where_the_race_ended(run: Run, tmp_path: Path) -> None:
+    first = run("race branin --methods random --budget 20 --seeds 2")
     assert "40 episodes to compute" in first.stderr
-    again = run("race", "branin", "--methods", "random", "--budget", "20", "--seeds", "2", cwd=tmp_path)
+    again = run("race branin --methods random --budget 20 --seeds 2")
     assert "all 40 episodes are there already" in again.stderr
-    more = run("race", "branin", "--methods", "random,cma-es", "--budget", "30", "--seeds", "3", "--json", cwd=tmp_path)
+    more = run("race branin --methods random,cma-es --budget 30 --seeds 3 --json")
     assert "140 episodes to compute, 40 are there already" in more.stderr
-    less = run("race", "branin", "--methods", "random", "--budget", "20", "--seeds", "2", "--json", cwd=tmp_path)
+    less = run("race branin --methods random --budget 20 --seeds 2 --json")
     assert json.loads(less.stdout)["folder"] == json.loads(more.stdout)["folder"]
     assert len(list(tmp_path.glob("out/race-branin-exact-*/*/run.zarr"))) == 6
     both = [
@@ -54,13 +49,12 @@ def test_more_seeds_methods_and_episodes_go_on_where_the_race_ended(run: Callabl
     ]
     assert both[0]["final"][0] >= both[1]["final"][0]
     assert both[0]["forwards"] == 20
-    anew = run("race", "branin", "--methods", "random", "--budget", "20", "--seeds", "2", "--force", cwd=tmp_path)
+    anew = run("race branin --methods random --budget 20 --seeds 2 --force")
     assert "40 episodes to compute:" in anew.stderr
 
 
-def test_race_prints_ranks_and_what_the_paper_claims(run: Callable[..., Said], tmp_path: Path) -> None:
-    done = run(*RACE, "--claims", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+def test_race_prints_ranks_and_what_the_paper_claims(run: Run) -> None:
+    done = run.ok(*RACE, "--claims")
     for shown in (
         "branin · exact · 40 episodes · 3 seeds",
         "mean rank",
@@ -70,53 +64,28 @@ def test_race_prints_ranks_and_what_the_paper_claims(run: Callable[..., Said], t
         assert shown in done.stdout
 
 
-def test_report_holds_the_papers_claims_against_the_race(run: Callable[..., Said], tmp_path: Path) -> None:
+def test_report_holds_the_papers_claims_against_the_race(run: Run) -> None:
     command = ["race", "cartpole", "--methods", "random,descents", "--budget", "8", "--seeds", "2"]
-    done = run(*command, "--claims", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    done = run.ok(*command, "--claims")
     lines = [line for line in done.stdout.splitlines() if " better than " in line and "│" in line]
     by_claim = {line.split("│")[1].strip(): line.split("│")[2].strip() for line in lines}
     assert by_claim["descents better than random"] in ("holds", "does not hold", "not decided")
     assert by_claim["bo-leap better than cma-es"] == "not run"
 
 
-def test_options_of_a_method_reach_it_and_make_another_race(run: Callable[..., Said], tmp_path: Path) -> None:
+def test_options_of_a_method_reach_it_and_make_another_race(run: Run) -> None:
     short = ["race", "branin", "--methods", "cma-es", "--budget", "9", "--seeds", "1", "--json"]
-    plain = json.loads(run(*short, cwd=tmp_path).stdout)
-    other = json.loads(run(*short, "--option", "cma-es.population=9", cwd=tmp_path).stdout)
+    plain = run.json(*short)
+    other = run.json(*short, "--option", "cma-es.population=9")
     assert other["method_options"]["cma-es"]["population"] == 9
     assert plain["folder"] != other["folder"]
 
 
-def test_all_methods_that_can_run_here_race_by_default_and_by_name(run: Callable[..., Said], tmp_path: Path) -> None:
+def test_all_methods_that_can_run_here_race_by_default_and_by_name(run: Run) -> None:
     small = ["race", "branin", "--budget", "3", "--seeds", "1", "--json"]
     named, default = (
-        json.loads(run(*small, *more, "--out", name, cwd=tmp_path).stdout)["methods"]
+        run.json(*small, *more, "--out", name)["methods"]
         for name, more in (("named", ["--methods", "all"]), ("default", []))
     )
     assert named == default
     assert {name for name, one in methods().items() if not one.extra} <= set(named)
-
-
-LONG = ["race", "bounce", "--methods", "random,descents", "--fidelity", "draft", "--budget", "40", "--seeds", "2"]
-LONG += ["--json", "--out", "r"]
-
-
-def test_interrupt_says_how_to_go_on_and_the_result_is_the_same(run: Callable[..., Said], tmp_path: Path) -> None:
-    for name in ("whole", "stopped"):
-        (tmp_path / name).mkdir()
-    race = partial(landscape, *LONG, "--workers", "2")
-    whole = alone(race, tmp_path / "whole")
-    assert whole.returncode == 0, whole.stderr
-    stopped = alone(race, tmp_path / "stopped", Instant(9, of="status/c", by=signal.SIGINT))
-    assert (stopped.returncode, stopped.stdout) == (130, "")
-    assert "Traceback" not in stopped.stderr
-    assert "the same command continues from there: landscape race bounce" in stopped.stderr
-    resumed = run(*LONG, cwd=tmp_path / "stopped")
-    assert "are there already" in resumed.stderr
-    assert "all 160 episodes" not in resumed.stderr
-    one, two = (json.loads(done.stdout) for done in (whole, resumed))
-    finals = [{rank["method"]: rank["final"] for rank in figures["ranks"]} for figures in (one, two)]
-    assert finals[0] == finals[1]
-    assert "The paper compares no optimisers here" in one["silence"]
-    assert one["loss_unit"] == "m²"

@@ -1,7 +1,6 @@
 """`landscape slice --refine` and `--budget`, and what a slice says of what its samples hide."""
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +9,7 @@ import pytest
 import gradscape as gs
 from gradscape.gallery.site.page_data import count_numbers
 from gradscape.jobs.slice import SliceJob
-from gradscape.jobs.watch import Stopped, Watch
+from gradscape.jobs.watch import Stopped
 from gradscape.landscapes.convert import to_json
 from gradscape.landscapes.draw.figures.contour import landscape_figure
 from gradscape.landscapes.draw.figures.multiples import thumbnail_figure
@@ -18,9 +17,9 @@ from gradscape.landscapes.draw.figures.profile import profile_figure
 from gradscape.landscapes.objective import Status
 from gradscape.landscapes.storage.store import open_slice
 
-from ..command import Said
+from ..command import Run
+from ..watches import Stop, Told
 
-Run = Callable[..., Said]
 REFINED = "slice pinball-2 --dims 0 1 --resolution 33 --refine 5% --json --device cpu --fidelity draft --out"
 
 
@@ -30,74 +29,23 @@ def foot(figure: object) -> str:
 
 
 def test_a_refined_slice_says_what_was_sampled_and_is_there_the_second_time(run: Run, tmp_path: Path) -> None:
-    first = run(*REFINED.split(), "made", cwd=tmp_path)
-    assert first.returncode == 0, first.stderr
+    first = run.ok(*REFINED.split(), "made")
     said = json.loads(first.stdout)
     assert said["status"]["ok"] + said["status"]["interpolated"] == 33 * 33
     assert said["refinement"]["sampled"] == said["status"]["ok"] == said["episodes"]
     assert "up to 1089 episodes with gradients to compute" in first.stderr
     assert f"{said['episodes']} of 1089 points sampled" in first.stderr
-    again = json.loads(run(*REFINED.split(), "made", cwd=tmp_path).stdout)
+    again = run.json(*REFINED.split(), "made")
     assert (again["episodes"], again["resumed"]) == (0, said["episodes"])
     assert {name: again[name] for name in ("status", "loss", "undersampled")} == {
         name: said[name] for name in ("status", "loss", "undersampled")
     }
-    other = run(*REFINED.replace("5%", "4%").split(), "made", cwd=tmp_path)
-    assert other.returncode == 2
-    assert "refinement.share: wanted 0.04, found 0.05" in other.stderr
-    plain = run(*REFINED.replace("--refine 5%", "--force").split(), "made", cwd=tmp_path)
+    run.refuse(*REFINED.replace("5%", "4%").split(), "made", said="refinement.share: wanted 0.04, found 0.05")
+    plain = run(*REFINED.replace("--refine 5%", "--force").split(), "made")
     assert json.loads(plain.stdout)["refinement"] is None
     assert sorted(path.name for path in (tmp_path / "made").iterdir()) == [
         "landscape.png", "slice.zarr", "summary.json",
     ]  # fmt: skip
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        ("--refine much", "--refine takes a share such as 1% or 0.01; got 'much'"),
-        ("--refine 0", "a share of the range between 0 and 1; got 0"),
-        ("--refine nan", "a share of the range between 0 and 1; got nan"),
-        ("--refine 120%", "a share of the range between 0 and 1; got 1.2"),
-        ("--budget 9", "begins with 81 points; got a budget of 9"),
-    ],
-)
-def test_what_is_no_share_or_too_small_is_refused_in_a_line(run: Run, tmp_path: Path, words: str, said: str) -> None:
-    done = run(*["slice", "branin", "--dims", "0", "1", "--resolution", "33"], *words.split(), cwd=tmp_path)
-    assert done.returncode == 2
-    assert said in done.stderr
-    assert len(done.stderr.splitlines()) == 1
-    assert not any(tmp_path.iterdir())
-
-
-class Impatient(Watch):
-    """Stop a job at every so many steps, as Ctrl-C does."""
-
-    def progress(self, total: int, what: str = "episodes"):  # type: ignore[no-untyped-def]
-        from contextlib import contextmanager
-
-        @contextmanager
-        def counting():  # type: ignore[no-untyped-def]
-            calls = 0
-
-            def advance(done: int, text: str = "") -> None:
-                nonlocal calls
-                calls += 1
-                if calls == 4:
-                    raise KeyboardInterrupt
-
-            yield advance
-
-        return counting()
-
-
-class Noted(Watch):
-    """Hear what is said of a job."""
-
-    said = ""
-
-    def note(self, text: str) -> None:
-        self.said += text
 
 
 def test_a_job_that_is_stopped_keeps_what_it_has_and_draws_it(tmp_path: Path) -> None:
@@ -113,12 +61,14 @@ def test_a_job_that_is_stopped_keeps_what_it_has_and_draws_it(tmp_path: Path) ->
 
     whole = job("one").run()
     with pytest.raises(Stopped, match="of 1089 points are kept"):
-        job("two").run(Impatient())
+        job("two").run(Stop(100))
     assert (tmp_path / "two" / "landscape.png").exists()
-    kept, patient = job("two").kept(), Noted()
+    kept, patient = job("two").kept(), Told()
     rest = job("two").run(patient)
     assert f"{rest.resumed} of 1089 points are kept" in kept
-    assert f"up to {1089 - rest.resumed} episodes with gradients to compute, {rest.resumed} are there" in patient.said
+    assert f"up to {1089 - rest.resumed} episodes with gradients to compute, {rest.resumed} are there" in "".join(
+        patient.lines
+    )
     assert rest.resumed > 0
     assert rest.episodes + rest.resumed == whole.episodes
     one, two = (open_slice(tmp_path / name) for name in ("one", "two"))

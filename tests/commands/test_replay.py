@@ -1,48 +1,33 @@
-"""`landscape replay`: what it leaves and refuses."""
+"""`landscape replay` and `landscape surface`: what they leave and refuse."""
 
 import json
-import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from gradscape.cli import main
+from ..command import Run
 
 
-@pytest.fixture
-def run(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> Callable[[str], tuple[int, str]]:
-    monkeypatch.chdir(tmp_path)
-
-    def command(text: str) -> tuple[int, str]:
-        monkeypatch.setattr(sys, "argv", ["landscape", *text.split()])
-        with pytest.raises(SystemExit) as left:
-            main(text.split())
-        return int(left.value.code or 0), capsys.readouterr().err
-
-    return command
+def names(folder: Path) -> list[str]:
+    return sorted(file.name for file in folder.iterdir())
 
 
-def test_the_best_episode_of_a_run_is_replayed(run: Callable[[str], tuple[int, str]]) -> None:
-    assert run("optimize bounce --method random --budget 8 --out r --device cpu")[0] == 0
-    code, said = run("replay bounce --params best:r --no-film --out e --device cpu")
-    assert code == 0, said
-    assert sorted(file.name for file in Path("e").iterdir()) == ["episode.json", "episode.png", "episode.rrd"]
+def test_the_best_episode_of_a_run_is_replayed(run: Run) -> None:
+    run.ok("optimize bounce --method random --budget 8 --out r --device cpu")
+    run.ok("replay bounce --params best:r --no-film --out e --device cpu")
+    assert names(Path("e")) == ["episode.json", "episode.png", "episode.rrd"]
     best = json.loads(Path("r/summary.json").read_text())
     record = json.loads(Path("e/episode.json").read_text())
     assert record["status"] == "OK"
     assert f"{record['loss']:.6g}" in json.dumps(best) or record["loss"] == pytest.approx(best["best"]["loss"])
     assert record["provenance"]["command"].startswith("landscape replay bounce --params best:r")
-    code, said = run("replay cartpole --params best:r --no-film --device cpu")
-    assert code == 2
-    assert "r holds no runs of cartpole" in said
 
 
-def test_what_cannot_be_replayed_is_refused(run: Callable[[str], tuple[int, str]]) -> None:
-    assert "ackley has no episode to draw" in run("replay ackley")[1]
-    Path("full").mkdir()
-    Path("full/notes.txt").write_text("")
-    code, said = run("replay bounce --out full --device cpu")
-    assert (code, "full holds other files" in said) == (2, True)
+@pytest.mark.drawn
+def test_a_slice_with_a_run_becomes_a_surface(run: Run) -> None:
+    run.ok("slice bounce --dims 0 1 --resolution 5 --out cut --device cpu")
+    run.ok("optimize bounce --method random --budget 4 --out r --device cpu")
+    run.ok("surface cut r --out s")
+    assert names(Path("s")) == ["surface.gltf", "surface.png"]
+    run.ok("surface cut")
+    assert len(list(Path("out").glob("surface-bounce-*"))) == 1

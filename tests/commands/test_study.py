@@ -1,7 +1,6 @@
 """`landscape study`: what a kind of study takes, prints and refuses."""
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -14,10 +13,9 @@ from gradscape.landscapes.storage.records import read_json
 from gradscape.studies import samples
 from gradscape.studies.model import ModelRecord
 
-from ..command import Said
+from ..command import Run
 from ..parted import CLOCK, Parted
 
-Command = Callable[..., Said]
 TRADE = ["study", "model", "parted", "--points", "16", "--out", "parts"]
 
 
@@ -32,9 +30,8 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.drawn
-def test_the_parts_of_a_model_are_printed_drawn_and_kept(run: Command, tmp_path: Path) -> None:
-    done = run(*TRADE, "--json", "--figure-width-mm", "85", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+def test_the_parts_of_a_model_are_printed_drawn_and_kept(run: Run, tmp_path: Path) -> None:
+    done = run.ok(*TRADE, "--json", "--figure-width-mm", "85")
     report = json.loads(done.stdout)
     assert {**read_json(tmp_path / "parts/model.json"), "folder": "parts"} == report
     for file, begins in (("model.png", b"\x89PNG"), ("model-85mm.pdf", b"%PDF")):
@@ -49,7 +46,7 @@ def test_the_parts_of_a_model_are_printed_drawn_and_kept(run: Command, tmp_path:
     ):
         assert said in done.stderr
     assert "about " in done.stderr.partition("models to measure")[2]  # the estimate comes first
-    again = run(*TRADE, cwd=tmp_path)
+    again = run(*TRADE)
     assert "0 models" not in again.stderr
     assert "8 are there already" in again.stderr  # those that are refused are tried again
 
@@ -61,23 +58,6 @@ def test_the_front_door_has_the_same_study(tmp_path: Path) -> None:
     assert found.command.startswith("gradscape.study('model', Parted, points=16")
     with pytest.raises(ValueError, match="study model takes points, seed; got settings"):
         gs.study("model", Parted, settings=("dt",))
-
-
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (["ladder", "bounce"], "Choose from"),
-        (["model", "parted", "--settings", "dt"], "study model takes points, seed; got settings"),
-        (["fidelity", "bounce", "--fidelity", "draft"], "got draft, leave it out"),
-        (["model", "branin"], "branin names no parts of its model"),
-        (["extremes", "bounce", "--time-limit", "3"], "got time_limit"),
-    ],
-)
-def test_what_a_study_does_not_take_is_refused(arguments: list[str], said: str, run: Command, tmp_path: Path) -> None:
-    done = run("study", *arguments, cwd=tmp_path)
-    assert done.returncode == 2
-    assert said in done.stderr
-    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(("name", "kind"), [("tradeoff", "fidelity"), ("extremes", "extremes")])

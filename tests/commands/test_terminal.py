@@ -1,7 +1,6 @@
 """Tables on narrow terminals: what has a name is folded, and not cut; no name steers the terminal."""
 
 import re
-from collections.abc import Callable
 from io import StringIO
 from pathlib import Path
 
@@ -14,7 +13,7 @@ from gradscape.envs.registry import entries
 from gradscape.gallery.figures import read_figures
 from gradscape.optim.registry import methods
 
-from ..command import Said
+from ..command import Run
 
 SOURCES = list(Path(gradscape.__path__[0]).glob("commands/*.py"))
 
@@ -57,7 +56,7 @@ def test_control_characters_in_names_are_shown_and_not_obeyed() -> None:
         assert control not in shown.getvalue()
 
 
-def test_a_class_of_others_does_not_steer_the_terminal(run: Callable[..., Said], tmp_path: Path) -> None:
+def test_a_class_of_others_does_not_steer_the_terminal(run: Run, tmp_path: Path) -> None:
     (tmp_path / "evil.py").write_text(
         "import gradscape as gs\nclass Evil(gs.Environment):\n    'It \\x1b[2J.'\n    name = 'evil\\x1b[2J'\n"
         "    space = gs.ParameterSpace({'\\x1b]0;k': (0, 1, 'm\\x07'), 'x': (0, 1)})\n"
@@ -68,7 +67,7 @@ def test_a_class_of_others_does_not_steer_the_terminal(run: Callable[..., Said],
         ["slice", "evil.py:Evil", "--dims", "k", "0"],
         ["slice", "branin", "--dims", "0", "1", "--through", "\x1b[2J.npy"],
     ):
-        said = run(*command, cwd=tmp_path)
+        said = run(*command)
         assert r"\x1b" in said.stdout + said.stderr
         assert not set("\x1b\x07") & set(said.stdout + said.stderr), command
 
@@ -88,8 +87,8 @@ def test_every_table_is_made_that_way() -> None:
         ("gallery list", [figure.env for figure in read_figures()]),
     ],
 )
-def test_lists_fit_eighty_columns(run: Callable[..., Said], tmp_path: Path, command: str, names: list[str]) -> None:
-    said = run(*command.split(), cwd=tmp_path, width=80).stdout
+def test_lists_fit_eighty_columns(run: Run, command: str, names: list[str]) -> None:
+    said = run(command, width=80).stdout
     assert "…" not in said
     assert max(map(len, said.splitlines())) <= 80 or command == "gallery list"  # whose title is a path
     assert [name for name in names if name not in said] == []

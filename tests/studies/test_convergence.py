@@ -1,9 +1,8 @@
 """`landscape study convergence`: what it finds of scenes whose convergence is known, keeps and refuses."""
 
 import json
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import pytest
 import torch
@@ -15,12 +14,10 @@ from gradscape.landscapes.convert import from_json
 from gradscape.landscapes.objective import Evaluation
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.landscapes.storage.records import read_json
-from gradscape.studies import samples, variants
+from gradscape.studies import samples
 from gradscape.studies.convergence import ConvergenceRecord, find_refinements
 
-from ..command import Said
-
-Command = Callable[..., Said]
+from ..command import Run, Said
 
 
 class Second(Environment):
@@ -78,14 +75,13 @@ def study(scene: str, *more: str) -> list[str]:
     return ["study", "convergence", scene, "--points", "16", "--device", "cpu", "--out", "study", *more]
 
 
-def measured(run: Command, folder: Path, scene: str) -> tuple[ConvergenceRecord, Said]:
-    done = run(*study(scene, "--json"), cwd=folder)
-    assert done.returncode == 0, done.stderr
+def measured(run: Run, folder: Path, scene: str) -> tuple[ConvergenceRecord, Said]:
+    done = run.ok(*study(scene, "--json"), cwd=folder)
     return from_json(ConvergenceRecord, json.loads(done.stdout)), done
 
 
 @pytest.mark.drawn
-def test_a_scene_of_second_order_converges_and_its_limit_is_the_bowl(run: Command, tmp_path: Path) -> None:
+def test_a_scene_of_second_order_converges_and_its_limit_is_the_bowl(run: Run, tmp_path: Path) -> None:
     found, done = measured(run, tmp_path, "second")
     assert found == from_json(ConvergenceRecord, read_json(tmp_path / "study/convergence.json"))
     assert (tmp_path / "study/convergence.png").read_bytes().startswith(b"\x89PNG")
@@ -103,7 +99,7 @@ def test_a_scene_of_second_order_converges_and_its_limit_is_the_bowl(run: Comman
 
 
 @pytest.mark.drawn
-def test_a_chaotic_scene_is_judged_by_distributions(run: Command, tmp_path: Path) -> None:
+def test_a_chaotic_scene_is_judged_by_distributions(run: Run, tmp_path: Path) -> None:
     found, _ = measured(run, tmp_path, "wild")
     assert found.divergence is not None
     assert found.divergence.is_chaos
@@ -115,35 +111,13 @@ def test_a_chaotic_scene_is_judged_by_distributions(run: Command, tmp_path: Path
     assert told["reference-dt-x0.5"] == ()
 
 
-def test_a_trade_off_prints_what_a_study_of_the_same_code_has_left(run: Command, tmp_path: Path) -> None:
+def test_a_trade_off_prints_what_a_study_of_the_same_code_has_left(run: Run, tmp_path: Path) -> None:
     trade = ["study", "fidelity", "second", "--points", "4", "--settings", "dt", "--device", "cpu", "--out", "trade"]
-    assert "Richardson" not in run(*trade, cwd=tmp_path).stderr
+    assert "Richardson" not in run(*trade).stderr
     measured(run, tmp_path, "second")
-    said = " ".join(run(*trade, cwd=tmp_path).stdout.split())
+    said = " ".join(run(*trade).stdout.split())
     assert "the reference is converged" in said
     assert "from Richardson's limit" in said
-
-
-def test_a_stopped_study_goes_on_and_evaluates_nothing_twice(
-    run: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    evaluate, done = variants.evaluate_points, list[str]()
-
-    def stopped(env: Any, *given: Any) -> Any:
-        if len(done) == 3:
-            raise KeyboardInterrupt
-        done.append(env.fidelity.name)
-        return evaluate(env, *given)
-
-    monkeypatch.setattr(variants, "evaluate_points", stopped)
-    assert run(*study("second"), cwd=tmp_path).returncode == 130
-    names = [*done]
-    done.clear()
-    monkeypatch.setattr(
-        variants, "evaluate_points", lambda env, *given: (done.append(env.fidelity.name), evaluate(env, *given))[1]
-    )
-    assert run(*study("second"), cwd=tmp_path).returncode == 0
-    assert not set(names) & set(done)
 
 
 def test_levels_go_from_coarse_to_fine_about_the_reference() -> None:
@@ -167,18 +141,3 @@ def test_widths_are_those_of_the_levels_fidelities() -> None:
     (steps,) = find_refinements(cartpole, ["dt"])
     dt = cartpole.fidelity.dt
     assert [width for _, width in steps.levels] == pytest.approx([4 * dt, 2 * dt, dt, dt / 2, dt / 4])
-
-
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (["branin"], "there is nothing to compare"),
-        (["bounce", "--settings", "speed"], "--settings takes dt, resolution, particles, joint, precision"),
-        (["bounce", "--settings", "resolution"], "bounce has nothing of resolution to refine"),
-        (["bounce", "--fidelity", "draft"], "leave it out"),
-    ],
-)
-def test_what_cannot_be_refined_is_refused(arguments: list[str], said: str, run: Command, tmp_path: Path) -> None:
-    done = run("study", "convergence", *arguments, cwd=tmp_path)
-    assert done.returncode == 2
-    assert said in " ".join(done.stderr.split())

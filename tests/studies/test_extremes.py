@@ -297,12 +297,14 @@ def test_a_record_is_read_as_it_was_written(tmp_path: Path) -> None:
         ({"pairs": ("dt",)}, "--pairs takes two settings as dt:box"),
         ({"precisions": ["half"]}, "--precisions takes float32, float64; got half"),
         ({"width": 0.0}, "--width takes a share between 0 and 1"),
+        ({"tolerance": -1.0}, "--tolerance takes a share of the losses' spread"),
         ({"reference": "exact"}, "has fidelities standard, reference to be judged by; got 'exact'"),
     ],
 )
 def test_what_cannot_be_is_refused(how: dict[str, Any], said: str, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=said):
         gs.study("extremes", Spring, out=tmp_path / "study", **how)
+    assert not (tmp_path / "study").exists()
 
 
 def test_a_ball_s_penalty_contact_is_right_up_to_the_limit_of_its_spring_and_wrong_beyond(tmp_path: Path) -> None:

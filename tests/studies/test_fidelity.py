@@ -2,7 +2,6 @@
 
 import json
 import weakref
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -23,9 +22,8 @@ from gradscape.studies import samples, variants
 from gradscape.studies.fidelity import SETTINGS, list_variants
 
 from ..clock import Clock
-from ..command import Said
+from ..command import Run
 
-Command = Callable[..., Said]
 CLOCK = Clock()
 TRADE = ["study", "fidelity", "converging", "--points", "16", "--device", "cpu", "--out", "trade"]
 
@@ -93,10 +91,8 @@ def study(report: dict[str, Any]) -> dict[str, Any]:
 
 
 @pytest.mark.drawn
-def test_errors_and_order_of_convergence_are_those_of_the_scene(run: Command, tmp_path: Path) -> None:
-    done = run(*TRADE, "--json", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    report = json.loads(done.stdout)
+def test_errors_and_order_of_convergence_are_those_of_the_scene(run: Run, tmp_path: Path) -> None:
+    report = run.json(*TRADE)
     assert {**read_json(tmp_path / "trade/fidelity.json"), "folder": "trade"} == report
     assert (tmp_path / "trade/fidelity.png").read_bytes().startswith(b"\x89PNG")
     rows = by_name(report)
@@ -114,21 +110,20 @@ def test_errors_and_order_of_convergence_are_those_of_the_scene(run: Command, tm
 
 
 def test_a_study_is_printed_without_being_measured_again(
-    run: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert run(*TRADE, "--settings", "precision", cwd=tmp_path).returncode == 0
+    run.ok(*TRADE, "--settings", "precision")
     simulate, rows = Converging._evaluate, list[int]()
     monkeypatch.setattr(Converging, "_evaluate", lambda *x, grad: rows.append(len(x[1])) or simulate(*x, grad=grad))
-    done = run(*TRADE, "--settings", "precision", "--figure-width-mm", "85", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    done = run.ok(*TRADE, "--settings", "precision", "--figure-width-mm", "85")
     assert "fidelity-85mm.pdf, fidelity-85mm.svg" in done.stderr
     assert (tmp_path / "trade/fidelity-85mm.pdf").read_bytes().startswith(b"%PDF")
-    assert run(*TRADE, "--settings", "precision", cwd=tmp_path).returncode == 0
+    run.ok(*TRADE, "--settings", "precision")
     assert rows == [POINTS, POINTS]  # those that are verified, each time
 
 
-def test_variants_that_are_refused_are_listed_and_those_that_diverge_are_counted(run: Command, tmp_path: Path) -> None:
-    done = run(*TRADE, "--json", cwd=tmp_path)
+def test_variants_that_are_refused_are_listed_and_those_that_diverge_are_counted(run: Run) -> None:
+    done = run(*TRADE, "--json")
     report = json.loads(done.stdout)
     assert report["refused"] == [{"name": "draft-dt-x4", "why": "converging takes dt below 0.4; got 0.4"}]
     assert "refused: draft-dt-x4: converging takes dt below 0.4; got 0.4" in done.stderr
@@ -138,9 +133,7 @@ def test_variants_that_are_refused_are_listed_and_those_that_diverge_are_counted
     assert coarse["comparison"]["loss_error"]["p95"]["value"] is None
 
 
-def test_a_variant_whose_engine_gives_up_is_listed_too(
-    run: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_variant_whose_engine_gives_up_is_listed_too(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     simulate = Converging._evaluate
 
     def short_of_memory(self: Converging, x: Tensor, *, grad: bool) -> Evaluation:
@@ -149,14 +142,12 @@ def test_a_variant_whose_engine_gives_up_is_listed_too(
         return simulate(self, x, grad=grad)
 
     monkeypatch.setattr(Converging, "_evaluate", short_of_memory)
-    report = json.loads(run(*TRADE, "--settings", "precision", "--json", cwd=tmp_path).stdout)
+    report = run.json(*TRADE, "--settings", "precision")
     assert report["refused"] == [{"name": "standard", "why": "out of memory"}]
     assert {"draft", "draft-float64", "standard-float64", "reference"} < set(by_name(report))
 
 
-def test_a_variant_is_gone_when_the_next_one_is_measured(
-    run: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_variant_is_gone_when_the_next_one_is_measured(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     """On a GPU it would hold the memory that the next one measures how quick it is with."""
     simulate, simulated = Converging._evaluate, list[weakref.ref[Converging]]()
 
@@ -168,9 +159,8 @@ def test_a_variant_is_gone_when_the_next_one_is_measured(
         return simulate(self, x, grad=grad)
 
     monkeypatch.setattr(Converging, "_evaluate", followed)
-    done = run(*TRADE, "--settings", "precision", "--json", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert len(simulated) == 2 + len(json.loads(done.stdout)["variants"])  # one to verify by, one for the estimate
+    found = run.json(*TRADE, "--settings", "precision")
+    assert len(simulated) == 2 + len(found["variants"])  # one to verify by, one for the estimate
 
 
 def test_a_dt_that_does_not_divide_the_episode_is_refused() -> None:
@@ -209,10 +199,10 @@ def test_scenes_have_the_variants_of_their_knobs(scene: str, wanted: set[str]) -
 
 
 def test_a_stopped_study_goes_on_with_the_next_variant(
-    run: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "whole").mkdir()
-    whole = json.loads(run(*TRADE, "--json", cwd=tmp_path / "whole").stdout)
+    whole = run.json(*TRADE, cwd=tmp_path / "whole")
     measure, measured = samples.measure, []
 
     def stopped(env: Any, x: Tensor, **how: Any) -> samples.Sample:
@@ -222,65 +212,41 @@ def test_a_stopped_study_goes_on_with_the_next_variant(
         return measure(env, x, **how)
 
     monkeypatch.setattr(samples, "measure", stopped)
-    done = run(*TRADE, "--json", cwd=tmp_path)
+    done = run(*TRADE, "--json")
     assert (done.returncode, done.stdout) == (130, "")
     assert "stopped: 3 of" in done.stderr
     assert not (tmp_path / "trade/fidelity.json").exists()
     kept = {path.name: path.read_bytes() for path in (tmp_path / "trade/pieces").iterdir()}
     monkeypatch.setattr(samples, "measure", measure)
-    resumed = json.loads(run(*TRADE, "--json", cwd=tmp_path).stdout)
+    resumed = run.json(*TRADE)
     assert study(resumed) == study(whole)
     assert kept == {name: (tmp_path / "trade/pieces" / name).read_bytes() for name in kept}
 
 
-def test_another_study_is_not_overwritten(run: Command, tmp_path: Path) -> None:
-    run(*TRADE, "--settings", "dt", cwd=tmp_path)
+def test_another_study_is_not_overwritten(run: Run, tmp_path: Path) -> None:
+    run(*TRADE, "--settings", "dt")
     before = (tmp_path / "trade/fidelity.json").read_bytes()
-    other = run(*TRADE, "--seed", "1", cwd=tmp_path)
-    assert other.returncode == 2
-    assert "seed: wanted 1, found 0" in other.stderr
+    run.refuse(*TRADE, "--seed", "1", said="seed: wanted 1, found 0")
     assert (tmp_path / "trade/fidelity.json").read_bytes() == before
 
 
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (["study", "fidelity", "branin"], "branin has one fidelity, exact, so there is nothing to compare"),
-        (["study", "fidelity", "bounce", "--settings", "speed"], "--settings takes dt, resolution"),
-        (
-            ["slice", "bounce", "--dims", "0", "1", "--tolerance", "5%", "--set", "horizon=0.5"],
-            "`landscape study fidelity bounce --set=horizon=0.5` measures them",
-        ),
-        (["slice", "bounce", "--dims", "0", "1", "--tolerance", "5%", "--fidelity", "draft"], "leave out one"),
-        (["slice", "bounce", "--dims", "0", "1", "--tolerance", "close"], "such as 5%"),
-        (["optimize", "bounce", "--method", "random", "--tolerance", "-1"], "such as 5%"),
-    ],
-)
-def test_what_cannot_be_is_refused(arguments: list[str], said: str, run: Command, tmp_path: Path) -> None:
-    done = run(*arguments, cwd=tmp_path)
-    assert done.returncode == 2
-    assert said in done.stderr
-
-
-def test_a_tolerance_takes_the_quickest_fidelity_within_it(run: Command, tmp_path: Path) -> None:
-    report = json.loads(run(*TRADE, "--json", cwd=tmp_path).stdout)
+def test_a_tolerance_takes_the_quickest_fidelity_within_it(run: Run, tmp_path: Path) -> None:
+    report = run.json(*TRADE)
     errors = {row["name"]: row["comparison"]["loss_error"]["p95_relative"]["value"] for row in report["variants"]}
     within = [row for row in report["variants"] if (off := errors[row["name"]]) is not None and off <= 0.02]
     wanted = min(within, key=lambda row: row["comparison"]["seconds"]["with_gradient"])
     assert len(report["variants"]) > len(within) > 1
     how = ["converging", "--device", "cpu", "--tolerance", "2%"]
-    cut = run("slice", *how, "--dims", "0", "1", "--resolution", "3", "--out", "cut", cwd=tmp_path)
-    assert cut.returncode == 0, cut.stderr
+    cut = run.ok("slice", *how, "--dims", "0", "1", "--resolution", "3", "--out", "cut")
     assert f"{wanted['name']}: the quickest of" in cut.stderr
     assert gradscape.open_slice(tmp_path / "cut").identity["settings"] == wanted["fidelity"]
-    searched = run("optimize", *how, "--method", "random", "--budget", "3", "--json", cwd=tmp_path)
-    assert searched.returncode == 0, searched.stderr
-    assert json.loads(searched.stdout)["fidelity"] == wanted["fidelity"]["name"]
+    searched = run.json("optimize", *how, "--method", "random", "--budget", "3")
+    assert searched["fidelity"] == wanted["fidelity"]["name"]
 
 
-def test_a_tolerance_that_nothing_meets_names_the_best(run: Command, tmp_path: Path) -> None:
+def test_a_tolerance_that_nothing_meets_names_the_best(run: Run, tmp_path: Path) -> None:
     kept = Path(tmp_path / "data").rglob("*.json")
-    run(*TRADE, cwd=tmp_path)
+    run(*TRADE)
     (path,) = kept
     report = read_json(path)
     report["variants"] = [
@@ -289,30 +255,25 @@ def test_a_tolerance_that_nothing_meets_names_the_best(run: Command, tmp_path: P
     report["identity"]["model_version"] = 0
     write_record(path, report)
     how = ["slice", "converging", "--device", "cpu", "--dims", "0", "1", "--resolution", "3", "--tolerance"]
-    none = run(*how, "1e-9", cwd=tmp_path)
-    assert none.returncode == 2
-    assert "the best is standard-dt-x0.5" in none.stderr
-    some = run(*how, "50%", cwd=tmp_path)
-    assert some.returncode == 0
+    run.refuse(*how, "1e-9", said="the best is standard-dt-x0.5")
+    some = run.ok(*how, "50%")
     assert "warning: measured by converging model 0; this is model 1" in some.stderr
 
 
-def test_a_name_whose_settings_changed_since_is_not_chosen(
-    run: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    run(*TRADE, cwd=tmp_path)
+def test_a_name_whose_settings_changed_since_is_not_chosen(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    run(*TRADE)
     how = ["slice", "converging", "--device", "cpu", "--dims", "0", "1", "--resolution", "3", "--tolerance", "50%"]
-    before = json.loads(run(*how, "--out", "before", "--json", cwd=tmp_path).stdout)["fidelity"]
+    before = run.json(*how, "--out", "before")["fidelity"]
     monkeypatch.setattr(Converging, "fidelities", {**Converging.fidelities, "draft": Fidelity("draft", dt=0.125)})
-    after = json.loads(run(*how, "--out", "after", "--json", cwd=tmp_path).stdout)["fidelity"]
+    after = run.json(*how, "--out", "after")["fidelity"]
     assert before == "draft"
     assert after != "draft"
 
 
 def test_the_gallerys_variants_of_the_same_problem_are_found_where_nothing_of_the_users_own_is(
-    run: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    report = json.loads(run(*TRADE, "--json", cwd=tmp_path).stdout)
+    report = run.json(*TRADE)
     for kept in (tmp_path / "data").rglob("*.json"):
         kept.unlink()
     softer = json.loads(json.dumps(by_name(report)["draft"])) | {"name": "softer", "options": {"ke": 1.0}}
@@ -322,22 +283,20 @@ def test_the_gallerys_variants_of_the_same_problem_are_found_where_nothing_of_th
     monkeypatch.setattr("gradscape.studies.kept.resources.files", lambda package: tmp_path)
     how = ["slice", "converging", "--device", "cpu", "--dims", "0", "1", "--resolution", "3", "--tolerance", "50%"]
     write_record(path, {**report, "variants": [softer, *report["variants"]]})
-    done = run(*how, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    done = run.ok(*how)
     assert str(path) in done.stderr
     assert "softer: " not in done.stderr
     write_record(path, {**report, "identity": {**report["identity"], "options": {"ke": 1.0}}})
-    assert "no fidelities of converging with these options are measured" in run(*how, cwd=tmp_path).stderr
+    assert "no fidelities of converging with these options are measured" in run(*how).stderr
 
 
-def test_a_slice_at_a_measured_fidelity_can_be_cut_anew(run: Command, tmp_path: Path) -> None:
+def test_a_slice_at_a_measured_fidelity_can_be_cut_anew(run: Run, tmp_path: Path) -> None:
     how = ["converging", "--device", "cpu", "--tolerance", "0.0015"]
-    run(*TRADE, "--settings", "dt", cwd=tmp_path)
-    run("slice", *how, "--dims", "0", "1", "--resolution", "3", "--out", "cut", cwd=tmp_path)
-    run("optimize", *how, "--method", "random", "--budget", "3", "--out", "searched", cwd=tmp_path)
+    run(*TRADE, "--settings", "dt")
+    run("slice", *how, "--dims", "0", "1", "--resolution", "3", "--out", "cut")
+    run("optimize", *how, "--method", "random", "--budget", "3", "--out", "searched")
     assert json.loads((tmp_path / "cut/summary.json").read_text())["fidelity"] == "standard-dt-x0.5"
-    anew = run("overlay", "cut", "searched", "--through", "best", "--device", "cpu", "--out", "over", cwd=tmp_path)
-    assert anew.returncode == 0, anew.stderr
+    run.ok("overlay cut searched --through best --device cpu --out over")
 
 
 def test_a_tolerance_is_a_share() -> None:
@@ -359,10 +318,10 @@ def elsewhere(report: dict[str, Any]) -> dict[str, Any]:
 
 
 def test_seconds_are_those_of_the_device_that_will_run(
-    run: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Errors measured on a GPU count here; its seconds do not: what may be quickest is timed, once, and kept."""
-    report = json.loads(run(*TRADE, "--json", cwd=tmp_path).stdout)
+    report = run.json(*TRADE)
     for kept in (tmp_path / "data").rglob("*.json"):
         kept.write_text(json.dumps(elsewhere(report)))
     timed: list[str] = []
@@ -379,7 +338,7 @@ def test_seconds_are_those_of_the_device_that_will_run(
         row["name"]: variants.expected_work(gradscape.make("converging", fidelity=Fidelity(**row["fidelity"])))
         for row in report["variants"]
     }
-    done = run(*how, "--tolerance", "2%", cwd=tmp_path)
+    done = run(*how, "--tolerance", "2%")
     chosen = json.loads(done.stdout)["fidelity"]
     assert work[chosen] == min(work[name] for name in within)
     assert chosen not in ("reference", "standard")
@@ -388,5 +347,5 @@ def test_seconds_are_those_of_the_device_that_will_run(
     assert 1 < len(timed) < len(within)  # what is dearer from the outset is not tried
     assert "one alone on cpu, timed here" in done.stderr
     timed.clear()
-    assert json.loads(run(*how, "--tolerance", "2%", cwd=tmp_path).stdout)["episodes"] == 0
+    assert run.json(*how, "--tolerance", "2%")["episodes"] == 0
     assert timed == []

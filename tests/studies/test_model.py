@@ -1,4 +1,4 @@
-"""`study model`: what it finds of parts whose effect and price are known, and how it goes on after a stop."""
+"""`study model`: what it finds of parts whose effect and price are known."""
 
 from pathlib import Path
 from typing import Any
@@ -8,7 +8,6 @@ import torch
 
 from gradscape.jobs.scene import SceneSpec
 from gradscape.jobs.study import StudyJob
-from gradscape.jobs.watch import Stopped
 from gradscape.landscapes import cost
 from gradscape.landscapes.convert import from_json, to_json
 from gradscape.landscapes.storage.records import read_json
@@ -111,39 +110,8 @@ def test_options_of_the_full_model_are_kept_where_a_part_changes_others(tmp_path
     assert by_name(calm)["as it is"].effect == Effect.ORDER  # it brings the wind back
 
 
-def test_a_stopped_study_goes_on_with_the_next_part(
-    tmp_path: Path, found: ModelRecord, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    take, timed = samples.take_turns, list[Any]()
-
-    def stopped(*given: Any) -> samples.Turns:
-        if len(timed) == 2:
-            raise KeyboardInterrupt
-        timed.append(given)
-        return take(*given)
-
-    monkeypatch.setattr(samples, "take_turns", stopped)
-    with pytest.raises(Stopped, match="4 of 11 models are kept"):
-        study(tmp_path)
-    assert not (tmp_path / "model.json").exists()
-    kept = {path.name: path.read_bytes() for path in (tmp_path / "pieces").iterdir()}
-    assert len(kept) == 5  # what it is verified by, the full model, its repeats, two parts
-    monkeypatch.setattr(samples, "take_turns", take)
-    resumed = study(tmp_path)
-    assert kept == {name: (tmp_path / "pieces" / name).read_bytes() for name in kept}
-    assert [(part.name, part.comparison.loss_error, part.verdict) for part in resumed.parts] == [
-        (part.name, part.comparison.loss_error, part.verdict) for part in found.parts
-    ]
-    assert resumed.refused == found.refused
-
-
 def test_the_table_has_a_row_for_each_part_and_the_record_is_what_is_read(folder: Path, found: ModelRecord) -> None:
     assert to_json(found) == read_json(folder / "model.json")
     table = found.table()
     assert table.index.tolist() == [part.name for part in (*found.present, *found.missing)]
     assert table.loc["paint", "price"] == "saves time"
-
-
-def test_a_scene_without_parts_is_refused() -> None:
-    with pytest.raises(ValueError, match="branin names no parts of its model"):
-        StudyJob.open("model", SceneSpec("branin"))

@@ -21,15 +21,7 @@ from gradscape.studies import samples
 from gradscape.studies.fidelity import fit_order_in_dt
 from gradscape.studies.samples import Bootstrap, Comparison, Sample, compare, pareto_front
 
-from ..made_studies import VARIANTS, fidelities, variant
-
-
-def sample(loss: list[float], failed: int = 0, grad: float = 1.0) -> Sample:
-    losses = np.array(loss)
-    status = np.full(len(losses), Status.OK, dtype=np.int8)
-    if failed:
-        status[-failed:], losses[-failed:] = Status.NONFINITE, np.nan
-    return Sample(losses, np.full((len(losses), 2), grad), status, 0.1, 0.3, 4)
+from ..made_studies import VARIANTS, fidelities, sample, variant
 
 
 def test_errors_are_shares_of_the_spread_between_the_5th_and_95th_percentile() -> None:

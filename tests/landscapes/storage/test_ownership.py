@@ -69,11 +69,15 @@ def test_a_slice_with_anything_else_in_it_is_not_replaced(
     assert own(tmp_path) == ["slice.filling.zarr"]
 
 
-def test_a_link_in_a_slice_is_not_ours(tmp_path: Path) -> None:
+def test_a_link_in_a_slice_is_not_ours_unless_it_leads_nowhere(tmp_path: Path) -> None:
     (tmp_path / "mine").mkdir()
-    (finished(tmp_path / "slice.zarr") / "loss/c/7").symlink_to(tmp_path / "mine")
+    link = finished(tmp_path / "slice.zarr") / "loss/c/7"
+    link.symlink_to(tmp_path / "mine")
     with pytest.raises(ValueError, match="not of a slice: loss/c/7;"):
         make(tmp_path / "slice.zarr", overwrite=True)
+    link.unlink()
+    link.symlink_to(link)
+    assert make(tmp_path / "slice.zarr", overwrite=True).pending()
 
 
 @pytest.mark.parametrize("made", [finished, unfinished])
