@@ -54,7 +54,7 @@ if TYPE_CHECKING:
     from ..landscapes.plane import Plane
 
 FRAMES, ONLY, FILM, GIF, STREAM, SUMMARY = SWEEP.files
-FRAME = re.compile(r"\d{3,}(?:\.filling)?\.zarr")  # what the folder of a sweep's slices holds
+FRAME = re.compile(r"\d{3,}\.(?:filling|zarr)")  # what the folder of a sweep's slices holds
 SMOOTHING = "smoothing"
 MAX_SMOOTHING = 0.25  # the widest Gaussian's standard deviation, as a fraction of the box's sides
 PARALLEL_TOLERANCE = 1e-9  # of a parameter's unit: as near as rounding lets a point on a plane be to it

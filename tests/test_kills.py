@@ -31,16 +31,20 @@ JOBS = {
 }
 
 
-INSTANTS = {"pairs": [Instant(1), Instant(1, "moved-0"), Instant(1, "crossed-0"), Instant(1, "pairs.json")]}
+INSTANTS = {
+    "pairs": [Instant(1), Instant(1, "moved-0"), Instant(1, "crossed-0"), Instant(1, "pairs.json")],
+    "race": [Instant(1), Instant(4, "loss/c"), Instant(5, "status/c"), Instant(1, "race.png")],
+    "league": [Instant(1), Instant(4, "loss/c"), Instant(5, "status/c"), Instant(1, "league.json")],
+}
 
 
 @pytest.mark.parametrize(
     "job", [one if one == "slice" else pytest.param(one, marks=pytest.mark.nightly) for one in JOBS]
 )
 def test_four_kills_change_no_bit(job: str, tmp_path: Path) -> None:
-    """One before anything is there, one before a tile's losses, one before a status, one when all values are there."""
+    """One before anything is there, two in the middle of a tile or of columns, one when all values are there."""
     command, last = JOBS[job]
-    four = INSTANTS.get(job, [Instant(1), Instant(4, "loss/c"), Instant(5, "status/c"), Instant(1, last)])
+    four = INSTANTS.get(job, [Instant(1), Instant(9, "pieces"), Instant(12, "pieces"), Instant(1, last)])
     work, killed, whole = partial(landscape, *command.split()), tmp_path / "killed", tmp_path / "whole"
     for folder in (killed, whole):
         folder.mkdir()

@@ -174,37 +174,19 @@ def equal_groups(store: SliceStore, tiles: Sequence[Tile], batch: int, workers: 
     return [group for group in groups if group]
 
 
-class ReadBack:
-    """Read the tiles that workers have finished, while they go on with others."""
+def await_tiles(store: SliceStore, late: Sequence[Tile]) -> None:
+    """Wait for tiles that workers have written: a file system that machines share may show them later.
 
-    def __init__(self, store: SliceStore) -> None:
-        self._store = store
-        self._values: dict[Tile, dict[str, NDArray[Any]]] = {}
-        self._late: list[Tile] = []
-
-    def look(self, tile: Tile) -> None:
-        """Read a tile if it is to be seen already: a file system that machines share may show it later."""
-        values = self._store.read_tile(tile)
-        if values is None:
-            self._late.append(tile)
-        else:
-            self._values[tile] = values
-
-    def values(self) -> Mapping[Tile, dict[str, NDArray[Any]]]:
-        """Return the arrays of all tiles looked for, when they have appeared; raises StoreError where they do not."""
-        since = time.monotonic()
-        while self._late:
-            late, self._late = self._late, []
-            for tile in late:
-                self.look(tile)
-            if self._late and time.monotonic() - since > LATE:
-                raise StoreError(
-                    f"{self._store.path}: {len(self._late)} tiles that workers finished have not appeared here for "
-                    f"{LATE:g} s; see that they write to the same folder, and the same command goes on"
-                )
-            if self._late:
-                time.sleep(POLL)
-        return self._values
+    Raises StoreError where they do not appear.
+    """
+    since = time.monotonic()
+    while late := [tile for tile in late if store.read_tile(tile) is None]:
+        if time.monotonic() - since > LATE:
+            raise StoreError(
+                f"{store.path}: {len(late)} tiles that workers finished have not appeared here for {LATE:g} s; see "
+                "that they write to the same folder, and the same command goes on"
+            )
+        time.sleep(POLL)
 
 
 class Distributed(ObjectiveWrapper):

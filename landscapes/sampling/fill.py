@@ -21,7 +21,7 @@ from ..storage.arrays import Tile
 from ..storage.files import full, is_full
 from ..storage.store import SliceStore
 from ..verification import verify_store
-from .distribution import FilledTile, ReadBack, TileWriter, WorkersLostError, distribute
+from .distribution import FilledTile, TileWriter, WorkersLostError, await_tiles, distribute
 from .memory import MemoryBound
 
 
@@ -85,9 +85,9 @@ def sample(
     _check_store(store, objective, plane, grad=gradients > 0)
     verify_store(objective, store)
     batch = as_whole(objective.preferred_batch if batch is None else batch, "sample's batch", least=1)
-    status = store.status()
+    status, pending = store.status(), store.pending()
     counts: Counter[Status] = Counter({kind: int((status == kind).sum()) for kind in Status if kind != Status.MISSING})
-    resumed, pending = counts.total(), store.pending(status)
+    resumed, late = counts.total(), list[Tile]()
     left = Counter(tile.level for tile in pending)  # tiles, by level
     all_levels = 1 + store.tiles()[-1].level
     levels = min(left, default=all_levels)
@@ -100,7 +100,6 @@ def sample(
             progress(Progress(counts.total(), status.size, resumed, dict(counts), levels, levels > before))
 
     report()
-    back = ReadBack(store)
     writer = TileWriter(MemoryBound(objective), store, made)
     with resumable(store, counts), closing(_fill(writer, pending, batch, executor)) as tiles:
         for filled in tiles:
@@ -110,9 +109,10 @@ def sample(
             counts.update(filled.statuses)
             left -= Counter([filled.tile.level])  # none is kept at zero
             report()
-            if executor is not None:
-                back.look(filled.tile)
-        dataset = store.dataset(back.values())
+            if store.read_tile(filled.tile) is None:
+                late.append(filled.tile)
+        await_tiles(store, late)
+        dataset = store.dataset()
         if not bool((dataset["status"] == Status.MISSING).any()):
             if conclude is not None and not store.ascending:
                 dataset = dataset.assign_attrs(conclude(dataset))

@@ -200,7 +200,7 @@ def test_bad_input_is_one_line_and_writes_nothing(run: Command, over: str, said:
 def test_a_sweep_that_is_stopped_goes_on_to_the_same_bits(run: Command, tmp_path: Path) -> None:
     text = "sweep bounce --dims 0 1 --over 2 --frames 4 --resolution 8 --device cpu --out stopped"
     sweep = partial(landscape, *text.split())
-    done = alone(sweep, tmp_path, Instant(20, of="status/c", by=signal.SIGINT))
+    done = alone(sweep, tmp_path, Instant(40, of="pieces", by=signal.SIGINT))
     assert done.returncode == 130
     assert f"the same command continues from there: landscape {text}" in done.stderr
     kept = int(done.stderr.split("stopped: ")[1].split(" of 256 points")[0])

@@ -239,7 +239,7 @@ def test_a_worker_of_another_store_or_without_the_file_system_says_so(tmp_path):
         MemoryBound(from_torch(wave, SPACE)), store, functools.partial(from_torch, wave, SPACE)
     ).__reduce__()
     remote = make(*arguments)
-    (tmp_path / "s.filling.zarr").rename(tmp_path / "elsewhere.zarr")
+    (tmp_path / "s.filling").rename(tmp_path / "elsewhere")
     with pytest.raises(StoreError, match=r"a worker finds no .*file system that they share"):
         list(remote.fill(store.tiles(), 16))
     SliceStore.create(tmp_path / "s.zarr", PLANE, SPACE, identity={"objective": "hill"})
@@ -276,7 +276,7 @@ def test_what_workers_wrote_is_waited_for(tmp_path, alone, hidden, clock):
     with ThreadPoolExecutor(2) as threads:
         dataset = sample(from_torch(wave, SPACE), PLANE, store, batch=40, executor=threads)
     assert dataset["loss"].equals(alone.dataset()["loss"])
-    assert set(hidden.values()) == {-1}  # and read once
+    assert max(hidden.values()) < 0
     assert clock.slept == [spread.POLL]
 
 

@@ -217,18 +217,6 @@ def strided_store(path: Path, plane: Plane = PLANE) -> SliceStore:
     return SliceStore.open_or_create(path, plane, SPACE, identity={"objective": "wave", "gradients_every": 3})
 
 
-@pytest.mark.parametrize("sloped", [True, False])
-def test_a_gradient_that_is_lacking_where_it_belongs_is_a_tile_that_was_torn(tmp_path: Path, sloped: bool) -> None:
-    store = strided_store(tmp_path / "slice.zarr")
-    tile = next(one for one in store.tiles() if store.sloped(one).any() and not store.sloped(one).all())
-    whole = Counted().evaluate(store.points(tile))
-    assert whole.grad is not None
-    row = int(np.flatnonzero((store.sloped(tile) == sloped) & (whole.status == Status.OK).numpy())[0])
-    whole.grad[row] = torch.nan
-    store.write(tile, whole)
-    assert (tile in store.pending()) == sloped
-
-
 def test_other_gradients_are_another_slice(tmp_path: Path) -> None:
     job = SliceJob.of(Counted(), PLANE, command="", out=tmp_path, gradients=3)
     job.run()
