@@ -8,7 +8,7 @@ import json
 import math
 import shutil
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import groupby
@@ -26,6 +26,7 @@ from ..landscapes.measures.classify import QuotedWord
 from ..landscapes.measures.doubled_resolution import DoubledResolution
 from ..landscapes.measures.profile import Profile
 from ..landscapes.objective import BoxedObjective, Evaluation, ObjectiveWrapper
+from ..landscapes.plain import digest
 from ..landscapes.storage.files import is_full, make_folder, other_files, replacing, tidy, write_json
 from ..landscapes.storage.records import read_json, reading, write_record
 from ..landscapes.verification import RESAMPLE, verify_dataset
@@ -137,6 +138,7 @@ class ReportJob:
         be reported on, or where another report is there.
         """
         watch, done, failed = watch or Watch(), list[Report](), dict[str, str]()
+        watch.plan(self.work())
 
         def say_kept() -> str:
             return f"{len(done)} of {len(self.subjects)} reports are kept in {self._place(self.subjects[0]).parent}"
@@ -159,6 +161,17 @@ class ReportJob:
                     partial.write_text(slices_markdown(found.reports))
         return found
 
+    def work(self) -> Iterator[Work]:
+        """Yield what measuring each slice takes that has no report yet."""
+        known: dict[str, Environment] = {}
+        for subject in self.subjects:
+            dataset = _open(subject)
+            env = environment_of(dataset, self.device, self.env)
+            env = known.setdefault(digest(env.identity()), env)
+            key = ReportKey(self.points, self.seed, digest_of(dataset), env.version_on(env.engine))
+            if not any(_holds(folder, key) for folder in (self._place(subject), self._beside(subject)) if folder):
+                yield report_work(env, dataset["loss"].shape, self.points)
+
     def report(self, subject: ReportedSlice, watch: Watch) -> Report:
         """Return the report of a slice that is there, or else measure it now and leave it there."""
         folder = self._place(subject)
@@ -170,16 +183,17 @@ class ReportJob:
     def _place(self, subject: ReportedSlice) -> Path:
         return self.folder if self.single else self.folder / subject.name
 
-    def _find(self, subject: ReportedSlice, folder: Path, watch: Watch) -> Report:
-        """Return a report that is there, or beside its slice, or else measure it.
+    def _beside(self, subject: ReportedSlice) -> Path | None:
+        """Return the folder of a slice, whose report may be copied; not without what it is drawn from for print."""
+        folder = subject.store.parent
+        return folder if not self.prints or (folder / ARRAYS).exists() else None
 
-        One that is to be drawn for print is not taken from beside the slice without what it is drawn from.
-        """
+    def _find(self, subject: ReportedSlice, folder: Path, watch: Watch) -> Report:
+        """Return a report that is there, or next to its slice, or else measure it."""
         dataset = _open(subject)
         env = environment_of(dataset, self.device, self.env)
         key = ReportKey(self.points, self.seed, digest_of(dataset), env.version_on(env.engine))
-        beside = subject.store.parent
-        if not self.prints or (beside / ARRAYS).exists():
+        if (beside := self._beside(subject)) is not None:
             _fetch(beside, folder, key, watch)
         if (folder / RECORD).exists():
             return _keep(folder, key, env.device, watch)
@@ -236,7 +250,6 @@ def measure(env: Environment, dataset: xr.Dataset, points: int, seed: int, watch
     from ..landscapes.measures.profile import PRECISION, effort, measure_profile
 
     total = sum(effort(dataset["loss"].ndim, points, dataset["loss"].shape))
-    watch.plan([report_work(env, dataset["loss"].shape, points)])
     _announce(env, dataset, points, watch)
     objective = BoxedObjective(env) if stored_identity(dataset).get("boxed") else env
     with watch.progress(total) as advance:
@@ -357,12 +370,16 @@ def digest_of(dataset: xr.Dataset) -> str:
     return hashlib.sha256(identity + dataset["loss"].to_numpy().tobytes()).hexdigest()[:12]
 
 
+def _holds(folder: Path, key: ReportKey) -> bool:
+    """Whether a folder holds this report."""
+    files = (folder / name for name in (PICTURE, MEASURES, RECORD))
+    return all(file.exists() for file in files) and not _differences(Report.read(folder / RECORD).key, key)
+
+
 def _fetch(source: Path, folder: Path, key: ReportKey, watch: Watch) -> None:
     """Copy the same report from beside its slice, where the gallery has it, rather than measure again."""
     files = [source / name for name in (PICTURE, MEASURES, RECORD)]
-    if (folder / RECORD).exists() or not all(file.exists() for file in files):
-        return
-    if not _differences(Report.read(source / RECORD).key, key):
+    if not (folder / RECORD).exists() and _holds(source, key):
         make_folder(folder)
         for file in [*files, *source.glob(ARRAYS)]:
             with replacing(folder / file.name) as partial:

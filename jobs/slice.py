@@ -21,7 +21,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..landscapes.capacity import peak_memory, size
-from ..landscapes.convert import to_json
 from ..landscapes.cost import duration, seconds_per_episode
 from ..landscapes.directions import barrier
 from ..landscapes.identity import plane_of, stored_identity, with_stride
@@ -36,18 +35,20 @@ from ..landscapes.sampling.memory import MemoryBound
 from ..landscapes.sampling.refine import Refined, Refinement, partly_refined, refine
 from ..landscapes.storage.arrays import Tile, need_of
 from ..landscapes.storage.checkpoint import Checkpoint
-from ..landscapes.storage.files import clear, tidy, write_json
+from ..landscapes.storage.files import clear
 from ..landscapes.storage.paths import is_slice, slice_exists
 from ..landscapes.storage.store import SliceStore
 from ..landscapes.verification import verify_dataset, verify_store
 from .folder import ROOT, SLICE, SUMMARY, folder_named
-from .job import Job
+from .job import SummaryJob
 from .scene import provenance
 from .watch import PREPARING, Watch, Work, resumable
 from .workers import recipe
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+    from ..landscapes.space import ParameterSpace
 
 STORE, PICTURE, REFINING = SLICE.store, SLICE.picture, "slice.refining"
 MIN_PAUSE_SECONDS = 10.0  # between pictures of an unfinished slice
@@ -134,7 +135,7 @@ def slice_work(objective: Objective, shape: tuple[int, ...], every: int, *, betw
 
 
 @dataclass(frozen=True, kw_only=True)
-class SliceJob(Job[SliceSummary]):
+class SliceJob(SummaryJob[SliceSummary]):
     """A slice to sample, and how to draw it, here or by the workers of an `executor`, each with what `remake` returns.
 
     With a `refinement` it is sampled only where it has to be.
@@ -148,45 +149,6 @@ class SliceJob(Job[SliceSummary]):
     executor: Executor | None = None
     remake: Callable[[], Objective] | None = None
     refinement: Refinement | None = None
-
-    @classmethod
-    def open(
-        cls,
-        objective: Objective,
-        plane: Plane,
-        folder: Path,
-        draw: Draw,
-        *,
-        identity: Mapping[str, Any],
-        provenance: Mapping[str, Any],
-        command: str = "",
-        grad: bool = True,
-        force: bool = False,
-        executor: Executor | None = None,
-        remake: Callable[[], Objective] | None = None,
-        prints: Sequence[float] = (),
-        refinement: Refinement | None = None,
-    ) -> SliceJob:
-        """Go on with the slice in `folder`, or begin it there; `force` begins anew where another slice is.
-
-        Raises ValueError where the folder holds something else, StoreMismatchError where it holds another slice.
-        """
-        SLICE.check(folder)
-        path = folder / STORE
-        if refinement is not None:
-            refinement.check(plane)
-            identity = {**identity, "refinement": asdict(refinement)}
-        settings: dict[str, Any] = {"identity": identity, "provenance": provenance, "grad": grad}
-        if force and slice_exists(path):
-            store = SliceStore.create(path, plane, objective.space, overwrite=True, **settings)
-            clear(folder, (PICTURE, SUMMARY), PICTURE)
-            checkpoint_in(folder, store).remove()
-        else:
-            store = SliceStore.open_or_create(path, plane, objective.space, **settings)
-        return cls(
-            objective=objective, plane=plane, folder=folder, store=store, plot=draw, command=command,
-            executor=executor, remake=remake, prints=prints, refinement=refinement,
-        )  # fmt: skip
 
     @classmethod
     def of(
@@ -205,35 +167,30 @@ class SliceJob(Job[SliceSummary]):
         prints: Sequence[float] = (),
         refinement: Refinement | None = None,
     ) -> SliceJob:
-        """Open the slice of an environment, or of any objective, in `out`, by default a folder named after it.
-
-        That folder is under `root`.
+        """Continue the slice in `out`, by default a folder under `root` named after it, or begin it there.
 
         Losses are at all samples, gradients at every so many along each axis, `gradients`, 0 for none. `boxed` leaves
         out what lies beyond the parameters' bounds. With a `cut`, how it was cut along directions, it is boxed; of one
-        that was begun, `kept_plane` has the plane. With an `executor` its workers compute. Raises ValueError where
-        gradients cannot be so far apart, and as `open` does.
+        that was begun, `kept_plane` has the plane. With an `executor` its workers compute. `force` begins again where
+        another slice is. Raises ValueError where gradients cannot be so far apart and where the folder holds something
+        else, StoreMismatchError where it holds another slice.
         """
-        boxed = boxed or cut is not None
         gradients = check_gradients(gradients, plane, refined=refinement is not None)
-        identity = with_stride(identity_of(objective), gradients)
-        identity |= ({"boxed": True} if boxed else {}) | ({"cut": dict(cut)} if cut else {})
-        out = out or default_folder(identity, plane.resolution, plane, gradients > 0, root, refinement)
-        return cls.open(
-            BoxedObjective(objective) if boxed else objective,
-            plane,
-            out,
-            picture_of(objective, plane),
-            identity=identity,
-            provenance=provenance(objective, command),
-            command=command,
-            grad=gradients > 0,
-            force=force,
-            executor=executor,
-            remake=None if boxed else recipe(objective),
-            prints=prints,
-            refinement=refinement,
-        )
+        identity = _identity(objective, gradients, boxed=boxed, cut=cut)
+        folder = out or default_folder(identity, plane.resolution, plane, gradients > 0, root, refinement)
+        if refinement is not None:
+            refinement.check(plane)
+            identity["refinement"] = asdict(refinement)
+        store = _open_store(
+            folder, plane, objective.space, force=force,
+            identity=identity, provenance=provenance(objective, command), grad=gradients > 0,
+        )  # fmt: skip
+        boxed = "boxed" in identity
+        return cls(
+            objective=BoxedObjective(objective) if boxed else objective, remake=None if boxed else recipe(objective),
+            plane=plane, store=store, plot=picture_of(objective, plane), folder=folder, command=command,
+            executor=executor, prints=prints, refinement=refinement,
+        )  # fmt: skip
 
     def work(self) -> list[Work]:
         """Return its samples, and what looks between them."""
@@ -255,19 +212,9 @@ class SliceJob(Job[SliceSummary]):
         printed = self.draw(partial(self.plot, dataset))
         return self._summary(dataset, computed, time.monotonic() - start, [STORE, PICTURE, *printed, SUMMARY])
 
-    def write(self, found: SliceSummary) -> list[str]:
-        """Write the summary."""
-        write_json(self.folder / SUMMARY, to_json(found))
-        tidy(self.folder)
-        return found.files
-
     def holding(self, watch: Watch) -> AbstractContextManager[None]:
         """Leave the finest complete picture where it is stopped."""
         return resumable(self.kept, self.picture)
-
-    def outcome(self, found: SliceSummary) -> str:
-        """Say in a line what the slice cost and what came out."""
-        return found.outcome()
 
     def kept(self) -> str:
         """Say how much of it is on disk."""
@@ -366,6 +313,23 @@ class SliceJob(Job[SliceSummary]):
             barrier=barrier_of(dataset),
             error=self.store.error,
         )
+
+
+def _identity(objective: Objective, gradients: int, *, boxed: bool, cut: Mapping[str, Any] | None) -> dict[str, Any]:
+    """Return what decides a slice's numbers, but for its plane; one that was cut along directions is boxed."""
+    about = ({"boxed": True} if boxed or cut is not None else {}) | ({"cut": dict(cut)} if cut else {})
+    return with_stride(objective.identity(), gradients) | about
+
+
+def _open_store(folder: Path, plane: Plane, space: ParameterSpace, *, force: bool, **settings: Any) -> SliceStore:
+    """Continue the slice in a folder, or begin it there; `force` begins again where another one is."""
+    SLICE.check(folder)
+    if not (force and slice_exists(folder / STORE)):
+        return SliceStore.open_or_create(folder / STORE, plane, space, **settings)
+    store = SliceStore.create(folder / STORE, plane, space, overwrite=True, **settings)
+    clear(folder, (PICTURE, SUMMARY), PICTURE)
+    checkpoint_in(folder, store).remove()
+    return store
 
 
 def kind_of(store: SliceStore) -> str:
@@ -494,7 +458,7 @@ def kept_plane(
 
     It goes on along these: others may come out a little different each time, on a GPU, and some take many episodes.
     """
-    identity = with_stride(identity_of(objective), gradients) | {"boxed": True, "cut": dict(cut)}
+    identity = _identity(objective, gradients, boxed=True, cut=cut)
     path = (out or default_folder(identity, resolution, None, gradients > 0, root, refinement)) / STORE
     if not is_slice(path):
         return None
@@ -502,11 +466,6 @@ def kept_plane(
     same = all(kept.get(name) == json.loads(json.dumps(value)) for name, value in identity.items())
     found = Plane.from_record(kept["plane"])
     return found if same and found.resolution == resolution else None
-
-
-def identity_of(objective: Objective) -> dict[str, Any]:
-    """Return what decides an objective's numbers, as far as it says: an environment all, any other its name."""
-    return objective.identity()
 
 
 def look_between(objective: Objective, dataset: xr.Dataset) -> dict[str, Any]:
