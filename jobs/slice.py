@@ -9,7 +9,7 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import AbstractContextManager
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -29,7 +29,13 @@ from ..landscapes.measures.undersampled import Undersampled, find_undersampled, 
 from ..landscapes.objective import BoxedObjective, Objective, Status, describe_errors, failed
 from ..landscapes.plain import digest, plain_name
 from ..landscapes.plane import Plane
-from ..landscapes.sampling.distribution import TileWriter, WorkerTileWriter, evaluator, run_tasks, workers_of
+from ..landscapes.sampling.distribution import (
+    PortableObjective,
+    RemoteObjective,
+    evaluator,
+    run_tasks,
+    workers_of,
+)
 from ..landscapes.sampling.fill import Progress, sample
 from ..landscapes.sampling.memory import MemoryBound
 from ..landscapes.sampling.refine import Refined, Refinement, partly_refined, refine
@@ -108,15 +114,11 @@ class SliceSummary:
 
 @dataclass(frozen=True)
 class SliceCost:
-    """Say what is left of a slice to compute: episodes, seconds they should take, bytes of memory.
-
-    `each` has the seconds of an episode with a gradient, True, and of one without, as far as there are such ones here.
-    """
+    """Say what is left of a slice to compute: episodes, seconds they should take, bytes of memory."""
 
     episodes: int
     seconds: float
     memory: int
-    each: Mapping[bool, float] = field(default_factory=dict)
 
     def less(self, done: int) -> SliceCost:
         """Return what is left where so many of the episodes are done."""
@@ -280,7 +282,7 @@ class SliceJob(SummaryJob[SliceSummary]):
 
             def conclude(dataset: xr.Dataset) -> dict[str, Any]:
                 advance(dataset["status"].size, "looking between them")
-                return look_between(evaluator(self.objective, self.store, self.executor, self.remake), dataset)
+                return look_between(evaluator(self.objective, self.executor, self.remake), dataset)
 
             how: dict[str, Any] = {"executor": self.executor, "made": self.remake}
             how |= {"progress": follow, "conclude": conclude}
@@ -378,34 +380,38 @@ def estimate_cost(
     executor: Executor | None = None,
     remake: Callable[[], Objective] | None = None,
 ) -> SliceCost:
-    """Estimate what is left of a slice, here or, with an `executor`, on its workers."""
-    if executor is None:
-        return cost_of(objective, store)
-    writer = TileWriter(MemoryBound(objective), store, remake)
-    costs = list(run_tasks(executor, _cost_there, [(writer,)] * workers_of(executor)))
-    shares = [1 / cost.seconds for cost in costs if cost.seconds]
-    return replace(costs[0], seconds=1 / sum(shares) if shares else 0.0)
+    """Estimate what is left of a slice from its own first points, evaluated as they will be; that takes seconds.
 
-
-def cost_of(objective: Objective, store: SliceStore) -> SliceCost:
-    """Estimate what is left of a slice from its own first points, evaluated as they will be; that takes seconds."""
-    pending = store.pending()
-    left = sum(store.count(tile) for tile in pending)
+    With an `executor` its workers evaluate them.
+    """
+    tiling, pending = store.tiling, store.pending()
+    left = sum(map(tiling.count, pending))
     if not left:
         return SliceCost(0, 0.0, peak_memory())
-    objective.prepare()
     batch = first_points(store, pending, objective.preferred_batch)
-    sloped = sum(int(store.sloped(tile).sum()) for tile in pending)
-    counts = {True: sloped, False: left - sloped}
-    each = {grad: seconds_per_episode(objective, batch, grad=grad, count=n) for grad, n in counts.items() if n}
-    seconds = sum(counts[grad] * one for grad, one in each.items())
+    sloped = sum(int(tiling.sloped(tile).sum()) for tile in pending)
+    counts = {grad: count for grad, count in ((True, sloped), (False, left - sloped)) if count}
+    if executor is None:
+        timed = [_time(objective, batch, counts)]
+    else:
+        sent = PortableObjective(MemoryBound(objective), remake)
+        timed = list(run_tasks(executor, _time_there, [(sent, batch, counts)] * workers_of(executor)))
+    shares = [1 / seconds for seconds, _ in timed if seconds]
     arrays = need_of(store.shape, store.plane.dim, grad=store.grad)
-    return SliceCost(left, seconds, peak_memory() + round(arrays.memory), each)
+    return SliceCost(left, 1 / sum(shares) if shares else 0.0, timed[0][1] + round(arrays.memory))
 
 
-def _cost_there(writer: TileWriter | WorkerTileWriter) -> SliceCost:
-    here = writer.here()
-    return cost_of(here.objective.objective, here.store)
+def _time(objective: Objective, batch: Float[Tensor, "point dim"], counts: Mapping[bool, int]) -> tuple[float, int]:
+    """Return what so many episodes with a gradient, True, and without take [s], and this process's memory [bytes]."""
+    objective.prepare()
+    each = {grad: seconds_per_episode(objective, batch, grad=grad, count=n) for grad, n in counts.items()}
+    return sum(counts[grad] * one for grad, one in each.items()), peak_memory()
+
+
+def _time_there(
+    sent: PortableObjective | RemoteObjective, batch: Float[Tensor, "point dim"], counts: Mapping[bool, int]
+) -> tuple[float, int]:
+    return _time(sent.here().objective, batch, counts)
 
 
 def first_points(store: SliceStore, tiles: Sequence[Tile], count: int) -> Float[Tensor, "point dim"]:

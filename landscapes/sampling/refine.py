@@ -149,7 +149,7 @@ def refine(
         batch = max(LEAST_BATCH, objective.preferred_batch)
         batch *= workers_of(executor) if executor else 1
         run = Refining(
-            evaluator(objective, store, executor, made), batch, plane, store, refinement, checkpoint, progress, seed
+            evaluator(objective, executor, made), batch, plane, store, refinement, checkpoint, progress, seed
         )
         with resumable(store, run.counts):
             run.go()
@@ -235,10 +235,6 @@ class Refining:
         for share in self.refinement.shares():
             if not self._refine_to(share):
                 return
-
-    def take_all(self) -> None:
-        """Sample the whole grid."""
-        self._evaluate(np.argwhere(np.ones(self.tree.shape, bool)))
 
     def dataset(self) -> xr.Dataset:
         """Return the slice."""

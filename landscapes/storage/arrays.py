@@ -11,15 +11,19 @@ import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import cached_property
 from heapq import heappop, heappush
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import torch
 import xarray as xr
 import zarr
+from jaxtyping import Float
 from numpy.typing import NDArray
+from torch import Tensor
 from zarr.codecs import BloscCodec, Crc32cCodec, ZstdCodec
 
 from ..capacity import BLOCK, Need, require
@@ -234,6 +238,62 @@ class Tile:
     def level(self) -> int:
         """Which square of tiles this one helps to complete: 0 is the first, coarsest picture."""
         return max(self.index)
+
+
+@dataclass(frozen=True)
+class Tiling:
+    """Say which samples of a slice are in which tile: coarse to fine, or the chunks of a finished slice.
+
+    Gradients are at every so many samples along each axis, `every`, 0 for none. `chunks` are the sides of the chunks.
+    """
+
+    plane: Plane
+    every: int
+    chunks: tuple[int, ...] = ()
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Points per axis, in array order."""
+        return tuple(self.plane.resolution[::-1])
+
+    @cached_property
+    def sides(self) -> tuple[int, ...]:
+        """Points of a tile along each axis."""
+        return self.chunks or tuple(map(tile_side, self.shape))
+
+    @cached_property
+    def order(self) -> list[NDArray[np.intp]]:
+        """The samples along each axis in the order in which tiles take them."""
+        pairs = zip(self.shape, self.sides, strict=True)
+        return [np.arange(n) if self.chunks else np.array(coarse_to_fine(n, side)) for n, side in pairs]
+
+    def tiles(self) -> list[Tile]:
+        """Return every tile, coarse to fine."""
+        counts = (math.ceil(points / side) for points, side in zip(self.shape, self.sides, strict=True))
+        return sorted(map(Tile, np.ndindex(*counts)), key=lambda tile: (tile.level, sum(tile.index), tile.index))
+
+    def rows(self, tile: Tile) -> list[NDArray[np.intp]]:
+        """Return the places of a tile's samples along each axis."""
+        parts = zip(tile.index, self.order, self.sides, strict=True)
+        return [order[at * side : (at + 1) * side] for at, order, side in parts]
+
+    def count(self, tile: Tile) -> int:
+        """Return how many points a tile has."""
+        return math.prod(map(len, self.rows(tile)))
+
+    def sloped(self, tile: Tile) -> NDArray[np.bool_]:
+        """Return which points of a tile have a gradient, in the order of `points`, shape (points,)."""
+        if not self.every:
+            return np.zeros(self.count(tile), bool)
+        having = np.meshgrid(*(rows % self.every == 0 for rows in self.rows(tile)), indexing="ij")
+        found: NDArray[np.bool_] = np.logical_and.reduce(having).ravel()
+        return found
+
+    def points(self, tile: Tile) -> Float[Tensor, "points dim"]:
+        """Return the parameters at the points of a tile."""
+        pairs = zip(self.plane.axes()[::-1], self.rows(tile), strict=True)
+        grid = np.meshgrid(*(axis.numpy()[rows] for axis, rows in pairs), indexing="ij")[::-1]
+        return self.plane.lift(torch.from_numpy(np.stack([axis.ravel() for axis in grid], axis=1)))
 
 
 def tile_side(points: int) -> int:

@@ -16,13 +16,11 @@ from __future__ import annotations
 import contextlib
 import json
 import math
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-import torch
 import xarray as xr
 from jaxtyping import Float
 from numpy.typing import NDArray
@@ -56,11 +54,10 @@ from .arrays import (
     Arrays,
     Chunks,
     Tile,
+    Tiling,
     blank,
-    coarse_to_fine,
     damage,
     refuse_too_large,
-    tile_side,
     write_finished,
 )
 from .checkpoint import Checkpoint
@@ -104,12 +101,7 @@ class SliceStore:
         self.provenance = current_provenance(json.loads(str(empty.attrs["provenance"])), stored)
         self.plane = Plane.from_record(self.identity["plane"])
         self.dims = AXES[: self.plane.rank][::-1]
-        self.shape = tuple(empty.sizes[name] for name in self.dims)
-        self._sides = chunks.sides if chunks else tuple(map(tile_side, self.shape))
-        pairs = zip(self.shape, self._sides, strict=True)
-        self._order = [
-            np.arange(points) if chunks else np.array(coarse_to_fine(points, side)) for points, side in pairs
-        ]
+        self.tiling = Tiling(self.plane, self.every if self.grad else 0, chunks.sides if chunks else ())
         self._tiles: dict[Tile, Arrays] = {}  # what is known of a slice that is being filled
         self._files = Checkpoint(self.place, digest(self.identity)) if self.place and not chunks else None
 
@@ -222,10 +214,18 @@ class SliceStore:
         """At every how many samples along each axis there is a gradient, in a slice that holds gradients."""
         return gradient_stride(self.identity)
 
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Points per axis, in array order."""
+        return self.tiling.shape
+
     def tiles(self) -> list[Tile]:
         """Return every tile, coarse to fine."""
-        counts = (math.ceil(points / side) for points, side in zip(self.shape, self._sides, strict=True))
-        return sorted(map(Tile, np.ndindex(*counts)), key=lambda tile: (tile.level, sum(tile.index), tile.index))
+        return self.tiling.tiles()
+
+    def points(self, tile: Tile) -> Float[Tensor, "points dim"]:
+        """Return the parameters at the points of a tile."""
+        return self.tiling.points(tile)
 
     def pending(self) -> list[Tile]:
         """Return the tiles that are not finished, coarse to fine."""
@@ -247,27 +247,6 @@ class SliceStore:
                 self._tiles[tile] = self._files.read(tile.name)
         return self._tiles.get(tile)
 
-    def statuses(self, tile: Tile) -> Counter[Status]:
-        """Count how the points of a finished tile ended; nothing of one that is not finished."""
-        values = self.read_tile(tile)
-        return Counter() if values is None else Counter(map(Status, values["status"].ravel().tolist()))
-
-    def count(self, tile: Tile) -> int:
-        """Return how many points a tile has."""
-        return math.prod(map(len, self._rows(tile)))
-
-    def sloped(self, tile: Tile) -> NDArray[np.bool_]:
-        """Return which points of a tile have a gradient, in the order of `points`, shape (points,)."""
-        having = np.meshgrid(*(rows % self.every == 0 for rows in self._rows(tile)), indexing="ij")
-        found: NDArray[np.bool_] = np.logical_and.reduce(having).ravel() & self.grad
-        return found
-
-    def points(self, tile: Tile) -> Float[Tensor, "points dim"]:
-        """Return the parameters at the points of a tile."""
-        named = zip(self.dims, self._rows(tile), strict=True)
-        grid = np.meshgrid(*(self._empty[name].to_numpy()[rows] for name, rows in named), indexing="ij")[::-1]
-        return self.plane.lift(torch.from_numpy(np.stack([axis.ravel() for axis in grid], axis=1)))
-
     def write(self, tile: Tile, evaluation: Evaluation) -> None:
         """Write a whole tile; `evaluation` has its points in the order of `points`, failures blanked.
 
@@ -278,7 +257,7 @@ class SliceStore:
             raise ValueError("this slice holds gradients; got an evaluation without, so evaluate with grad=True")
         if bool((evaluation.status == Status.MISSING).any()):
             raise ValueError("a tile is written whole; got an evaluation with status MISSING")
-        shape = tuple(map(len, self._rows(tile)))
+        shape = tuple(map(len, self.tiling.rows(tile)))
         if self._follow_finished() or math.prod(shape) != len(evaluation.loss):
             return  # another process has finished the slice, which has larger and fewer tiles since
         self.keep_error(evaluation.error)
@@ -340,21 +319,16 @@ class SliceStore:
             return self.dataset()
         if not (level := 0 if self.ascending else pending[0].level):
             return None
-        parts = zip(self.dims, self._order, self._sides, strict=True)
+        parts = zip(self.dims, self.tiling.order, self.tiling.sides, strict=True)
         found = self.dataset().isel({name: np.sort(order[: level * side]) for name, order, side in parts})
         return found.drop_vars("grad", errors="ignore") if self.every > 1 else found
-
-    def _rows(self, tile: Tile) -> list[NDArray[np.intp]]:
-        """Return the places of a tile's samples along each axis."""
-        parts = zip(tile.index, self._order, self._sides, strict=True)
-        return [order[at * side : (at + 1) * side] for at, order, side in parts]
 
     def _is_whole(self, tile: Tile, values: Arrays) -> bool:
         """Whether loss and gradient are finite exactly where the status says so, which is not MISSING anywhere."""
         status = values["status"]
         lacking = np.zeros(status.shape, bool)
         if "grad" in values:
-            lacking = ~np.isfinite(values["grad"]).all(axis=-1) & self.sloped(tile).reshape(status.shape)
+            lacking = ~np.isfinite(values["grad"]).all(axis=-1) & self.tiling.sloped(tile).reshape(status.shape)
         finite, without = np.isfinite(values["loss"]), status == Status.NO_GRADIENT
         said = np.where(has_loss(status), finite & (lacking == without), ~finite)
         return bool((said & (status != Status.MISSING)).all())
@@ -375,7 +349,7 @@ class SliceStore:
         """Return arrays of the whole slice, blank where nothing is sampled."""
         found: Arrays = {name: self._empty[name].to_numpy().copy() for name in names}
         for tile, values in self._finished():
-            at = np.ix_(*self._rows(tile))
+            at = np.ix_(*self.tiling.rows(tile))
             for name, array in found.items():
                 array[at] = values[name]
         return found

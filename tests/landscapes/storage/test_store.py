@@ -157,7 +157,7 @@ def test_another_process_that_finishes_first_is_followed(tmp_path):
 def test_a_nan_result_is_finished_and_not_missing(tmp_path):
     store = make(tmp_path / "s.zarr")
     tile = store.tiles()[0]
-    count = store.count(tile)
+    count = store.tiling.count(tile)
     nan = torch.full((count,), torch.nan).double()
     store.write(tile, Evaluation.from_results(nan, nan[:, None].expand(-1, 3)))
     assert tile not in store.pending()

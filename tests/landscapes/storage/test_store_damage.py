@@ -51,7 +51,7 @@ def test_a_damaged_tile_costs_exactly_its_points(tmp_path, damage):
         assert [tile.name for tile in pending] == [file.stem]
         assert store.damaged_tiles(pending) == ([] if damage == "removed" else pending)
         seen = open_slice(path)["status"].to_numpy()
-        assert (seen == Status.MISSING).sum() == store.count(pending[0])
+        assert (seen == Status.MISSING).sum() == store.tiling.count(pending[0])
         fill(store, pending)
         xr.testing.assert_identical(open_slice(path), whole)
 
