@@ -27,7 +27,7 @@ from ..landscapes.identity import plane_of, stored_identity, with_stride
 from ..landscapes.lattice import check_gradients, count_gradients
 from ..landscapes.measures.undersampled import Undersampled, find_undersampled, probes
 from ..landscapes.objective import BoxedObjective, Objective, Status, describe_errors, failed
-from ..landscapes.plain import digest, plain_name
+from ..landscapes.plain import plain_name
 from ..landscapes.plane import Plane
 from ..landscapes.sampling.distribution import (
     PortableObjective,
@@ -40,7 +40,6 @@ from ..landscapes.sampling.fill import Progress, sample
 from ..landscapes.sampling.memory import MemoryBound
 from ..landscapes.sampling.refine import Refined, Refinement, partly_refined, refine
 from ..landscapes.storage.arrays import Tile, need_of
-from ..landscapes.storage.checkpoint import Checkpoint
 from ..landscapes.storage.files import clear
 from ..landscapes.storage.paths import is_slice, slice_exists
 from ..landscapes.storage.store import SliceStore
@@ -56,7 +55,7 @@ if TYPE_CHECKING:
 
     from ..landscapes.space import ParameterSpace
 
-STORE, PICTURE, REFINING = SLICE.store, SLICE.picture, "slice.refining"
+STORE, PICTURE = SLICE.store, SLICE.picture
 MIN_PAUSE_SECONDS = 10.0  # between pictures of an unfinished slice
 MAX_DRAWING_SHARE = 0.1  # of the time, for pictures of an unfinished slice
 FIRST_PICTURE_SECONDS = 3.0  # no intermediate picture of slices that are faster than this
@@ -220,26 +219,22 @@ class SliceJob(SummaryJob[SliceSummary]):
 
     def kept(self) -> str:
         """Say how much of it is on disk."""
-        status = self._so_far()["status"] if self.refinement else self.store.status()
+        status = partly_refined(self.store)["status"] if self.refinement else self.store.status()
         return f"{int((status > 0).sum())} of {status.size} points are kept in {self.folder}"
 
     def picture(self) -> None:
         """Draw the finest complete picture of the whole so far, if there is one."""
-        coarse = self._so_far() if self.refinement else self.store.coarse()
+        coarse = partly_refined(self.store) if self.refinement else self.store.coarse()
         if coarse is not None and bool((coarse["status"] != Status.MISSING).any()):
             from ..landscapes.draw.figures.page import save
 
             save(self.plot(coarse), self.folder / PICTURE)
 
-    def _so_far(self) -> xr.Dataset:
-        """Return what is sampled of a slice that is refined."""
-        return partly_refined(self.store, checkpoint_in(self.folder, self.store))
-
     def _verify(self, watch: Watch) -> None:
         """Evaluate a few stored points anew, before anything is added to them."""
         with watch.busy(f"{self.store.identity.get('objective')}: {PREPARING}"):
             if self.refinement and not self.store.ascending:
-                verify_dataset(self.objective, self._so_far(), self.folder)
+                verify_dataset(self.objective, partly_refined(self.store), self.folder)
             else:
                 verify_store(self.objective, self.store)
 
@@ -250,7 +245,7 @@ class SliceJob(SummaryJob[SliceSummary]):
         with watch.busy(f"{env}: {PREPARING}"):
             cost = self.cost()
             if self.refinement and cost.episodes:
-                cost = cost.less(int((self._so_far()["status"] > 0).sum()))
+                cost = cost.less(int((partly_refined(self.store)["status"] > 0).sum()))
         total, whole = math.prod(self.plane.resolution), self.store.grad and self.store.every == 1
         kind = kind_of(self.store)
         watch.note(" · ".join([env, str(about.get("fidelity")), str(about.get("device")), str(self.folder)]))
@@ -288,8 +283,7 @@ class SliceJob(SummaryJob[SliceSummary]):
             how |= {"progress": follow, "conclude": conclude}
             if self.refinement is None:
                 return sample(self.objective, self.plane, self.store, gradients=int(self.store.grad), **how), computed
-            how |= {"refinement": self.refinement, "checkpoint": checkpoint_in(self.folder, self.store)}
-            return refine(self.objective, self.plane, self.store, **how), computed
+            return refine(self.objective, self.plane, self.store, self.refinement, **how), computed
 
     def _summary(self, dataset: xr.Dataset, computed: int, seconds: float, files: list[str]) -> SliceSummary:
         identity, status = self.store.identity, dataset["status"].to_numpy()
@@ -330,7 +324,6 @@ def _open_store(folder: Path, plane: Plane, space: ParameterSpace, *, force: boo
         return SliceStore.open_or_create(folder / STORE, plane, space, **settings)
     store = SliceStore.create(folder / STORE, plane, space, overwrite=True, **settings)
     clear(folder, (PICTURE, SUMMARY), PICTURE)
-    checkpoint_in(folder, store).remove()
     return store
 
 
@@ -356,11 +349,6 @@ def picture_of(objective: Objective, plane: Plane) -> Draw:
         return profile_figure(dataset, events=objective.events(plane.lift(u[:, None])), width=width)
 
     return surface if plane.rank == 2 else profile
-
-
-def checkpoint_in(folder: Path, store: SliceStore) -> Checkpoint:
-    """Return what is kept of a slice in a folder while it is refined."""
-    return Checkpoint(folder / REFINING, digest(store.identity))
 
 
 def _gpu_memory(objective: Objective) -> str:

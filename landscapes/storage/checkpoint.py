@@ -21,7 +21,7 @@ from ..identity import DamagedError, check_identity
 from ..objective import Evaluation, Objective, evaluate
 from ..plain import digest, plain_json, text
 from ..verification import POINTS, StoredPoints, verify
-from .files import check_free, check_ours, discard, refuse_others, remove, replacing, visible_files, write_json
+from .files import check_free, check_ours, discard, refuse_others, replacing, visible_files, write_json
 from .records import read_json, reading
 
 SETTINGS, PARTS, PROBES = "settings.json", "pieces", "probes"
@@ -128,10 +128,6 @@ class Checkpoint:
         """Return the names of the parts, in order, but for what the study is verified by."""
         paths = (self.folder / PARTS).glob("[!.]*.npz")
         return sorted(path.stem for path in paths if not path.stem.startswith(PROBES))
-
-    def remove(self) -> None:
-        """Remove the parts, and the folder where nothing else is in it."""
-        remove(self.folder, re.compile(rf"{PARTS}/{PART.pattern}").fullmatch)
 
     def count(self) -> int:
         """Count the parts."""

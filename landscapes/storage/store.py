@@ -103,7 +103,8 @@ class SliceStore:
         self.dims = AXES[: self.plane.rank][::-1]
         self.tiling = Tiling(self.plane, self.every if self.grad else 0, chunks.sides if chunks else ())
         self._tiles: dict[Tile, Arrays] = {}  # what is known of a slice that is being filled
-        self._files = Checkpoint(self.place, digest(self.identity)) if self.place and not chunks else None
+        # the files of what is being filled: of tiles, or of the points of a slice that is refined
+        self.parts = Checkpoint(self.place, digest(self.identity)) if self.place and not chunks else None
 
     @classmethod
     def create(
@@ -242,9 +243,9 @@ class SliceStore:
         if self._chunks is not None:
             values = self._chunks.read(tile)
             return values if values is not None and self._is_whole(tile, values) else None
-        if tile not in self._tiles and self._files is not None:
+        if tile not in self._tiles and self.parts is not None:
             with contextlib.suppress(DamagedError, FileNotFoundError):
-                self._tiles[tile] = self._files.read(tile.name)
+                self._tiles[tile] = self.parts.read(tile.name)
         return self._tiles.get(tile)
 
     def write(self, tile: Tile, evaluation: Evaluation) -> None:
@@ -269,8 +270,8 @@ class SliceStore:
         if self._chunks is not None:
             self._chunks.write(tile, arrays)
             return
-        if self._files is not None:
-            self._files.save(tile.name, **arrays)
+        if self.parts is not None:
+            self.parts.save(tile.name, **arrays)
         self._tiles[tile] = arrays
 
     def keep_error(self, error: str) -> None:
@@ -335,9 +336,9 @@ class SliceStore:
 
     def _written(self) -> list[Tile]:
         """Return the tiles that something was written of."""
-        if self._files is None:
+        if self.parts is None:
             return self.tiles() if self._chunks else list(self._tiles)
-        return [tile for name in self._files.names() if (tile := Tile.named(name)) is not None]
+        return [tile for name in self.parts.names() if (tile := Tile.named(name)) is not None]
 
     def _finished(self) -> Iterator[tuple[Tile, Arrays]]:
         """Yield the tiles that are finished, with their arrays."""
