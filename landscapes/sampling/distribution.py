@@ -173,28 +173,25 @@ def run_tasks(executor: Executor, work: Callable[..., T], tasks: Iterable[Sequen
 
     Raises WorkersLostError where nobody is left to do them, and what a task raises.
     """
-    futures: list[Future[T]] = []
+    pending: set[Future[T]] = set()
     try:
-        futures += [executor.submit(work, *task) for task in tasks]
-        for future in _wait_for(executor, futures):
-            yield future.result()
+        for task in tasks:
+            pending.add(executor.submit(work, *task))
+        seen = time.monotonic()
+        while pending:
+            done, pending = wait(pending, timeout=POLL, return_when=FIRST_COMPLETED)
+            alive = bool(done) or _has_workers(executor)
+            while done:  # held no longer than needed: Dask computes again what was lost with a worker and is held
+                yield done.pop().result()
+            if alive:
+                seen = time.monotonic()
+            elif time.monotonic() - seen > WITHOUT_WORKERS:
+                raise WorkersLostError(f"the workers are gone (none was there for {WITHOUT_WORKERS:g} s)")
     except (CancelledError, BrokenExecutor) as error:
         raise WorkersLostError(f"the workers are gone ({str(error) or type(error).__name__})") from error
     finally:
-        for future in futures:
+        for future in pending:
             future.cancel()
-
-
-def _wait_for(executor: Executor, futures: Iterable[Future[T]]) -> Iterator[Future[T]]:
-    """Yield futures as they end, and give up where nobody is left to work on them."""
-    pending, seen = set(futures), time.monotonic()
-    while pending:
-        done, pending = wait(pending, timeout=POLL, return_when=FIRST_COMPLETED)
-        yield from done
-        if done or _has_workers(executor):
-            seen = time.monotonic()
-        elif time.monotonic() - seen > WITHOUT_WORKERS:
-            raise WorkersLostError(f"the workers are gone (none was there for {WITHOUT_WORKERS:g} s)")
 
 
 def _has_workers(executor: Executor) -> bool:
