@@ -15,22 +15,22 @@ from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from ..landscapes.capacity import Need, require, size
 from ..landscapes.convert import NOT_JSON, from_json, to_json
 from ..landscapes.cost import duration, seconds_per_episode
-from ..landscapes.identity import MODEL_VERSION, stored_identity
+from ..landscapes.identity import MODEL_VERSION, plane_of, stored_identity
 from ..landscapes.measures.classify import QuotedWord
 from ..landscapes.measures.doubled_resolution import DoubledResolution
 from ..landscapes.measures.profile import Profile
-from ..landscapes.objective import BoxedObjective, Evaluation, ObjectiveWrapper
+from ..landscapes.objective import BoxedObjective, Evaluation, ObjectiveWrapper, evaluate
 from ..landscapes.plain import digest
 from ..landscapes.storage.files import is_full, make_folder, other_files, replacing, tidy, write_json
 from ..landscapes.storage.records import read_json, reading, write_record
 from ..landscapes.verification import RESAMPLE, verify_dataset
-from . import growth
 from .folder import REPORT, REPORTS, ROOT, SLICE_STORE, folder_named, store_in
 from .scene import environment_of
 from .watch import PREPARING, Watch, Work, resumable
@@ -42,12 +42,14 @@ if TYPE_CHECKING:
     from ..envs.base import Environment
     from ..landscapes.draw.figure import Picture
     from ..landscapes.measures.gradient_quality import ScaleRow
+    from ..landscapes.measures.lyapunov import GradientGrowth
     from ..landscapes.objective import Objective
     from ..landscapes.statistics import Estimate
 
 RECORD, MEASURES, PICTURE, ARRAYS = REPORT.files  # the arrays are what the picture is drawn from, but for the slice
 TABLE = REPORTS.files[1]
 POINTS = 6  # along each axis where gradients are tested by new evaluations
+HORIZONS, GROWTH_POINTS = (0.2, 0.4, 0.6, 0.8, 1.0), 16  # shares of the episode, and where gradients are compared
 RESOLUTION = 24  # points per axis of a slice that is sampled for its report
 HEADINGS = ("slice", "minima", "flat", "jumps", "cosine", "measured", "the paper's words", "measured too")
 ENVIRONMENTS = (
@@ -210,7 +212,7 @@ class ReportJob:
         verify_dataset(env, dataset, subject.store, todo=RESAMPLE)
         start = time.monotonic()
         profile = measure(env, dataset, self.points, self.seed, watch)
-        profile = replace(profile, growth=growth.measure_growth_of(env, dataset, watch))
+        profile = replace(profile, growth=measure_growth_of(env, dataset, watch))
         report = Report(
             name=subject.name,
             env=env.name,
@@ -242,7 +244,7 @@ def report_work(env: Environment, shape: tuple[int, ...], points: int) -> Work:
     from ..landscapes.measures.profile import effort
 
     losses, gradients = effort(len(shape), points, shape)
-    return Work(env, losses, gradients + growth.effort(env))
+    return Work(env, losses, gradients + growth_effort(env))
 
 
 def measure(env: Environment, dataset: xr.Dataset, points: int, seed: int, watch: Watch) -> Profile:
@@ -334,6 +336,38 @@ def _warn(subject: ReportedSlice, dataset: xr.Dataset, env: Environment, watch: 
     if differ:
         said = "; ".join(f"{name} {theirs.get(name)} there, {ours[name]} here" for name in differ)
         watch.note(f"warning: {subject.name} was sampled otherwise ({said}), so losses may differ")
+
+
+def growth_effort(env: Environment) -> int:
+    """Return how many gradients of shorter and whole episodes `measure_growth_of` evaluates."""
+    return len(HORIZONS) * GROWTH_POINTS if env.horizon else 0
+
+
+def measure_growth_of(env: Environment, dataset: xr.Dataset, watch: Watch) -> GradientGrowth | None:
+    """Measure how gradients grow with the length of episodes at points of a slice.
+
+    None where no setting says how long episodes are. Where a scene draws none, time is in the unit of that setting.
+    """
+    from ..landscapes.measures.gradient_quality import subgrid
+    from ..landscapes.measures.lyapunov import measure_growth
+
+    if not env.horizon:
+        return None
+    time = env.horizon
+    with contextlib.suppress(ValueError):  # nothing to draw
+        time = float(env.episode(env.space.center).time[-1])
+    plane = plane_of(dataset)
+    x = plane.lift(subgrid(plane, math.isqrt(GROWTH_POINTS) if plane.rank == 2 else GROWTH_POINTS))
+    boxed = bool(stored_identity(dataset).get("boxed"))
+    width, norms = env.space.upper - env.space.lower, list[Tensor]()
+    with watch.progress(growth_effort(env), "gradients of shorter episodes") as advance:
+        for share in HORIZONS:
+            other = env.with_horizon(share * env.horizon)
+            found = evaluate(BoxedObjective(other) if boxed else other, x, grad=True)
+            assert found.grad is not None
+            norms.append((found.grad * width).norm(dim=1))
+            advance(len(norms) * len(x))
+    return measure_growth(time * np.array(HORIZONS), torch.stack(norms).numpy())
 
 
 def _compare_words(profile: Profile, said: Quoted | None) -> PaperWords | None:
@@ -529,8 +563,6 @@ class Report:
 
     def picture(self) -> Callable[..., Picture]:
         """Read what it is drawn from, and return what draws it, for any width. Raises ValueError as `plot` does."""
-        import numpy as np
-
         from ..landscapes.draw.figures.quality import quality_figure
         from ..landscapes.lattice import sampled_lattice
         from ..landscapes.measures.gradient_quality import GradientQuality, compare_samples
