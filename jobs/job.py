@@ -96,9 +96,11 @@ class Job(abc.ABC, Generic[Found]):
 
 
 class Summary(Protocol):
-    """What a job came to, as its last file has it: the `files` it left, and in a line what came out."""
+    """What a job came to, as its last file has it."""
 
-    files: list[str]
+    @property
+    def files(self) -> list[str]:
+        """The files that it left."""
 
     def outcome(self) -> str:
         """Say in a line what came out."""

@@ -9,7 +9,7 @@ import math
 import pickle
 import threading
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, Future, wait
 from dataclasses import dataclass, replace
 from functools import partial
@@ -155,7 +155,7 @@ def workers_of(executor: Executor) -> int:
 
 def fill_tiles(
     sent: PortableObjective, tiling: Tiling, pending: Sequence[Tile], batch: int, executor: Executor | None
-) -> Iterator[FilledTile]:
+) -> Generator[FilledTile, None, None]:
     """Evaluate the tiles that are pending, here or group by group on an executor's workers; yield each when it is done.
 
     What is not begun when that ends is cancelled.

@@ -215,13 +215,12 @@ class Refining:
         self.batch, self.counts = batch, Counter[Status]()
         self.objective, self.plane, self.store, self.refinement = objective, plane, store, refinement
         self.progress, self.seed = progress, seed
-        self.tree, self.kept = Quadtree(store.shape), _Samples(store.shape, plane.dim)
-        self.samples = _Samples(store.shape, plane.dim)
+        self.tree, self.samples = Quadtree(store.shape), _Samples(store.shape, plane.dim)
         self.axes = plane.axes()
         self.errors, self.tests, self.resumed = np.zeros(0), 0, 0
         if store.parts is not None:
-            self.kept.load(store.parts)
-            self.resumed = int(self.kept.sampled.sum())
+            self.samples.load(store.parts)
+            self.resumed = int(self.samples.sampled.sum())
 
     def go(self) -> None:
         """Sample until it is as fine as was asked for, or the budget is spent."""
@@ -233,7 +232,8 @@ class Refining:
 
     def dataset(self) -> xr.Dataset:
         """Return the slice."""
-        samples, inside = self.samples, self.tree.fill()
+        samples = self.samples
+        inside = np.where(samples.sampled, np.nan, self.tree.fill())
         dataset = samples.put_into(self.store.dataset())
         status = np.where(samples.sampled, samples.status, np.int8(Status.INTERPOLATED))
         known = np.sort(self.errors)
@@ -317,9 +317,7 @@ class Refining:
 
     def _evaluate(self, at: Places) -> None:
         """Evaluate points that are not kept, a batch at a time, and give the tree all of them."""
-        known = self.kept.sampled[tuple(at.T)]
-        self._adopt(at[known], self.kept)
-        new = at[np.logical_not(known)]
+        new = at[np.logical_not(self.samples.sampled[tuple(at.T)])]
         for start in range(0, len(new), self.batch):
             self._ask(new[start : start + self.batch])
         index = tuple(at.T)
@@ -339,10 +337,6 @@ class Refining:
         if self.store.parts is not None:
             self.store.parts.save("-".join(map(str, [POINTS, len(at), *at[0]])), at=at, **arrays)
         self._report()
-
-    def _adopt(self, at: Places, kept: _Samples) -> None:
-        index = tuple(at.T)
-        self.samples.take(at, kept.loss[index], kept.status[index], kept.grad[index])
 
     def _report(self) -> None:
         self.counts.clear()
