@@ -30,9 +30,8 @@ from ..landscapes.identity import gradient_stride, plane_of, stored_identity
 from ..landscapes.measures.profile import effort
 from ..landscapes.objective import Evaluation, Status, evaluate
 from ..landscapes.plane import Plane
-from ..landscapes.storage.arrays import FILES
-from ..landscapes.storage.files import has_lost_root, make_folder
-from ..landscapes.storage.paths import is_slice
+from ..landscapes.storage.files import make_folder
+from ..landscapes.storage.paths import has_lost_root, is_slice
 from ..landscapes.storage.records import read_json, write_record
 from ..landscapes.storage.store import SliceStore, open_slice
 from ..optim.registry import optimizer_class
@@ -195,7 +194,7 @@ class SlicePart(FigurePart):
     def state(self) -> State:
         """Look at the data without making an environment; who sampled it, and on what device, does not matter."""
         points, store = self.figure.resolution ** len(self.figure.dims), self.folder / STORE
-        if not is_slice(store) and not has_lost_root(store, FILES):
+        if not is_slice(store) and not has_lost_root(store):
             return State(points, 0)
         stored = SliceStore.open(store)
         same = _same(self.figure, stored.identity) and _through(stored.provenance) == self.figure.through

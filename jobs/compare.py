@@ -27,7 +27,7 @@ from ..landscapes.storage.records import read_json, reading
 from ..landscapes.storage.store import open_slice
 from .folder import COMPARISON, SLICE_STORE, folder_named
 from .job import Job
-from .slice import SliceJob, identity_of, slice_work
+from .slice import SliceJob, slice_work
 from .watch import Watch, Work
 
 if TYPE_CHECKING:
@@ -78,7 +78,7 @@ class CompareJob(Job[SliceComparison]):
             names = scaled_labels(other.space.names, other.space.scales)
             check_landscapes(parameters(ours), names, loss_unit(ours), other.loss_unit)
             check_finished(ours)
-            identity = {"a": slice.identity, "b": identity_of(other)}
+            identity = {"a": slice.identity, "b": other.identity()}
         named = [str(one.get("objective", "slice")) for one in identity.values()]
         folder = out or folder_named(["compare", *dict.fromkeys(named)], identity)
         COMPARISON.check(folder, allowed=[file for file in visible_files(folder) if slice_exists(file / SLICE_STORE)])

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, Protocol, TypeVar
 
 import torch
 
@@ -15,7 +15,7 @@ from ..landscapes.convert import to_json
 from ..landscapes.objective import Evaluation, Objective
 from ..landscapes.sampling.memory import free_memory
 from ..landscapes.storage.checkpoint import Checkpoint
-from ..landscapes.storage.files import holding, tidy
+from ..landscapes.storage.files import holding, tidy, write_json
 from ..landscapes.storage.records import write_record
 from ..landscapes.threads import one_torch_thread
 from ..landscapes.verification import POINTS, StoredPoints, verify
@@ -93,6 +93,35 @@ class Job(abc.ABC, Generic[Found]):
         path = self.folder / self.results.picture
         save(plot(), path)
         return save_prints(lambda width: plot(width=width), path, self.prints)
+
+
+class Summary(Protocol):
+    """What a job came to, as its last file has it."""
+
+    @property
+    def files(self) -> list[str]:
+        """The files that it left."""
+
+    def outcome(self) -> str:
+        """Say in a line what came out."""
+
+
+Summed = TypeVar("Summed", bound=Summary)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SummaryJob(Job[Summed]):
+    """A job that draws as it computes, and leaves a summary of what it came to."""
+
+    def write(self, found: Summed) -> list[str]:
+        """Write the summary."""
+        write_json(self.folder / self.results.files[-1], to_json(found))
+        tidy(self.folder)
+        return found.files
+
+    def outcome(self, found: Summed) -> str:
+        """Say in a line what came out."""
+        return found.outcome()
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,28 +8,29 @@ import json
 import math
 import shutil
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from ..landscapes.capacity import Need, require, size
 from ..landscapes.convert import NOT_JSON, from_json, to_json
 from ..landscapes.cost import duration, seconds_per_episode
-from ..landscapes.identity import MODEL_VERSION, stored_identity
+from ..landscapes.identity import MODEL_VERSION, plane_of, stored_identity
 from ..landscapes.measures.classify import QuotedWord
 from ..landscapes.measures.doubled_resolution import DoubledResolution
 from ..landscapes.measures.profile import Profile
-from ..landscapes.objective import BoxedObjective, Evaluation, ObjectiveWrapper
+from ..landscapes.objective import BoxedObjective, Evaluation, ObjectiveWrapper, evaluate
+from ..landscapes.plain import digest
 from ..landscapes.storage.files import is_full, make_folder, other_files, replacing, tidy, write_json
 from ..landscapes.storage.records import read_json, reading, write_record
 from ..landscapes.verification import RESAMPLE, verify_dataset
-from . import growth
 from .folder import REPORT, REPORTS, ROOT, SLICE_STORE, folder_named, store_in
 from .scene import environment_of
 from .watch import PREPARING, Watch, Work, resumable
@@ -41,12 +42,14 @@ if TYPE_CHECKING:
     from ..envs.base import Environment
     from ..landscapes.draw.figure import Picture
     from ..landscapes.measures.gradient_quality import ScaleRow
+    from ..landscapes.measures.lyapunov import GradientGrowth
     from ..landscapes.objective import Objective
     from ..landscapes.statistics import Estimate
 
 RECORD, MEASURES, PICTURE, ARRAYS = REPORT.files  # the arrays are what the picture is drawn from, but for the slice
 TABLE = REPORTS.files[1]
 POINTS = 6  # along each axis where gradients are tested by new evaluations
+HORIZONS, GROWTH_POINTS = (0.2, 0.4, 0.6, 0.8, 1.0), 16  # shares of the episode, and where gradients are compared
 RESOLUTION = 24  # points per axis of a slice that is sampled for its report
 HEADINGS = ("slice", "minima", "flat", "jumps", "cosine", "measured", "the paper's words", "measured too")
 ENVIRONMENTS = (
@@ -137,6 +140,7 @@ class ReportJob:
         be reported on, or where another report is there.
         """
         watch, done, failed = watch or Watch(), list[Report](), dict[str, str]()
+        watch.plan(self.work())
 
         def say_kept() -> str:
             return f"{len(done)} of {len(self.subjects)} reports are kept in {self._place(self.subjects[0]).parent}"
@@ -159,6 +163,17 @@ class ReportJob:
                     partial.write_text(slices_markdown(found.reports))
         return found
 
+    def work(self) -> Iterator[Work]:
+        """Yield what measuring each slice takes that has no report yet."""
+        known: dict[str, Environment] = {}
+        for subject in self.subjects:
+            dataset = _open(subject)
+            env = environment_of(dataset, self.device, self.env)
+            env = known.setdefault(digest(env.identity()), env)
+            key = ReportKey(self.points, self.seed, digest_of(dataset), env.version_on(env.engine))
+            if not any(_holds(folder, key) for folder in (self._place(subject), self._beside(subject)) if folder):
+                yield report_work(env, dataset["loss"].shape, self.points)
+
     def report(self, subject: ReportedSlice, watch: Watch) -> Report:
         """Return the report of a slice that is there, or else measure it now and leave it there."""
         folder = self._place(subject)
@@ -170,16 +185,17 @@ class ReportJob:
     def _place(self, subject: ReportedSlice) -> Path:
         return self.folder if self.single else self.folder / subject.name
 
-    def _find(self, subject: ReportedSlice, folder: Path, watch: Watch) -> Report:
-        """Return a report that is there, or beside its slice, or else measure it.
+    def _beside(self, subject: ReportedSlice) -> Path | None:
+        """Return the folder of a slice, whose report may be copied; not without what it is drawn from for print."""
+        folder = subject.store.parent
+        return folder if not self.prints or (folder / ARRAYS).exists() else None
 
-        One that is to be drawn for print is not taken from beside the slice without what it is drawn from.
-        """
+    def _find(self, subject: ReportedSlice, folder: Path, watch: Watch) -> Report:
+        """Return a report that is there, or next to its slice, or else measure it."""
         dataset = _open(subject)
         env = environment_of(dataset, self.device, self.env)
         key = ReportKey(self.points, self.seed, digest_of(dataset), env.version_on(env.engine))
-        beside = subject.store.parent
-        if not self.prints or (beside / ARRAYS).exists():
+        if (beside := self._beside(subject)) is not None:
             _fetch(beside, folder, key, watch)
         if (folder / RECORD).exists():
             return _keep(folder, key, env.device, watch)
@@ -196,7 +212,7 @@ class ReportJob:
         verify_dataset(env, dataset, subject.store, todo=RESAMPLE)
         start = time.monotonic()
         profile = measure(env, dataset, self.points, self.seed, watch)
-        profile = replace(profile, growth=growth.measure_growth_of(env, dataset, watch))
+        profile = replace(profile, growth=measure_growth_of(env, dataset, watch))
         report = Report(
             name=subject.name,
             env=env.name,
@@ -228,7 +244,7 @@ def report_work(env: Environment, shape: tuple[int, ...], points: int) -> Work:
     from ..landscapes.measures.profile import effort
 
     losses, gradients = effort(len(shape), points, shape)
-    return Work(env, losses, gradients + growth.effort(env))
+    return Work(env, losses, gradients + growth_effort(env))
 
 
 def measure(env: Environment, dataset: xr.Dataset, points: int, seed: int, watch: Watch) -> Profile:
@@ -236,7 +252,6 @@ def measure(env: Environment, dataset: xr.Dataset, points: int, seed: int, watch
     from ..landscapes.measures.profile import PRECISION, effort, measure_profile
 
     total = sum(effort(dataset["loss"].ndim, points, dataset["loss"].shape))
-    watch.plan([report_work(env, dataset["loss"].shape, points)])
     _announce(env, dataset, points, watch)
     objective = BoxedObjective(env) if stored_identity(dataset).get("boxed") else env
     with watch.progress(total) as advance:
@@ -323,6 +338,38 @@ def _warn(subject: ReportedSlice, dataset: xr.Dataset, env: Environment, watch: 
         watch.note(f"warning: {subject.name} was sampled otherwise ({said}), so losses may differ")
 
 
+def growth_effort(env: Environment) -> int:
+    """Return how many gradients of shorter and whole episodes `measure_growth_of` evaluates."""
+    return len(HORIZONS) * GROWTH_POINTS if env.horizon else 0
+
+
+def measure_growth_of(env: Environment, dataset: xr.Dataset, watch: Watch) -> GradientGrowth | None:
+    """Measure how gradients grow with the length of episodes at points of a slice.
+
+    None where no setting says how long episodes are. Where a scene draws none, time is in the unit of that setting.
+    """
+    from ..landscapes.measures.gradient_quality import subgrid
+    from ..landscapes.measures.lyapunov import measure_growth
+
+    if not env.horizon:
+        return None
+    time = env.horizon
+    with contextlib.suppress(ValueError):  # nothing to draw
+        time = float(env.episode(env.space.center).time[-1])
+    plane = plane_of(dataset)
+    x = plane.lift(subgrid(plane, math.isqrt(GROWTH_POINTS) if plane.rank == 2 else GROWTH_POINTS))
+    boxed = bool(stored_identity(dataset).get("boxed"))
+    width, norms = env.space.upper - env.space.lower, list[Tensor]()
+    with watch.progress(growth_effort(env), "gradients of shorter episodes") as advance:
+        for share in HORIZONS:
+            other = env.with_horizon(share * env.horizon)
+            found = evaluate(BoxedObjective(other) if boxed else other, x, grad=True)
+            assert found.grad is not None
+            norms.append((found.grad * width).norm(dim=1))
+            advance(len(norms) * len(x))
+    return measure_growth(time * np.array(HORIZONS), torch.stack(norms).numpy())
+
+
 def _compare_words(profile: Profile, said: Quoted | None) -> PaperWords | None:
     return None if said is None else PaperWords(profile.verdict.compare_words(said.words), said.where)
 
@@ -357,12 +404,16 @@ def digest_of(dataset: xr.Dataset) -> str:
     return hashlib.sha256(identity + dataset["loss"].to_numpy().tobytes()).hexdigest()[:12]
 
 
+def _holds(folder: Path, key: ReportKey) -> bool:
+    """Whether a folder holds this report."""
+    files = (folder / name for name in (PICTURE, MEASURES, RECORD))
+    return all(file.exists() for file in files) and not _differences(Report.read(folder / RECORD).key, key)
+
+
 def _fetch(source: Path, folder: Path, key: ReportKey, watch: Watch) -> None:
     """Copy the same report from beside its slice, where the gallery has it, rather than measure again."""
     files = [source / name for name in (PICTURE, MEASURES, RECORD)]
-    if (folder / RECORD).exists() or not all(file.exists() for file in files):
-        return
-    if not _differences(Report.read(source / RECORD).key, key):
+    if not (folder / RECORD).exists() and _holds(source, key):
         make_folder(folder)
         for file in [*files, *source.glob(ARRAYS)]:
             with replacing(folder / file.name) as partial:
@@ -512,8 +563,6 @@ class Report:
 
     def picture(self) -> Callable[..., Picture]:
         """Read what it is drawn from, and return what draws it, for any width. Raises ValueError as `plot` does."""
-        import numpy as np
-
         from ..landscapes.draw.figures.quality import quality_figure
         from ..landscapes.lattice import sampled_lattice
         from ..landscapes.measures.gradient_quality import GradientQuality, compare_samples

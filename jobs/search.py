@@ -9,12 +9,11 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..landscapes.convert import to_json
 from ..landscapes.cost import duration, episode_cost
 from ..landscapes.identity import METHOD_VERSION
 from ..landscapes.objective import FAILED, Objective, Status, describe_errors
 from ..landscapes.space import as_whole
-from ..landscapes.storage.files import check_free, clear, tidy, write_json
+from ..landscapes.storage.files import check_free, clear
 from ..landscapes.threads import one_torch_thread
 from ..optim.base import Kind
 from ..optim.memory import SearchSize, require_runs, run_need
@@ -23,7 +22,7 @@ from ..optim.runs.run import Run
 from ..optim.runs.store import RunStore
 from ..optim.search import SearchProgress, search
 from .folder import ROOT, RUN, SUMMARY, folder_named
-from .job import Job, filling
+from .job import SummaryJob, filling
 from .scene import provenance
 from .watch import PREPARING, Watch, Work
 
@@ -85,7 +84,7 @@ class SearchSummary:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SearchJob(Job[SearchSummary]):
+class SearchJob(SummaryJob[SearchSummary]):
     """A run to fill up to a budget."""
 
     results = RUN
@@ -135,16 +134,6 @@ class SearchJob(Job[SearchSummary]):
             watch.note(f"{self._place()}\nall {self.budget} episodes are there already")
         printed = self.draw(self.result().plot)
         return self._summary(resumed, time.monotonic() - start, [STORE, PICTURE, *printed, SUMMARY])
-
-    def write(self, found: SearchSummary) -> list[str]:
-        """Write the summary."""
-        write_json(self.folder / SUMMARY, to_json(found))
-        tidy(self.folder)
-        return found.files
-
-    def outcome(self, found: SearchSummary) -> str:
-        """Say in a line what the run cost and found."""
-        return found.outcome()
 
     def work(self) -> list[Work]:
         """Return the budget, with gradients if the method asks for them."""

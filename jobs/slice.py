@@ -9,7 +9,7 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import AbstractContextManager
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,27 +21,31 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..landscapes.capacity import peak_memory, size
-from ..landscapes.convert import to_json
 from ..landscapes.cost import duration, seconds_per_episode
 from ..landscapes.directions import barrier
 from ..landscapes.identity import plane_of, stored_identity, with_stride
 from ..landscapes.lattice import check_gradients, count_gradients
 from ..landscapes.measures.undersampled import Undersampled, find_undersampled, probes
 from ..landscapes.objective import BoxedObjective, Objective, Status, describe_errors, failed
-from ..landscapes.plain import digest, plain_name
+from ..landscapes.plain import plain_name
 from ..landscapes.plane import Plane
-from ..landscapes.sampling.distribution import TileWriter, WorkerTileWriter, evaluator, run_tasks, workers_of
+from ..landscapes.sampling.distribution import (
+    PortableObjective,
+    RemoteObjective,
+    evaluator,
+    run_tasks,
+    workers_of,
+)
 from ..landscapes.sampling.fill import Progress, sample
 from ..landscapes.sampling.memory import MemoryBound
 from ..landscapes.sampling.refine import Refined, Refinement, partly_refined, refine
 from ..landscapes.storage.arrays import Tile, need_of
-from ..landscapes.storage.checkpoint import Checkpoint
-from ..landscapes.storage.files import clear, tidy, write_json
+from ..landscapes.storage.files import clear
 from ..landscapes.storage.paths import is_slice, slice_exists
 from ..landscapes.storage.store import SliceStore
 from ..landscapes.verification import verify_dataset, verify_store
 from .folder import ROOT, SLICE, SUMMARY, folder_named
-from .job import Job
+from .job import SummaryJob
 from .scene import provenance
 from .watch import PREPARING, Watch, Work, resumable
 from .workers import recipe
@@ -49,7 +53,9 @@ from .workers import recipe
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-STORE, PICTURE, REFINING = SLICE.store, SLICE.picture, "slice.refining"
+    from ..landscapes.space import ParameterSpace
+
+STORE, PICTURE = SLICE.store, SLICE.picture
 MIN_PAUSE_SECONDS = 10.0  # between pictures of an unfinished slice
 MAX_DRAWING_SHARE = 0.1  # of the time, for pictures of an unfinished slice
 FIRST_PICTURE_SECONDS = 3.0  # no intermediate picture of slices that are faster than this
@@ -107,15 +113,11 @@ class SliceSummary:
 
 @dataclass(frozen=True)
 class SliceCost:
-    """Say what is left of a slice to compute: episodes, seconds they should take, bytes of memory.
-
-    `each` has the seconds of an episode with a gradient, True, and of one without, as far as there are such ones here.
-    """
+    """Say what is left of a slice to compute: episodes, seconds they should take, bytes of memory."""
 
     episodes: int
     seconds: float
     memory: int
-    each: Mapping[bool, float] = field(default_factory=dict)
 
     def less(self, done: int) -> SliceCost:
         """Return what is left where so many of the episodes are done."""
@@ -134,7 +136,7 @@ def slice_work(objective: Objective, shape: tuple[int, ...], every: int, *, betw
 
 
 @dataclass(frozen=True, kw_only=True)
-class SliceJob(Job[SliceSummary]):
+class SliceJob(SummaryJob[SliceSummary]):
     """A slice to sample, and how to draw it, here or by the workers of an `executor`, each with what `remake` returns.
 
     With a `refinement` it is sampled only where it has to be.
@@ -148,45 +150,6 @@ class SliceJob(Job[SliceSummary]):
     executor: Executor | None = None
     remake: Callable[[], Objective] | None = None
     refinement: Refinement | None = None
-
-    @classmethod
-    def open(
-        cls,
-        objective: Objective,
-        plane: Plane,
-        folder: Path,
-        draw: Draw,
-        *,
-        identity: Mapping[str, Any],
-        provenance: Mapping[str, Any],
-        command: str = "",
-        grad: bool = True,
-        force: bool = False,
-        executor: Executor | None = None,
-        remake: Callable[[], Objective] | None = None,
-        prints: Sequence[float] = (),
-        refinement: Refinement | None = None,
-    ) -> SliceJob:
-        """Go on with the slice in `folder`, or begin it there; `force` begins anew where another slice is.
-
-        Raises ValueError where the folder holds something else, StoreMismatchError where it holds another slice.
-        """
-        SLICE.check(folder)
-        path = folder / STORE
-        if refinement is not None:
-            refinement.check(plane)
-            identity = {**identity, "refinement": asdict(refinement)}
-        settings: dict[str, Any] = {"identity": identity, "provenance": provenance, "grad": grad}
-        if force and slice_exists(path):
-            store = SliceStore.create(path, plane, objective.space, overwrite=True, **settings)
-            clear(folder, (PICTURE, SUMMARY), PICTURE)
-            checkpoint_in(folder, store).remove()
-        else:
-            store = SliceStore.open_or_create(path, plane, objective.space, **settings)
-        return cls(
-            objective=objective, plane=plane, folder=folder, store=store, plot=draw, command=command,
-            executor=executor, remake=remake, prints=prints, refinement=refinement,
-        )  # fmt: skip
 
     @classmethod
     def of(
@@ -205,35 +168,30 @@ class SliceJob(Job[SliceSummary]):
         prints: Sequence[float] = (),
         refinement: Refinement | None = None,
     ) -> SliceJob:
-        """Open the slice of an environment, or of any objective, in `out`, by default a folder named after it.
-
-        That folder is under `root`.
+        """Continue the slice in `out`, by default a folder under `root` named after it, or begin it there.
 
         Losses are at all samples, gradients at every so many along each axis, `gradients`, 0 for none. `boxed` leaves
         out what lies beyond the parameters' bounds. With a `cut`, how it was cut along directions, it is boxed; of one
-        that was begun, `kept_plane` has the plane. With an `executor` its workers compute. Raises ValueError where
-        gradients cannot be so far apart, and as `open` does.
+        that was begun, `kept_plane` has the plane. With an `executor` its workers compute. `force` begins again where
+        another slice is. Raises ValueError where gradients cannot be so far apart and where the folder holds something
+        else, StoreMismatchError where it holds another slice.
         """
-        boxed = boxed or cut is not None
         gradients = check_gradients(gradients, plane, refined=refinement is not None)
-        identity = with_stride(identity_of(objective), gradients)
-        identity |= ({"boxed": True} if boxed else {}) | ({"cut": dict(cut)} if cut else {})
-        out = out or default_folder(identity, plane.resolution, plane, gradients > 0, root, refinement)
-        return cls.open(
-            BoxedObjective(objective) if boxed else objective,
-            plane,
-            out,
-            picture_of(objective, plane),
-            identity=identity,
-            provenance=provenance(objective, command),
-            command=command,
-            grad=gradients > 0,
-            force=force,
-            executor=executor,
-            remake=None if boxed else recipe(objective),
-            prints=prints,
-            refinement=refinement,
-        )
+        identity = _identity(objective, gradients, boxed=boxed, cut=cut)
+        folder = out or default_folder(identity, plane.resolution, plane, gradients > 0, root, refinement)
+        if refinement is not None:
+            refinement.check(plane)
+            identity["refinement"] = asdict(refinement)
+        store = _open_store(
+            folder, plane, objective.space, force=force,
+            identity=identity, provenance=provenance(objective, command), grad=gradients > 0,
+        )  # fmt: skip
+        boxed = "boxed" in identity
+        return cls(
+            objective=BoxedObjective(objective) if boxed else objective, remake=None if boxed else recipe(objective),
+            plane=plane, store=store, plot=picture_of(objective, plane), folder=folder, command=command,
+            executor=executor, prints=prints, refinement=refinement,
+        )  # fmt: skip
 
     def work(self) -> list[Work]:
         """Return its samples, and what looks between them."""
@@ -255,42 +213,28 @@ class SliceJob(Job[SliceSummary]):
         printed = self.draw(partial(self.plot, dataset))
         return self._summary(dataset, computed, time.monotonic() - start, [STORE, PICTURE, *printed, SUMMARY])
 
-    def write(self, found: SliceSummary) -> list[str]:
-        """Write the summary."""
-        write_json(self.folder / SUMMARY, to_json(found))
-        tidy(self.folder)
-        return found.files
-
     def holding(self, watch: Watch) -> AbstractContextManager[None]:
         """Leave the finest complete picture where it is stopped."""
         return resumable(self.kept, self.picture)
 
-    def outcome(self, found: SliceSummary) -> str:
-        """Say in a line what the slice cost and what came out."""
-        return found.outcome()
-
     def kept(self) -> str:
         """Say how much of it is on disk."""
-        status = self._so_far()["status"] if self.refinement else self.store.status()
+        status = partly_refined(self.store)["status"] if self.refinement else self.store.status()
         return f"{int((status > 0).sum())} of {status.size} points are kept in {self.folder}"
 
     def picture(self) -> None:
         """Draw the finest complete picture of the whole so far, if there is one."""
-        coarse = self._so_far() if self.refinement else self.store.coarse()
+        coarse = partly_refined(self.store) if self.refinement else self.store.coarse()
         if coarse is not None and bool((coarse["status"] != Status.MISSING).any()):
             from ..landscapes.draw.figures.page import save
 
             save(self.plot(coarse), self.folder / PICTURE)
 
-    def _so_far(self) -> xr.Dataset:
-        """Return what is sampled of a slice that is refined."""
-        return partly_refined(self.store, checkpoint_in(self.folder, self.store))
-
     def _verify(self, watch: Watch) -> None:
         """Evaluate a few stored points anew, before anything is added to them."""
         with watch.busy(f"{self.store.identity.get('objective')}: {PREPARING}"):
             if self.refinement and not self.store.ascending:
-                verify_dataset(self.objective, self._so_far(), self.folder)
+                verify_dataset(self.objective, partly_refined(self.store), self.folder)
             else:
                 verify_store(self.objective, self.store)
 
@@ -301,7 +245,7 @@ class SliceJob(Job[SliceSummary]):
         with watch.busy(f"{env}: {PREPARING}"):
             cost = self.cost()
             if self.refinement and cost.episodes:
-                cost = cost.less(int((self._so_far()["status"] > 0).sum()))
+                cost = cost.less(int((partly_refined(self.store)["status"] > 0).sum()))
         total, whole = math.prod(self.plane.resolution), self.store.grad and self.store.every == 1
         kind = kind_of(self.store)
         watch.note(" · ".join([env, str(about.get("fidelity")), str(about.get("device")), str(self.folder)]))
@@ -333,14 +277,13 @@ class SliceJob(Job[SliceSummary]):
 
             def conclude(dataset: xr.Dataset) -> dict[str, Any]:
                 advance(dataset["status"].size, "looking between them")
-                return look_between(evaluator(self.objective, self.store, self.executor, self.remake), dataset)
+                return look_between(evaluator(self.objective, self.executor, self.remake), dataset)
 
             how: dict[str, Any] = {"executor": self.executor, "made": self.remake}
             how |= {"progress": follow, "conclude": conclude}
             if self.refinement is None:
                 return sample(self.objective, self.plane, self.store, gradients=int(self.store.grad), **how), computed
-            how |= {"refinement": self.refinement, "checkpoint": checkpoint_in(self.folder, self.store)}
-            return refine(self.objective, self.plane, self.store, **how), computed
+            return refine(self.objective, self.plane, self.store, self.refinement, **how), computed
 
     def _summary(self, dataset: xr.Dataset, computed: int, seconds: float, files: list[str]) -> SliceSummary:
         identity, status = self.store.identity, dataset["status"].to_numpy()
@@ -368,6 +311,22 @@ class SliceJob(Job[SliceSummary]):
         )
 
 
+def _identity(objective: Objective, gradients: int, *, boxed: bool, cut: Mapping[str, Any] | None) -> dict[str, Any]:
+    """Return what decides a slice's numbers, but for its plane; one that was cut along directions is boxed."""
+    about = ({"boxed": True} if boxed or cut is not None else {}) | ({"cut": dict(cut)} if cut else {})
+    return with_stride(objective.identity(), gradients) | about
+
+
+def _open_store(folder: Path, plane: Plane, space: ParameterSpace, *, force: bool, **settings: Any) -> SliceStore:
+    """Continue the slice in a folder, or begin it there; `force` begins again where another one is."""
+    SLICE.check(folder)
+    if not (force and slice_exists(folder / STORE)):
+        return SliceStore.open_or_create(folder / STORE, plane, space, **settings)
+    store = SliceStore.create(folder / STORE, plane, space, overwrite=True, **settings)
+    clear(folder, (PICTURE, SUMMARY), PICTURE)
+    return store
+
+
 def kind_of(store: SliceStore) -> str:
     """Say what is computed for a slice: episodes, and at which samples with gradients."""
     if store.every > 1:
@@ -392,11 +351,6 @@ def picture_of(objective: Objective, plane: Plane) -> Draw:
     return surface if plane.rank == 2 else profile
 
 
-def checkpoint_in(folder: Path, store: SliceStore) -> Checkpoint:
-    """Return what is kept of a slice in a folder while it is refined."""
-    return Checkpoint(folder / REFINING, digest(store.identity))
-
-
 def _gpu_memory(objective: Objective) -> str:
     if objective.device != "cuda":
         return ""
@@ -414,34 +368,38 @@ def estimate_cost(
     executor: Executor | None = None,
     remake: Callable[[], Objective] | None = None,
 ) -> SliceCost:
-    """Estimate what is left of a slice, here or, with an `executor`, on its workers."""
-    if executor is None:
-        return cost_of(objective, store)
-    writer = TileWriter(MemoryBound(objective), store, remake)
-    costs = list(run_tasks(executor, _cost_there, [(writer,)] * workers_of(executor)))
-    shares = [1 / cost.seconds for cost in costs if cost.seconds]
-    return replace(costs[0], seconds=1 / sum(shares) if shares else 0.0)
+    """Estimate what is left of a slice from its own first points, evaluated as they will be; that takes seconds.
 
-
-def cost_of(objective: Objective, store: SliceStore) -> SliceCost:
-    """Estimate what is left of a slice from its own first points, evaluated as they will be; that takes seconds."""
-    pending = store.pending()
-    left = sum(store.count(tile) for tile in pending)
+    With an `executor` its workers evaluate them.
+    """
+    tiling, pending = store.tiling, store.pending()
+    left = sum(map(tiling.count, pending))
     if not left:
         return SliceCost(0, 0.0, peak_memory())
-    objective.prepare()
     batch = first_points(store, pending, objective.preferred_batch)
-    sloped = sum(int(store.sloped(tile).sum()) for tile in pending)
-    counts = {True: sloped, False: left - sloped}
-    each = {grad: seconds_per_episode(objective, batch, grad=grad, count=n) for grad, n in counts.items() if n}
-    seconds = sum(counts[grad] * one for grad, one in each.items())
+    sloped = sum(int(tiling.sloped(tile).sum()) for tile in pending)
+    counts = {grad: count for grad, count in ((True, sloped), (False, left - sloped)) if count}
+    if executor is None:
+        timed = [_time(objective, batch, counts)]
+    else:
+        sent = PortableObjective(MemoryBound(objective), remake)
+        timed = list(run_tasks(executor, _time_there, [(sent, batch, counts)] * workers_of(executor)))
+    shares = [1 / seconds for seconds, _ in timed if seconds]
     arrays = need_of(store.shape, store.plane.dim, grad=store.grad)
-    return SliceCost(left, seconds, peak_memory() + round(arrays.memory), each)
+    return SliceCost(left, 1 / sum(shares) if shares else 0.0, timed[0][1] + round(arrays.memory))
 
 
-def _cost_there(writer: TileWriter | WorkerTileWriter) -> SliceCost:
-    here = writer.here()
-    return cost_of(here.objective.objective, here.store)
+def _time(objective: Objective, batch: Float[Tensor, "point dim"], counts: Mapping[bool, int]) -> tuple[float, int]:
+    """Return what so many episodes with a gradient, True, and without take [s], and this process's memory [bytes]."""
+    objective.prepare()
+    each = {grad: seconds_per_episode(objective, batch, grad=grad, count=n) for grad, n in counts.items()}
+    return sum(counts[grad] * one for grad, one in each.items()), peak_memory()
+
+
+def _time_there(
+    sent: PortableObjective | RemoteObjective, batch: Float[Tensor, "point dim"], counts: Mapping[bool, int]
+) -> tuple[float, int]:
+    return _time(sent.here().objective, batch, counts)
 
 
 def first_points(store: SliceStore, tiles: Sequence[Tile], count: int) -> Float[Tensor, "point dim"]:
@@ -494,7 +452,7 @@ def kept_plane(
 
     It goes on along these: others may come out a little different each time, on a GPU, and some take many episodes.
     """
-    identity = with_stride(identity_of(objective), gradients) | {"boxed": True, "cut": dict(cut)}
+    identity = _identity(objective, gradients, boxed=True, cut=cut)
     path = (out or default_folder(identity, resolution, None, gradients > 0, root, refinement)) / STORE
     if not is_slice(path):
         return None
@@ -502,11 +460,6 @@ def kept_plane(
     same = all(kept.get(name) == json.loads(json.dumps(value)) for name, value in identity.items())
     found = Plane.from_record(kept["plane"])
     return found if same and found.resolution == resolution else None
-
-
-def identity_of(objective: Objective) -> dict[str, Any]:
-    """Return what decides an objective's numbers, as far as it says: an environment all, any other its name."""
-    return objective.identity()
 
 
 def look_between(objective: Objective, dataset: xr.Dataset) -> dict[str, Any]:

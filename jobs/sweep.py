@@ -18,7 +18,6 @@ import numpy as np
 import xarray as xr
 
 from ..landscapes.capacity import BLOCK, Need, require, size
-from ..landscapes.convert import to_json
 from ..landscapes.cost import duration
 from ..landscapes.identity import with_stride
 from ..landscapes.lattice import check_gradients
@@ -26,11 +25,11 @@ from ..landscapes.objective import BoxedObjective, Objective, failed
 from ..landscapes.plain import plain_name
 from ..landscapes.sampling.fill import Progress, sample
 from ..landscapes.storage.arrays import need_of as slice_need
-from ..landscapes.storage.files import discard, refuse_others, tidy, visible_files, write_json
+from ..landscapes.storage.files import discard, refuse_others, visible_files
 from ..landscapes.storage.paths import check_replaceable, filling_path, slice_exists
 from ..landscapes.storage.store import SliceStore
 from .folder import ROOT, SWEEP, folder_named
-from .job import Job
+from .job import SummaryJob
 from .scene import provenance
 from .slice import (
     MAX_NAME_LETTERS,
@@ -54,7 +53,7 @@ if TYPE_CHECKING:
     from ..landscapes.plane import Plane
 
 FRAMES, ONLY, FILM, GIF, STREAM, SUMMARY = SWEEP.files
-FRAME = re.compile(r"\d{3,}(?:\.filling)?\.zarr")  # what the folder of a sweep's slices holds
+FRAME = re.compile(r"\d{3,}\.(?:filling|zarr)")  # what the folder of a sweep's slices holds
 SMOOTHING = "smoothing"
 MAX_SMOOTHING = 0.25  # the widest Gaussian's standard deviation, as a fraction of the box's sides
 PARALLEL_TOLERANCE = 1e-9  # of a parameter's unit: as near as rounding lets a point on a plane be to it
@@ -110,7 +109,7 @@ class SweepSummary:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SweepJob(Job[SweepSummary]):
+class SweepJob(SummaryJob[SweepSummary]):
     """A sweep to sample slice by slice, here or by the workers of an `executor`, and to film.
 
     A `boxed` one leaves out what lies outside the parameters' bounds.
@@ -122,36 +121,6 @@ class SweepJob(Job[SweepSummary]):
     stores: tuple[SliceStore, ...]
     executor: Executor | None = None
     boxed: bool = False
-
-    @classmethod
-    def open(
-        cls,
-        env: Environment,
-        motion: Motion,
-        folder: Path,
-        *,
-        command: str,
-        gradients: int = 1,
-        force: bool = False,
-        cut: Mapping[str, Any] | None = None,
-    ) -> SweepJob:
-        """Go on with the sweep in `folder`, or begin it there; `force` begins anew where another one is.
-
-        Gradients are at every so many samples along each axis, `gradients`, 0 for none. With a `cut`, how it was cut
-        along directions, it is boxed. Raises ValueError where the folder holds something else, StoreMismatchError where
-        it holds another sweep.
-        """
-        check_folder(folder)
-        if force:
-            _clear(folder)
-        how: dict[str, Any] = {"grad": gradients > 0, "provenance": provenance(env, command)}
-        oblique: dict[str, Any] = {"boxed": True, "cut": dict(cut)} if cut else {}
-        made = [with_stride(motion.env_at(number).identity(), gradients) for number in range(len(motion.stores))]
-        stores = tuple(
-            SliceStore.open_or_create(folder / name, plane, env.space, identity=identity | oblique, **how)
-            for name, plane, identity in zip(motion.stores, motion.planes, made, strict=True)
-        )
-        return cls(env=env, motion=motion, folder=folder, stores=stores, command=command, boxed=bool(cut))
 
     @classmethod
     def of(
@@ -167,11 +136,13 @@ class SweepJob(Job[SweepSummary]):
         force: bool = False,
         cut: Mapping[str, Any] | None = None,
     ) -> SweepJob:
-        """Open the sweep of an environment in `out`, by default a folder named after it under out/.
+        """Continue the sweep of an environment in `out`, by default a folder named after it, or begin it there.
 
-        Of smoothed losses there are no gradients. With a `cut` it is boxed, and one that was begun goes on along its
-        own directions: on a GPU they come out a little different each time. Raises ValueError for what cannot be swept
-        and where gradients cannot be so far apart, TooLargeError for what has no room here, and as `open` does.
+        Gradients are at every so many samples along each axis, `gradients`, 0 for none; of smoothed losses there are
+        none. With a `cut`, how it was cut along directions, it is boxed, and one that was begun continues along its own
+        directions: on a GPU they come out a little different each time. `force` begins again where another sweep is.
+        Raises ValueError for what cannot be swept, where gradients cannot be so far apart and where the folder holds
+        something else, StoreMismatchError where it holds another sweep, and TooLargeError for what has no room here.
         """
         if plane.rank != 2 or frames < 2:
             dims = ", ".join(plane.names)
@@ -181,9 +152,20 @@ class SweepJob(Job[SweepSummary]):
         refuse_too_large(plane, frames, out or ROOT, grad=gradients > 0, over=over)
         motion = Motion.of(env, plane, over, frames)
         folder = out or sweep_folder(env, motion, over, gradients=gradients, cut=cut)
-        if cut and not force:
+        check_folder(folder)
+        if force:
+            _clear(folder)
+        elif cut:
             motion = Motion.of(env, _along_kept(folder / motion.stores[0], plane, cut), over, frames)
-        return cls.open(env, motion, folder, command=command, gradients=gradients, force=force, cut=cut)
+        about = provenance(env, command)
+        identities = (_identity(motion.env_at(number), gradients, cut) for number in range(len(motion.stores)))
+        stores = tuple(
+            SliceStore.open_or_create(
+                folder / name, plane, env.space, identity=identity, provenance=about, grad=gradients > 0
+            )
+            for name, plane, identity in zip(motion.stores, motion.planes, identities, strict=True)
+        )
+        return cls(env=env, motion=motion, folder=folder, stores=stores, command=command, boxed=bool(cut))
 
     @cached_property
     def total(self) -> int:
@@ -219,16 +201,6 @@ class SweepJob(Job[SweepSummary]):
         with watch.busy("drawing"):
             self._film(drawn)
         return self._summary(drawn, resumed, time.monotonic() - start)
-
-    def write(self, found: SweepSummary) -> list[str]:
-        """Write the summary."""
-        write_json(self.folder / SUMMARY, to_json(found))
-        tidy(self.folder)
-        return found.files
-
-    def outcome(self, found: SweepSummary) -> str:
-        """Say in a line what the sweep cost and what came out."""
-        return found.outcome()
 
     def sample(self, watch: Watch | None = None) -> Sweep:
         """Sample what is missing, and return what there is to draw.
@@ -325,6 +297,10 @@ class _Count:
         self.number += 1
         self.finished += dataset["status"].size
         self.failed += int(failed(dataset["status"]).sum())
+
+
+def _identity(env: Environment, gradients: int, cut: Mapping[str, Any] | None) -> dict[str, Any]:
+    return with_stride(env.identity(), gradients) | ({"boxed": True, "cut": dict(cut)} if cut else {})
 
 
 def sweep_folder(

@@ -37,16 +37,20 @@ JOBS = {
 }
 
 
-INSTANTS = {"pairs": [Instant(1), Instant(1, "moved-0"), Instant(1, "crossed-0"), Instant(1, "pairs.json")]}
+INSTANTS = {
+    "pairs": [Instant(1), Instant(1, "moved-0"), Instant(1, "crossed-0"), Instant(1, "pairs.json")],
+    "race": [Instant(1), Instant(4, "loss/c"), Instant(5, "status/c"), Instant(1, "race.png")],
+    "league": [Instant(1), Instant(4, "loss/c"), Instant(5, "status/c"), Instant(1, "league.json")],
+}
 
 
 @pytest.mark.parametrize(
     "job", [one if one in ("slice", "optimize") else pytest.param(one, marks=pytest.mark.nightly) for one in JOBS]
 )
 def test_four_kills_change_no_bit(job: str, tmp_path: Path) -> None:
-    """One before anything is there, one before a tile's losses, one before a status, one when all values are there."""
+    """One before anything is there, two in the middle of a tile or of columns, one when all values are there."""
     command, last = JOBS[job]
-    four = INSTANTS.get(job, [Instant(1), Instant(4, "loss/c"), Instant(5, "status/c"), Instant(1, last)])
+    four = INSTANTS.get(job, [Instant(1), Instant(9, "pieces"), Instant(12, "pieces"), Instant(1, last)])
     work, killed, whole = partial(landscape, *command.split()), tmp_path / "killed", tmp_path / "whole"
     for folder in (killed, whole):
         folder.mkdir()
@@ -60,23 +64,24 @@ def test_four_kills_change_no_bit(job: str, tmp_path: Path) -> None:
     assert not [path for path in killed.rglob(".*") if path.suffix in (".making", ".partial")]
 
 
-STOPPED = {  # the command and the instant of Ctrl-C, and how many points or episodes it has in all
-    "slice": ("slice bounce --dims 0 1 --resolution 16 --fidelity standard --out made", 9, 256),
-    "sweep": ("sweep bounce --dims 0 1 --over 2 --frames 4 --resolution 8 --device cpu --out made", 20, 256),
-    "optimize": ("optimize rastrigin --set dim=5 --method cma-es --budget 70 --out made", 9, 70),
+STOPPED = {  # the command, the instant of Ctrl-C, and how many points or episodes it has in all
+    "slice": ("slice bounce --dims 0 1 --resolution 16 --fidelity standard --out made", Instant(9, "pieces", SIGINT), 256),
+    "sweep": ("sweep bounce --dims 0 1 --over 2 --frames 4 --resolution 8 --device cpu --out made", Instant(40, "pieces", SIGINT), 256),
+    "optimize": ("optimize rastrigin --set dim=5 --method cma-es --budget 70 --out made", Instant(9, "status/c", SIGINT), 70),
     "race": (
-        "race bounce --methods random,descents --fidelity draft --budget 40 --seeds 2 --workers 2 --out made", 9, 160,
+        "race bounce --methods random,descents --fidelity draft --budget 40 --seeds 2 --workers 2 --out made",
+        Instant(9, "status/c", SIGINT), 160,
     ),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("job", STOPPED)
 def test_ctrl_c_says_what_is_kept_and_how_to_go_on_and_changes_no_bit(job: str, tmp_path: Path) -> None:
-    command, change, count = STOPPED[job]
+    command, instant, count = STOPPED[job]
     work, stopped, whole = partial(landscape, *command.split(), "--json"), tmp_path / "stopped", tmp_path / "whole"
     for folder in (stopped, whole):
         folder.mkdir()
-    done = alone(work, stopped, Instant(change, "status/c", SIGINT))
+    done = alone(work, stopped, instant)
     assert (done.returncode, done.stdout) == (130, "")
     assert "Traceback" not in done.stderr
     assert f"the same command continues from there: landscape {command}" in done.stderr

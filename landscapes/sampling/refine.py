@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from ..identity import DamagedError, check_identity, record_parameters
 from ..objective import Objective, Status, evaluate
 from ..plane import Plane
+from ..storage.arrays import POINTS
 from ..storage.checkpoint import Checkpoint
 from ..storage.store import SliceStore
 from .distribution import evaluator, workers_of
@@ -122,7 +123,6 @@ def refine(
     store: SliceStore,
     refinement: Refinement,
     *,
-    checkpoint: Checkpoint | None = None,
     progress: Callable[[Progress], None] | None = None,
     executor: Executor | None = None,
     made: Callable[[], Objective] | None = None,
@@ -132,8 +132,8 @@ def refine(
     """Evaluate an objective where a slice needs it, and return the slice; the other points are INTERPOLATED.
 
     Their losses are NaN, and what is interpolated is the variable of its own, `interpolated`. Samples are the same bits
-    as in a slice that is sampled everywhere. What `checkpoint` holds is not evaluated again; it is removed at the end.
-    `progress`, `executor`, `made` and `conclude` are those of `sample`.
+    as in a slice that is sampled everywhere. What `store` holds already is not evaluated again. `progress`, `executor`,
+    `made` and `conclude` are those of `sample`.
 
     Raises StoreMismatchError where the store was made by other settings, ValueError for a budget that does not cover
     the coarsest lattice, DamagedError where a finished one is damaged, and what `sample` does.
@@ -148,26 +148,22 @@ def refine(
     else:
         batch = max(LEAST_BATCH, objective.preferred_batch)
         batch *= workers_of(executor) if executor else 1
-        run = Refining(
-            evaluator(objective, store, executor, made), batch, plane, store, refinement, checkpoint, progress, seed
-        )
+        run = Refining(evaluator(objective, executor, made), batch, plane, store, refinement, progress, seed)
         with resumable(store, run.counts):
             run.go()
         dataset = run.dataset()
         if conclude is not None:
             dataset = dataset.assign_attrs(conclude(dataset))
         store.finish(dataset)
-    if checkpoint is not None:
-        checkpoint.remove()
     return dataset
 
 
-def partly_refined(store: SliceStore, checkpoint: Checkpoint) -> xr.Dataset:
+def partly_refined(store: SliceStore) -> xr.Dataset:
     """Return what is sampled of a slice so far."""
     samples, empty = _Samples(store.shape, store.plane.dim), store.dataset()
-    if store.ascending:
+    if store.parts is None:
         return empty
-    samples.load(checkpoint)
+    samples.load(store.parts)
     return samples.put_into(empty)
 
 
@@ -213,20 +209,18 @@ class Refining:
         plane: Plane,
         store: SliceStore,
         refinement: Refinement,
-        checkpoint: Checkpoint | None,
         progress: Callable[[Progress], None] | None,
         seed: int,
     ) -> None:
         self.batch, self.counts = batch, Counter[Status]()
         self.objective, self.plane, self.store, self.refinement = objective, plane, store, refinement
-        self.checkpoint, self.progress, self.seed = checkpoint, progress, seed
-        self.tree, self.kept = Quadtree(store.shape), _Samples(store.shape, plane.dim)
-        self.samples = _Samples(store.shape, plane.dim)
+        self.progress, self.seed = progress, seed
+        self.tree, self.samples = Quadtree(store.shape), _Samples(store.shape, plane.dim)
         self.axes = plane.axes()
         self.errors, self.tests, self.resumed = np.zeros(0), 0, 0
-        if checkpoint is not None:
-            self.kept.load(checkpoint)
-            self.resumed = int(self.kept.sampled.sum())
+        if store.parts is not None:
+            self.samples.load(store.parts)
+            self.resumed = int(self.samples.sampled.sum())
 
     def go(self) -> None:
         """Sample until it is as fine as was asked for, or the budget is spent."""
@@ -236,13 +230,10 @@ class Refining:
             if not self._refine_to(share):
                 return
 
-    def take_all(self) -> None:
-        """Sample the whole grid."""
-        self._evaluate(np.argwhere(np.ones(self.tree.shape, bool)))
-
     def dataset(self) -> xr.Dataset:
         """Return the slice."""
-        samples, inside = self.samples, self.tree.fill()
+        samples = self.samples
+        inside = np.where(samples.sampled, np.nan, self.tree.fill())
         dataset = samples.put_into(self.store.dataset())
         status = np.where(samples.sampled, samples.status, np.int8(Status.INTERPOLATED))
         known = np.sort(self.errors)
@@ -326,9 +317,7 @@ class Refining:
 
     def _evaluate(self, at: Places) -> None:
         """Evaluate points that are not kept, a batch at a time, and give the tree all of them."""
-        known = self.kept.sampled[tuple(at.T)]
-        self._adopt(at[known], self.kept)
-        new = at[np.logical_not(known)]
+        new = at[np.logical_not(self.samples.sampled[tuple(at.T)])]
         for start in range(0, len(new), self.batch):
             self._ask(new[start : start + self.batch])
         index = tuple(at.T)
@@ -345,13 +334,9 @@ class Refining:
             arrays["grad"] = found.grad.numpy()
         self.samples.take(at, arrays["loss"], arrays["status"], arrays.get("grad"))
         self.store.keep_error(found.error)
-        if self.checkpoint is not None:
-            self.checkpoint.save("-".join(map(str, [len(at), *at[0]])), at=at, **arrays)
+        if self.store.parts is not None:
+            self.store.parts.save("-".join(map(str, [POINTS, len(at), *at[0]])), at=at, **arrays)
         self._report()
-
-    def _adopt(self, at: Places, kept: _Samples) -> None:
-        index = tuple(at.T)
-        self.samples.take(at, kept.loss[index], kept.status[index], kept.grad[index])
 
     def _report(self) -> None:
         self.counts.clear()

@@ -4,47 +4,50 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import threading
 import warnings
 import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import cached_property
 from heapq import heappop, heappush
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import torch
 import xarray as xr
 import zarr
+from jaxtyping import Float
 from numpy.typing import NDArray
+from torch import Tensor
 from zarr.codecs import BloscCodec, Crc32cCodec, ZstdCodec
 
 from ..capacity import BLOCK, Need, require
-from ..identity import BOUNDS, PACKAGE, VERSIONS, DamagedError, with_package
+from ..identity import ERROR, PACKAGE, VERSIONS, DamagedError, current_identity, current_provenance
 from ..objective import Status
 from ..plane import Plane
-from ..space import LOG10, ParameterSpace
+from ..space import LOG10
+from .checkpoint import PARTS
 from .files import store_files
+from .paths import HEADER
 
 FORMAT = 2
+MARK = "gradscape_slice"  # the attribute that says that something is a slice, and of which format
 AXES = ("u", "v")
+SAMPLES = ("loss", "grad", "status")  # the arrays of what was evaluated
 CF = "CF-1.11"
 SUMS = "checksum"
 INTERPOLATED = "interpolated"  # the array of a refined slice that has what was not sampled
-FILES = store_files(("loss", "grad", "status", INTERPOLATED, SUMS, *AXES, "dim", "unit"))  # of a slice on disk
+FILES = store_files((*SAMPLES, INTERPOLATED, SUMS, *AXES, "dim", "unit"))  # of a finished slice
+POINTS = "points"  # what names of files begin with that hold points of a slice that is refined
+FILLING_FILES = re.compile(rf"{HEADER}|{PARTS}/(?:{POINTS}-)?\d+(?:-\d+)*\.npz").fullmatch  # of one that is filled
 DRAWN = 150  # bytes that a picture takes for each sample
 COORDINATES = {"coordinates": "unit"}  # tells xarray that it is no variable
-
-
-def axes_of(plane: Plane, parameters: list[str], units: list[str], *, ascending: bool) -> dict[str, NDArray[Any]]:
-    """Return the coordinates of a slice in stored order: ascending, or coarse to fine while tiles are being filled."""
-    found: dict[str, NDArray[Any]] = {}
-    for name, axis in zip(AXES, plane.axes(), strict=False):
-        values = axis.numpy()
-        found[name] = values if ascending else values[coarse_to_fine(len(values), tile_side(len(values)))]
-    return found | {"dim": np.array(parameters, dtype=object), "unit": np.array(units, dtype=object)}
+Arrays = dict[str, NDArray[Any]]  # loss, status and, unless sampled without gradients, grad
 
 
 def need_of(shape: tuple[int, ...], dim: int, *, grad: bool) -> Need:
@@ -72,36 +75,30 @@ def refuse_too_large(plane: Plane, path: Path | None, *, grad: bool) -> None:
     require("resolution", most, need, path)
 
 
-def lay_out(
-    group: zarr.Group,
-    plane: Plane,
-    space: ParameterSpace,
-    identity: Mapping[str, Any],
-    provenance: Mapping[str, Any],
-    *,
-    grad: bool,
-) -> None:
-    """Make the empty arrays of a slice that is to be filled tile by tile."""
-    axes = axes_of(plane, list(space.names), list(space.units), ascending=False)
-    names = AXES[: plane.rank][::-1]
-    shape = tuple(len(axes[name]) for name in names)
-    side = tuple(tile_side(points) for points in shape)
-    bounds = [space.to_values(bound).tolist() for bound in (space.lower, space.upper)]
-    group.attrs.update({**_about(identity, {**with_package(provenance), BOUNDS: bounds}), **COORDINATES})
-    unit = str(provenance.get("loss_unit", ""))
-    create_array(group, "loss", shape, side, names, "float64", long_name="loss", **({"units": unit} if unit else {}))
-    if grad:
+def blank(
+    identity: Mapping[str, Any], provenance: Mapping[str, Any], units: Sequence[str], *, error: str = ""
+) -> xr.Dataset:
+    """Return a slice of which nothing is sampled yet; its arrays take no memory, and cannot be written to."""
+    plane, parameters = Plane.from_record(identity["plane"]), identity["parameters"]
+    names, shape, unit = AXES[: plane.rank][::-1], plane.resolution[::-1], str(provenance.get("loss_unit", ""))
+    arrays: dict[str, Any] = {"loss": (names, _nothing("float64", shape), {"long_name": "loss"})}
+    arrays["loss"][2].update({"units": unit} if unit else {})
+    if identity["gradients"]:
         said = "gradient of the loss by each parameter, in the loss's unit per the parameter's"
-        deep = (*shape, space.dim), (*side, space.dim), (*names, "dim")
-        create_array(group, "grad", *deep, "float64", long_name=said)
-    create_array(group, "status", shape, side, names, "int8", long_name="how the evaluation ended", **flags(Status))
-    tiles = tuple(math.ceil(points / one) for points, one in zip(shape, side, strict=True))
-    lay_out_sums(group, tiles, (1,) * len(tiles), names)
-    for number, name in enumerate(AXES[: plane.rank]):
-        _keep(group, name, axes[name], (name,), _axis(plane, number))
-    _keep(group, "dim", axes["dim"], ("dim",), {"long_name": "parameter"})
-    about = {"long_name": "unit of the parameter", "checksum": text_sum(axes["unit"])}  # nothing else says them
-    _keep(group, "unit", axes["unit"], ("dim",), about)
+        arrays["grad"] = ((*names, "dim"), _nothing("float64", (*shape, len(parameters))), {"long_name": said})
+    arrays["status"] = (names, _nothing("int8", shape), {"long_name": "how the evaluation ended", **flags(Status)})
+    axes: dict[str, Any] = {
+        name: (name, axis.numpy(), _axis(plane, number))
+        for number, (name, axis) in enumerate(zip(AXES, plane.axes(), strict=False))
+    }
+    axes["dim"] = ("dim", np.array(parameters, object), {"long_name": "parameter"})
+    about = {"long_name": "unit of the parameter", "checksum": text_sum(units)}  # nothing else says them
+    axes["unit"] = ("dim", np.array(units, object), about)
+    return xr.Dataset(arrays, axes, _about(identity, provenance) | ({ERROR: error} if error else {}))
+
+
+def _nothing(dtype: str, shape: tuple[int, ...]) -> NDArray[Any]:
+    return np.broadcast_to(np.array(FILL[dtype], dtype), shape)
 
 
 def write_finished(path: Path, dataset: xr.Dataset) -> None:
@@ -155,7 +152,7 @@ def _about(identity: Mapping[str, Any], provenance: Mapping[str, Any]) -> dict[s
     over = " and ".join(label.partition(" [")[0] for label in identity["plane"]["labels"])
     made = " ".join(str(provenance[name]) for name in ("created", "command") if provenance.get(name))
     return {
-        "gradscape_slice": FORMAT,
+        MARK: FORMAT,
         "Conventions": CF,
         "title": f"{identity.get('objective', 'loss')} over {over}",
         "source": f"{PACKAGE} {provenance[VERSIONS][PACKAGE]}",
@@ -228,10 +225,76 @@ class Tile:
 
     index: tuple[int, ...]
 
+    @classmethod
+    def named(cls, name: str) -> Tile | None:
+        """Return the tile of this name, None where it is no tile's."""
+        return cls(tuple(map(int, name.split("-")))) if re.fullmatch(r"\d+(-\d+)?", name) else None
+
+    @property
+    def name(self) -> str:
+        """What the file of its samples is called."""
+        return "-".join(map(str, self.index))
+
     @property
     def level(self) -> int:
         """Which square of tiles this one helps to complete: 0 is the first, coarsest picture."""
         return max(self.index)
+
+
+@dataclass(frozen=True)
+class Tiling:
+    """Say which samples of a slice are in which tile: coarse to fine, or the chunks of a finished slice.
+
+    Gradients are at every so many samples along each axis, `every`, 0 for none. `chunks` are the sides of the chunks.
+    """
+
+    plane: Plane
+    every: int
+    chunks: tuple[int, ...] = ()
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Points per axis, in array order."""
+        return tuple(self.plane.resolution[::-1])
+
+    @cached_property
+    def sides(self) -> tuple[int, ...]:
+        """Points of a tile along each axis."""
+        return self.chunks or tuple(map(tile_side, self.shape))
+
+    @cached_property
+    def order(self) -> list[NDArray[np.intp]]:
+        """The samples along each axis in the order in which tiles take them."""
+        pairs = zip(self.shape, self.sides, strict=True)
+        return [np.arange(n) if self.chunks else np.array(coarse_to_fine(n, side)) for n, side in pairs]
+
+    def tiles(self) -> list[Tile]:
+        """Return every tile, coarse to fine."""
+        counts = (math.ceil(points / side) for points, side in zip(self.shape, self.sides, strict=True))
+        return sorted(map(Tile, np.ndindex(*counts)), key=lambda tile: (tile.level, sum(tile.index), tile.index))
+
+    def rows(self, tile: Tile) -> list[NDArray[np.intp]]:
+        """Return the places of a tile's samples along each axis."""
+        parts = zip(tile.index, self.order, self.sides, strict=True)
+        return [order[at * side : (at + 1) * side] for at, order, side in parts]
+
+    def count(self, tile: Tile) -> int:
+        """Return how many points a tile has."""
+        return math.prod(map(len, self.rows(tile)))
+
+    def sloped(self, tile: Tile) -> NDArray[np.bool_]:
+        """Return which points of a tile have a gradient, in the order of `points`, shape (points,)."""
+        if not self.every:
+            return np.zeros(self.count(tile), bool)
+        having = np.meshgrid(*(rows % self.every == 0 for rows in self.rows(tile)), indexing="ij")
+        found: NDArray[np.bool_] = np.logical_and.reduce(having).ravel()
+        return found
+
+    def points(self, tile: Tile) -> Float[Tensor, "points dim"]:
+        """Return the parameters at the points of a tile."""
+        pairs = zip(self.plane.axes()[::-1], self.rows(tile), strict=True)
+        grid = np.meshgrid(*(axis.numpy()[rows] for axis, rows in pairs), indexing="ij")[::-1]
+        return self.plane.lift(torch.from_numpy(np.stack([axis.ravel() for axis in grid], axis=1)))
 
 
 def tile_side(points: int) -> int:
@@ -274,45 +337,77 @@ def _halfway(start: int, width: int, size: int) -> tuple[int, int, int, int]:
     return -(width // 2), min(middles), start, width
 
 
-Values = Mapping[str, NDArray[Any]]
+class Chunks:
+    """Read and write the samples of a finished slice, a chunk at a time, each with a checksum.
 
+    A chunk counts when it decodes and its checksum is right. Copies that xarray wrote have no checksums.
+    """
 
-class Checksums:
-    """Hold the checksum of every tile of a slice, in the array `checksum` beside the others."""
-
-    def __init__(self, array: zarr.Array[Any]) -> None:
-        self._array = array
+    def __init__(self, group: zarr.Group) -> None:
+        arrays = dict(group.arrays())
+        self._arrays = {name: arrays[name] for name in SAMPLES if name in arrays}
+        status = self._arrays["status"]
+        self._shape, self.sides = status.shape, status.chunks
+        counts = tuple(math.ceil(points / side) for points, side in zip(self._shape, self.sides, strict=True))
+        self._sums = arrays.get(SUMS) if SUMS in arrays and arrays[SUMS].shape == counts else None
 
     @classmethod
-    def of(cls, group: zarr.Group, tiles: tuple[int, ...]) -> Checksums | None:
-        """Return the checksums of a slice on disk, or None: copies that xarray wrote have none for their tiles."""
-        array: Any = group.get(SUMS)
-        return cls(array) if array is not None and array.shape == tiles else None
+    def open(cls, path: Path) -> tuple[xr.Dataset, Path, Chunks]:
+        """Return a finished slice as it would be without samples, its path and its chunks.
 
-    def write(self, index: tuple[int, ...], values: Values) -> None:
-        """Write the checksum of a tile."""
-        self._array[index] = tile_sum(index, values)
-
-    def read(self, tiles: tuple[int, ...]) -> NDArray[np.int64]:
-        """Return the checksums of the first `tiles` along each axis, and 0 for the others, which is no tile's."""
-        found = np.zeros(self._array.shape, dtype=np.int64)
-        box = tuple(slice(count) for count in tiles)
+        Raises DamagedError where its layout or its axes are not what was written.
+        """
         try:
-            found[box] = self._array[box]
-        except Exception:  # a torn one raises whatever its codec does
-            for index in np.ndindex(*tiles):
-                found[index] = self.one(index)
-        return found
+            group = open_group(path, "r+")
+            empty = _read_blank(path, group)
+            return empty, path, cls(group)
+        except DamagedError:
+            raise
+        except Exception as error:  # a damaged axis or layout raises whatever reads it; no chunk is read here
+            check_layouts(path)
+            raise damage(path, f"{type(error).__name__}: {error}") from error
 
-    def one(self, index: tuple[int, ...]) -> int:
-        """Return the checksum of a tile, 0 where it cannot be read."""
+    def read(self, tile: Tile) -> Arrays | None:
+        """Return the samples of a chunk, None where they are not what was written."""
         try:
-            return int(np.asarray(self._array[index]))
-        except Exception:  # as in `read`
-            return 0
+            values = {name: np.asarray(array[self._box(tile)]) for name, array in self._arrays.items()}
+            known = None if self._sums is None else int(np.asarray(self._sums[tile.index]))
+        except Exception:  # a damaged chunk raises whatever its codec does
+            return None
+        return values if known is None or known == tile_sum(tile.index, values) else None
+
+    def write(self, tile: Tile, values: Arrays) -> None:
+        """Write the samples of a chunk that was damaged."""
+        for name, array in self._arrays.items():
+            array[self._box(tile)] = values[name]
+        if self._sums is not None:
+            self._sums[tile.index] = tile_sum(tile.index, values)
+
+    def _box(self, tile: Tile) -> tuple[slice, ...]:
+        parts = zip(tile.index, self.sides, self._shape, strict=True)
+        return tuple(slice(at * side, min((at + 1) * side, points)) for at, side, points in parts)
 
 
-def tile_sum(index: tuple[int, ...], values: Values) -> int:
+def _read_blank(path: Path, group: zarr.Group) -> xr.Dataset:
+    """Return a finished slice as it would be without samples, from its plane, which its axes must agree with."""
+    about, arrays = attributes_of(group), dict(group.arrays())
+    stored = json.loads(str(about["identity"]))
+    identity, provenance = current_identity(stored), current_provenance(json.loads(str(about["provenance"])), stored)
+    units = [str(unit) for unit in np.asarray(arrays["unit"][:])]
+    if attributes_of(arrays["unit"]).get("checksum", sums := text_sum(units)) != sums:
+        raise damage(path / "unit", "it is not what was written")
+    empty = blank(identity, provenance, units)
+    axes = {str(name): one.to_numpy() for name, one in empty.coords.items()}
+    check_integrity(path, group, axes, list(map(str, empty.data_vars)))
+    for name, one in empty.variables.items():
+        one.attrs = attributes_of(arrays[str(name)])
+    if INTERPOLATED in arrays:
+        inside = arrays[INTERPOLATED]
+        empty[INTERPOLATED] = (empty["loss"].dims, np.asarray(inside[...]), attributes_of(inside))
+    return empty.drop_attrs(deep=False).assign_attrs(about)
+
+
+def tile_sum(index: tuple[int, ...], values: Arrays) -> int:
     """Return the checksum of a tile, at least 1: of its place, and of the names and the content of its arrays."""
     total = zlib.crc32(str(index).encode())
     for name in sorted(values):
@@ -325,14 +420,6 @@ def text_sum(words: Iterable[str]) -> str:
     return f"{zlib.crc32(json.dumps(list(words)).encode()):08x}"
 
 
-def lay_out_sums(
-    group: zarr.Group, tiles: tuple[int, ...], chunks: tuple[int, ...], names: Sequence[str]
-) -> zarr.Array[Any]:
-    """Make the empty array of the checksums of so many tiles along the dimensions of these names."""
-    said = "checksum (CRC-32, plus one) of a tile's place, gradient, loss and status"
-    return create_array(group, SUMS, tiles, chunks, tuple(f"{name}_tile" for name in names), "int64", long_name=said)
-
-
 def write_sums(group: zarr.Group, dataset: xr.Dataset) -> None:
     """Write the checksum of every chunk of a finished slice."""
     samples, names = dataset["loss"].shape, [str(name) for name in dataset["loss"].dims]
@@ -342,7 +429,9 @@ def write_sums(group: zarr.Group, dataset: xr.Dataset) -> None:
     for index in np.ndindex(*tiles):
         place = tuple(slice(at * side, (at + 1) * side) for at, side in zip(index, sides, strict=True))
         sums[index] = tile_sum(index, {str(name): one.to_numpy()[place] for name, one in dataset.items()})
-    lay_out_sums(group, tiles, tiles, names)[...] = sums
+    said = "checksum (CRC-32, plus one) of a tile's place, gradient, loss and status"
+    dims = tuple(f"{name}_tile" for name in names)
+    create_array(group, SUMS, tiles, tiles, dims, "int64", long_name=said)[...] = sums
 
 
 ANEW = "restore it, or sample the slice anew in another folder"

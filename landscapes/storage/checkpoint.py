@@ -21,7 +21,7 @@ from ..identity import DamagedError, check_identity
 from ..objective import Evaluation, Objective, evaluate
 from ..plain import digest, plain_json, text
 from ..verification import POINTS, StoredPoints, verify
-from .files import check_free, check_ours, discard, refuse_others, remove, replacing, visible_files, write_json
+from .files import check_free, check_ours, discard, refuse_others, replacing, visible_files, write_json
 from .records import read_json, reading
 
 SETTINGS, PARTS, PROBES = "settings.json", "pieces", "probes"
@@ -78,7 +78,7 @@ class Checkpoint:
             self.save(name, **{part: getattr(now, part).numpy() for part in ("loss", "grad", "status")})
             return
         with reading(path, todo):
-            kept = self._read(name, todo)
+            kept = self.read(name, todo)
             loss, slope, status = (torch.from_numpy(kept[part]) for part in ("loss", "grad", "status"))
             then = Evaluation(loss, slope, status)
         verify(objective, [StoredPoints(self.folder, "study", x, then, True)])
@@ -86,7 +86,7 @@ class Checkpoint:
     def _is_ours(self, name: str) -> bool:
         """Whether a part is there, whole and of this study; those of earlier versions do not say."""
         try:
-            self._read(name, AGAIN)
+            self.read(name)
         except (DamagedError, FileNotFoundError):
             return False
         return True
@@ -96,12 +96,12 @@ class Checkpoint:
         if not self._path(name).exists():
             return None
         try:
-            return self._read(name, AGAIN)
+            return self.read(name)
         except DamagedError as error:
             warnings.warn(str(error), RuntimeWarning, stacklevel=2)
             return None
 
-    def _read(self, name: str, todo: str) -> dict[str, NDArray[Any]]:
+    def read(self, name: str, todo: str = AGAIN) -> dict[str, NDArray[Any]]:
         """Return the arrays of a part. Raises DamagedError, which says what `todo`, where it is damaged."""
         path = self._path(name)
         with reading(path, todo), path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
@@ -128,10 +128,6 @@ class Checkpoint:
         """Return the names of the parts, in order, but for what the study is verified by."""
         paths = (self.folder / PARTS).glob("[!.]*.npz")
         return sorted(path.stem for path in paths if not path.stem.startswith(PROBES))
-
-    def remove(self) -> None:
-        """Remove the parts, and the folder where nothing else is in it."""
-        remove(self.folder, re.compile(rf"{PARTS}/{PART.pattern}").fullmatch)
 
     def count(self) -> int:
         """Count the parts."""

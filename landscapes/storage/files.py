@@ -220,7 +220,7 @@ def refuse_others(folder: Path, strange: Iterable[Path], what: str) -> None:
         )
 
 
-def has_lost_root(store: Path, ours: Ours) -> bool:
+def lost_root(store: Path, ours: Ours) -> bool:
     """Whether a zarr store has lost the file that says what it is, and everything else in it is of ours."""
     try:
         said = json.loads((store / "zarr.json").read_text())

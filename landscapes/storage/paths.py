@@ -1,14 +1,19 @@
-"""Paths of a slice: slice.zarr once it is finished, slice.filling.zarr beside it until then."""
+"""Paths of a slice: slice.zarr once it is finished, slice.filling next to it until then."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-SLICE, FILLING = "slice.zarr", ".filling.zarr"
+from ..identity import StoreError
+from .files import check_ours, foreign_files, lost_root
+from .records import read_json
+
+SLICE, FILLING = "slice.zarr", ".filling"
+HEADER = "slice.json"  # what a slice is that is being filled
 
 
 def filling_path(path: Path) -> Path:
-    """Return where the tiles of a slice are while it is being filled: slice.filling.zarr beside slice.zarr."""
+    """Return where the tiles of a slice are while it is being filled: slice.filling next to slice.zarr."""
     return path.with_name(path.name.removesuffix(".zarr") + FILLING)
 
 
@@ -29,40 +34,39 @@ def slice_exists(path: Path) -> bool:
 
 def refuse_missing(path: str | Path, what: str) -> None:
     """Raise StoreError where nothing is at a path that is to hold `what`; whoever opens it says more."""
-    from ..identity import StoreError
-
     if not slice_exists(Path(path)):
         raise StoreError(f"there is no {what} at {path}; give the folder of one")
 
 
 def is_slice(path: Path) -> bool:
     """Say whether a slice of this format, finished or not, is at `path`."""
-    from .arrays import FORMAT, open_group
+    from .arrays import FORMAT, MARK, open_group
 
+    place = place_of(path)
     try:
-        return open_group(place_of(path)).attrs.get("gradscape_slice") == FORMAT
+        about = read_json(place / HEADER) if place.name.endswith(FILLING) else open_group(place).attrs
+        return about.get(MARK) == FORMAT
     except Exception:  # whatever else is there is none
         return False
 
 
+def has_lost_root(place: Path) -> bool:
+    """Whether a slice has lost the file that says what it is, and everything else in its folder is of a slice."""
+    from .arrays import FILES, FILLING_FILES
+
+    if not place.name.endswith(FILLING):
+        return lost_root(place, FILES)
+    try:
+        read_json(place / HEADER)
+    except (OSError, TypeError, ValueError):
+        return place.is_dir() and any(place.iterdir()) and not any(foreign_files(place, FILLING_FILES))
+    return False
+
+
 def check_replaceable(store: Path) -> None:
     """Raise ValueError unless a folder is a slice's, its root damaged or not, and everything in it is of that."""
-    from ..identity import StoreError
-    from .arrays import FILES
-    from .files import check_ours, has_lost_root
+    from .arrays import FILES, FILLING_FILES
 
-    if not is_slice(store) and not has_lost_root(store, FILES):
+    if not is_slice(store) and not has_lost_root(store):
         raise StoreError(f"{store} is no slice store, so it is not replaced; move it away or write elsewhere")
-    check_ours(store, FILES, "a slice")
-
-
-def corner(array: Path, rank: int) -> tuple[int, ...]:
-    """Return how many tiles along each of so many axes there are files of, in an array's folder as zarr names them."""
-    rows, columns = _numbers(array / "c"), set[int]()
-    if rank == 2:
-        columns = columns.union(*(_numbers(array / "c" / str(row)) for row in rows))
-    return tuple(max(numbers, default=-1) + 1 for numbers in (rows, columns)[:rank])
-
-
-def _numbers(folder: Path) -> set[int]:
-    return {int(file.name) for file in folder.iterdir() if file.name.isdecimal()} if folder.exists() else set()
+    check_ours(store, FILLING_FILES if store.name.endswith(FILLING) else FILES, "a slice")

@@ -1,16 +1,14 @@
-"""A slice on disk: tiles while it is being filled, and plain ascending arrays once it is finished.
+"""A slice on disk: a file for each tile while it is being filled, and a zarr store once it is finished.
 
-A slice is a group of arrays: `loss(v, u)`, `grad(v, u, dim)` unless sampled without gradients, `status(v, u)` and the
-coordinates `u`, `v`, `dim`, `unit(dim)`; a line has no `v`. It lies in one of two places:
+A slice is `loss(v, u)`, `grad(v, u, dim)` unless sampled without gradients, `status(v, u)` and the coordinates `u`,
+`v`, `dim`, `unit(dim)`; a line has no `v`. It lies in one of two places:
 
-- `slice.filling.zarr` while it is being filled. Axes are stored coarse to fine (`tiles.coarse_to_fine`) and one chunk
-  is one tile, so the first tile is a coarse picture of the whole box and every square of tiles from it a finer one.
-- `slice.zarr` once every point is there. Axes ascend, and chunks are as large as analysis wants them
-  (`layout.analysis_chunks`), so that anybody's xarray or zarr reads it right. It appears whole, and only then the
-  tiles go: a process killed at any instant leaves one or the other.
-
-A tile, or a chunk of a finished slice, counts when it is whole (`samples.Samples`); a torn one is as if it had never
-been written.
+- `slice.filling` while it is being filled: a record of what it is, and a file for each tile, written whole. Samples
+  are taken coarse to fine (`arrays.coarse_to_fine`), so the first tile is a coarse picture of the whole box and every
+  square of tiles from it a finer one. A file that is damaged is as if it had never been written.
+- `slice.zarr` once every point is there, with ascending axes and chunks as large as analysis wants them
+  (`arrays.analysis_chunks`), so that anybody's xarray or zarr reads it right. It appears whole, and only then the tiles
+  go: a process killed at any instant leaves one or the other. Its tiles are its chunks, each with a checksum.
 """
 
 from __future__ import annotations
@@ -18,22 +16,20 @@ from __future__ import annotations
 import contextlib
 import json
 import math
-from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-import torch
 import xarray as xr
-import zarr
 from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
-from zarr.storage import MemoryStore
 
 from ..identity import (
+    BOUNDS,
     ERROR,
+    DamagedError,
     StoreError,
     StoreExistsError,
     check_identity,
@@ -41,33 +37,43 @@ from ..identity import (
     current_provenance,
     full_identity,
     gradient_stride,
+    with_package,
 )
 from ..objective import Evaluation, Status, has_loss
-from ..plain import plain_json
+from ..plain import digest, plain_json
 from ..plane import Plane
 from ..space import ParameterSpace
 from .arrays import (
+    ANEW,
     AXES,
     FILES,
+    FILLING_FILES,
     FORMAT,
-    INTERPOLATED,
-    Checksums,
+    MARK,
+    SAMPLES,
+    Arrays,
+    Chunks,
     Tile,
-    attributes_of,
-    axes_of,
-    check_integrity,
-    check_layouts,
-    consolidate,
+    Tiling,
+    blank,
     damage,
-    lay_out,
-    open_group,
     refuse_too_large,
-    text_sum,
-    tile_sum,
     write_finished,
 )
-from .files import has_lost_root, placing, remove, resolve
-from .paths import SLICE, check_replaceable, corner, filling_path, finished_path, is_slice, place_of, slice_exists
+from .checkpoint import Checkpoint
+from .files import placing, remove, resolve
+from .paths import (
+    HEADER,
+    SLICE,
+    check_replaceable,
+    filling_path,
+    finished_path,
+    has_lost_root,
+    is_slice,
+    place_of,
+    slice_exists,
+)
+from .records import read_json, reading, write_record
 
 T = TypeVar("T")
 
@@ -76,36 +82,29 @@ class SliceStore:
     """Keep a slice on disk tile by tile, so that a run stopped at any instant can go on.
 
     Make one with `create`, `open`, `open_or_create` or `in_memory`, all by the `path` of the finished slice; `place` is
-    where its arrays are now. Two processes may fill the same store: a tile is the same whoever writes it, and each file
-    appears whole or not at all.
+    where it is now. Two processes may fill the same store: a tile is the same whoever writes it, and each file appears
+    whole or not at all.
     """
 
-    def __init__(self, group: zarr.Group, path: Path | None, place: Path | None) -> None:
+    def __init__(self, empty: xr.Dataset, path: Path | None = None, chunks: Chunks | None = None) -> None:
         self.verified_for: object = None  # the objective that gave a few stored points again
-        self._adopt(group, path, place)
+        self._adopt(empty, path, chunks)
 
-    def _adopt(self, group: zarr.Group, path: Path | None, place: Path | None) -> None:
-        arrays = dict(group.arrays())
-        self.path, self.place = path, place
-        self._inode = place.stat().st_ino if place else None
-        self._about = attributes_of(group)
-        stored = json.loads(str(self._about["identity"]))
+    def _adopt(self, empty: xr.Dataset, path: Path | None, chunks: Chunks | None) -> None:
+        """Become the slice in which nothing is sampled yet, or the finished one with these chunks."""
+        self.path, self._empty, self._chunks = path, empty, chunks
+        self.place = path if path is None or chunks else filling_path(path)
+        self._inode = self.place.stat().st_ino if self.place else None
+        self.error = str(empty.attrs.get(ERROR, ""))  # what the first point that raised said
+        stored = json.loads(str(empty.attrs["identity"]))
         self.identity = current_identity(stored)
-        self.provenance = current_provenance(json.loads(str(self._about["provenance"])), stored)
+        self.provenance = current_provenance(json.loads(str(empty.attrs["provenance"])), stored)
         self.plane = Plane.from_record(self.identity["plane"])
         self.dims = AXES[: self.plane.rank][::-1]
-        self._coordinates = {name: np.asarray(arrays[name][:]) for name in self.dims}
-        self._parameters, self._units = ([str(one) for one in np.asarray(arrays[name][:])] for name in ("dim", "unit"))
-        self._attributes = {name: attributes_of(array) for name, array in arrays.items()}
-        self._interpolated = arrays.get(INTERPOLATED)
-        shape = tuple(len(self._coordinates[name]) for name in self.dims)
-        sloped = [self._has_slopes(name) for name in self.dims]
-        self._samples = Samples(group, shape, place, ascending=self.ascending, sloped=sloped)
-
-    def _has_slopes(self, name: str) -> NDArray[np.bool_]:
-        """Return which samples along an axis, in stored order, may have a gradient."""
-        found: NDArray[np.bool_] = self._coordinates[name].argsort().argsort() % self.every == 0
-        return found
+        self.tiling = Tiling(self.plane, self.every if self.grad else 0, chunks.sides if chunks else ())
+        self._tiles: dict[Tile, Arrays] = {}  # what is known of a slice that is being filled
+        # the files of what is being filled: of tiles, or of the points of a slice that is refined
+        self.parts = Checkpoint(self.place, digest(self.identity)) if self.place and not chunks else None
 
     @classmethod
     def create(
@@ -129,7 +128,7 @@ class SliceStore:
         TooLargeError where the slice does not fit onto the disk or into memory.
         """
         path = resolve(path)
-        whole = full_identity(identity, plane, space, grad=grad)
+        header = _header(plane, space, identity, provenance or {}, grad=grad)
         for taken in (path, filling_path(path)):
             if taken.exists() and not overwrite:
                 raise StoreExistsError(f"{path} exists already; write elsewhere with --out, or replace it with --force")
@@ -138,9 +137,7 @@ class SliceStore:
         refuse_too_large(plane, path, grad=grad)
         try:
             with placing(filling_path(path), overwrite=overwrite) as new:
-                group = zarr.create_group(new, zarr_format=3)
-                lay_out(group, plane, space, whole, plain_json(provenance or {}, "a slice's provenance"), grad=grad)
-                consolidate(new)
+                write_record(new / HEADER, header)
         except FileExistsError as error:
             raise StoreExistsError(str(error)) from None
         remove(path, FILES)
@@ -157,22 +154,13 @@ class SliceStore:
         if not place.exists():
             raise StoreError(f"there is no slice store at {path}; make one with `landscape slice`")
         if not is_slice(place):
-            if has_lost_root(place, FILES):
-                raise damage(place / "zarr.json", "it does not say what it is of")
+            if has_lost_root(place):
+                raise damage(place / ("zarr.json" if place == path else HEADER), "it does not say what it is of")
             raise StoreError(f"{place} is no slice store of format {FORMAT}; move it away or write elsewhere")
-        try:
-            group = open_group(place, "r+")
-            store = cls(group, path, place)
-            axes = axes_of(store.plane, store.identity["parameters"], store._units, ascending=store.ascending)
-            if store._attributes["unit"].get("checksum", sums := text_sum(store._units)) != sums:
-                raise damage(place / "unit", "it is not what was written")
-            check_integrity(place, group, axes, ["loss", "status", *(["grad"] if store.identity["gradients"] else [])])
-            return store
-        except StoreError:
-            raise
-        except Exception as error:  # a damaged axis or layout raises whatever reads it; of tiles nothing is read here
-            check_layouts(place)
-            raise damage(place, f"{type(error).__name__}: {error}") from error
+        if place == path:
+            return cls(*Chunks.open(path))
+        with reading(place / HEADER, ANEW):
+            return cls(_blank(read_json(place / HEADER)), path)
 
     @classmethod
     def open_or_create(
@@ -192,7 +180,7 @@ class SliceStore:
             store = cls.open(path)
         check_identity(store.path, wanted=full_identity(identity, plane, space, grad=grad), found=store.identity)
         if store.ascending and store.path:
-            remove(filling_path(store.path), FILES)  # left by a process that was killed when it had finished the slice
+            remove(filling_path(store.path), FILLING_FILES)  # left by a process that was killed at its end
         return store
 
     @classmethod
@@ -210,25 +198,17 @@ class SliceStore:
         Raises TooLargeError where it does not fit into memory.
         """
         refuse_too_large(plane, None, grad=grad)
-        group = zarr.create_group(MemoryStore(), zarr_format=3)
-        whole = full_identity(identity or {}, plane, space, grad=grad)
-        lay_out(group, plane, space, whole, plain_json(provenance or {}, "a slice's provenance"), grad=grad)
-        return cls(group, None, None)
+        return cls(_blank(_header(plane, space, identity or {}, provenance or {}, grad=grad)))
 
     @property
     def ascending(self) -> bool:
         """Whether this is a slice that was complete once, and so lies in its final place and order."""
-        return self.place is not None and self.place == self.path
-
-    @property
-    def error(self) -> str:
-        """What the first point that raised said; empty where none did."""
-        return str(self._about.get(ERROR, ""))
+        return self._chunks is not None
 
     @property
     def grad(self) -> bool:
         """Whether the slice holds gradients."""
-        return "grad" in self._samples.arrays
+        return "grad" in self._empty
 
     @property
     def every(self) -> int:
@@ -238,95 +218,82 @@ class SliceStore:
     @property
     def shape(self) -> tuple[int, ...]:
         """Points per axis, in array order."""
-        return self._samples.shape
+        return self.tiling.shape
 
     def tiles(self) -> list[Tile]:
         """Return every tile, coarse to fine."""
-        return self._samples.tiles()
-
-    def pending(self, status: NDArray[np.int8] | None = None) -> list[Tile]:
-        """Return the tiles that are not finished, coarse to fine; `status` spares reading it again."""
-        status = self.status() if status is None else status
-        return [tile for tile in self.tiles() if (status[self._samples.place(tile)] == Status.MISSING).any()]
-
-    def damaged_tiles(self, pending: Sequence[Tile]) -> list[Tile]:
-        """Return those of the tiles not finished that once were: their status is there, or torn.
-
-        A tile that another process has finished in the meantime is none of them.
-        """
-        return [tile for tile in self._samples.find_written(pending) if not self.statuses(tile)]
-
-    def read_tile(self, tile: Tile) -> dict[str, NDArray[Any]] | None:
-        """Return the arrays of a tile that is finished, None of one that is not."""
-        return self._samples.read_tile(tile)
-
-    def statuses(self, tile: Tile) -> Counter[Status]:
-        """Count how the points of a finished tile ended; nothing of one that is not finished."""
-        values = self.read_tile(tile)
-        return Counter() if values is None else Counter(map(Status, values["status"].ravel().tolist()))
-
-    def count(self, tile: Tile) -> int:
-        """Return how many points a tile has."""
-        return math.prod(at.stop - at.start for at in self._samples.place(tile))
-
-    def sloped(self, tile: Tile) -> NDArray[np.bool_]:
-        """Return which points of a tile have a gradient, in the order of `points`, shape (points,)."""
-        return self._samples.sloped(self._samples.place(tile)).ravel() & self.grad
+        return self.tiling.tiles()
 
     def points(self, tile: Tile) -> Float[Tensor, "points dim"]:
         """Return the parameters at the points of a tile."""
-        box = zip(self.dims, self._samples.place(tile), strict=True)
-        parts = [self._coordinates[name][part] for name, part in box]
-        grid = np.meshgrid(*parts, indexing="ij")[::-1]
-        return self.plane.lift(torch.from_numpy(np.stack([axis.ravel() for axis in grid], axis=1)))
+        return self.tiling.points(tile)
+
+    def pending(self) -> list[Tile]:
+        """Return the tiles that are not finished, coarse to fine."""
+        finished = self._read_steadily(lambda: {tile for tile, _ in self._finished()})
+        return [tile for tile in self.tiles() if tile not in finished]
+
+    def damaged_tiles(self, pending: Sequence[Tile]) -> list[Tile]:
+        """Return those of the tiles not finished that once were: what was written of them cannot be read."""
+        written = set(self._written())
+        return [tile for tile in pending if tile in written and self.read_tile(tile) is None]
+
+    def read_tile(self, tile: Tile) -> Arrays | None:
+        """Return the arrays of a tile that is finished, None of one that is not."""
+        if self._chunks is not None:
+            values = self._chunks.read(tile)
+            return values if values is not None and self._is_whole(tile, values) else None
+        if tile not in self._tiles and self.parts is not None:
+            with contextlib.suppress(DamagedError, FileNotFoundError):
+                self._tiles[tile] = self.parts.read(tile.name)
+        return self._tiles.get(tile)
 
     def write(self, tile: Tile, evaluation: Evaluation) -> None:
-        """Write a whole tile, status last; `evaluation` has its points in the order of `points`, failures blanked.
+        """Write a whole tile; `evaluation` has its points in the order of `points`, failures blanked.
 
         Raises ValueError where gradients are missing or a point was not evaluated, StoreError where the store was
         replaced.
         """
-        shape = tuple(at.stop - at.start for at in self._samples.place(tile))
         if self.grad and evaluation.grad is None:
             raise ValueError("this slice holds gradients; got an evaluation without, so evaluate with grad=True")
         if bool((evaluation.status == Status.MISSING).any()):
             raise ValueError("a tile is written whole; got an evaluation with status MISSING")
-        counts = zip(tile.index, self._samples.tile_counts, strict=True)
-        if self._follow_finished() or any(at >= count for at, count in counts):
+        shape = tuple(map(len, self.tiling.rows(tile)))
+        if self._follow_finished() or math.prod(shape) != len(evaluation.loss):
             return  # another process has finished the slice, which has larger and fewer tiles since
         self.keep_error(evaluation.error)
         arrays: Arrays = {}
-        for name, stored in self._samples.arrays.items():
-            tensor: Tensor = getattr(evaluation, name)
-            arrays[name] = tensor.detach().cpu().numpy().reshape(shape + tensor.shape[1:]).astype(stored.dtype)
-        try:
-            self._samples.write_tile(tile, arrays)
-        except FileNotFoundError:
-            if not self._follow_finished():
-                raise
+        for name in SAMPLES:
+            if name in self._empty:
+                values = getattr(evaluation, name).detach().cpu().numpy()
+                arrays[name] = values.reshape(shape + values.shape[1:]).astype(self._empty[name].dtype)
+        if self._chunks is not None:
+            self._chunks.write(tile, arrays)
+            return
+        if self.parts is not None:
+            self.parts.save(tile.name, **arrays)
+        self._tiles[tile] = arrays
 
     def keep_error(self, error: str) -> None:
         """Keep what the first point that raised said, as an attribute; what later ones say is not kept."""
         if not error or self.error:
             return
-        self._about[ERROR] = error
+        self.error = self._empty.attrs[ERROR] = error
         if self.place is not None and not self.ascending:
             with contextlib.suppress(FileNotFoundError):  # another process has finished the slice meanwhile
-                open_group(self.place, "r+").attrs.update({ERROR: error})
-                consolidate(self.place)
+                write_record(self.place / HEADER, read_json(self.place / HEADER) | {ERROR: error})
 
     def status(self) -> NDArray[np.int8]:
-        """Return the status of every point in stored order, MISSING wherever a tile is not finished."""
-        return self._read_steadily(lambda: self._samples.read(self._samples.whole)["status"])
+        """Return the status of every point, MISSING wherever a tile is not finished."""
+        found: NDArray[np.int8] = self._read_steadily(lambda: self._collect(["status"]))["status"]
+        return found
 
-    def dataset(self, known: Mapping[Tile, Mapping[str, NDArray[Any]]] | None = None) -> xr.Dataset:
+    def dataset(self) -> xr.Dataset:
         """Return everything sampled so far, axes ascending; MISSING and NaN where nothing is.
-
-        `known` spares reading tiles again: what `read_tile` returned of them.
 
         Raises StoreError where the store was replaced.
         """
-        return self._read_steadily(lambda: self._dataset(self._samples.whole, None if self.ascending else known))
+        return self._read_steadily(self._dataset)
 
     def finish(self, dataset: xr.Dataset) -> None:
         """Put the whole slice, which `dataset` returned, in the place of its tiles: ascending, in large chunks.
@@ -353,8 +320,44 @@ class SliceStore:
             return self.dataset()
         if not (level := 0 if self.ascending else pending[0].level):
             return None
-        found = self._dataset(tuple(slice(level * side) for side in self._samples.side))
+        parts = zip(self.dims, self.tiling.order, self.tiling.sides, strict=True)
+        found = self.dataset().isel({name: np.sort(order[: level * side]) for name, order, side in parts})
         return found.drop_vars("grad", errors="ignore") if self.every > 1 else found
+
+    def _is_whole(self, tile: Tile, values: Arrays) -> bool:
+        """Whether loss and gradient are finite exactly where the status says so, which is not MISSING anywhere."""
+        status = values["status"]
+        lacking = np.zeros(status.shape, bool)
+        if "grad" in values:
+            lacking = ~np.isfinite(values["grad"]).all(axis=-1) & self.tiling.sloped(tile).reshape(status.shape)
+        finite, without = np.isfinite(values["loss"]), status == Status.NO_GRADIENT
+        said = np.where(has_loss(status), finite & (lacking == without), ~finite)
+        return bool((said & (status != Status.MISSING)).all())
+
+    def _written(self) -> list[Tile]:
+        """Return the tiles that something was written of."""
+        if self.parts is None:
+            return self.tiles() if self._chunks else list(self._tiles)
+        return [tile for name in self.parts.names() if (tile := Tile.named(name)) is not None]
+
+    def _finished(self) -> Iterator[tuple[Tile, Arrays]]:
+        """Yield the tiles that are finished, with their arrays."""
+        for tile in self._written():
+            if (values := self.read_tile(tile)) is not None:
+                yield tile, values
+
+    def _collect(self, names: Sequence[str]) -> Arrays:
+        """Return arrays of the whole slice, blank where nothing is sampled."""
+        found: Arrays = {name: self._empty[name].to_numpy().copy() for name in names}
+        for tile, values in self._finished():
+            at = np.ix_(*self.tiling.rows(tile))
+            for name, array in found.items():
+                array[at] = values[name]
+        return found
+
+    def _dataset(self) -> xr.Dataset:
+        found = self._collect([name for name in SAMPLES if name in self._empty])
+        return self._empty.assign({name: self._empty[name].copy(data=array) for name, array in found.items()})
 
     def _read_steadily(self, read: Callable[[], T]) -> T:
         """Return what is read, once more where another process has finished the slice meanwhile."""
@@ -380,26 +383,8 @@ class SliceStore:
 
     def _move_on(self, path: Path) -> None:
         """Become the finished slice, and clear the tiles away."""
-        self._adopt(open_group(path, "r+"), path, path)
-        remove(filling_path(path), FILES)
-
-    def _dataset(
-        self, box: tuple[slice, ...], known: Mapping[Tile, Mapping[str, NDArray[Any]]] | None = None
-    ) -> xr.Dataset:
-        values = self._samples.read(box, known)
-        shaped = {"loss": self.dims, "grad": (*self.dims, "dim"), "status": self.dims}
-        coordinates = {name: self._coordinates[name][at] for name, at in zip(self.dims, box, strict=True)}
-        dataset = xr.Dataset(
-            {name: (shaped[name], values[name], self._attributes[name]) for name in values},
-            {name: (name, values, self._attributes[name]) for name, values in coordinates.items()},
-            self._about,
-        )
-        if self._interpolated is not None:
-            inside = np.asarray(self._interpolated[box])
-            dataset[INTERPOLATED] = (self.dims, inside, self._attributes[INTERPOLATED])
-        words = {"dim": self._parameters, "unit": self._units}
-        named = {name: ("dim", np.array(said, object), self._attributes[name]) for name, said in words.items()}
-        return dataset.assign_coords(named).sortby(list(self.dims))
+        self._adopt(*Chunks.open(path))
+        remove(filling_path(path), FILLING_FILES)
 
 
 def open_slice(path: str | Path) -> xr.Dataset:
@@ -413,162 +398,19 @@ def open_slice(path: str | Path) -> xr.Dataset:
     return SliceStore.open(path / SLICE if slice_exists(path / SLICE) else path).dataset()
 
 
-Arrays = dict[str, NDArray[Any]]  # loss, status and, unless sampled without gradients, grad
-Box = tuple[slice, ...]
+def _header(
+    plane: Plane, space: ParameterSpace, identity: Mapping[str, Any], provenance: Mapping[str, Any], *, grad: bool
+) -> dict[str, Any]:
+    """Return the record of a slice that is begun: what it is, and how it came about."""
+    bounds = [space.to_values(bound).tolist() for bound in (space.lower, space.upper)]
+    about = plain_json(provenance, "a slice's provenance")
+    return {
+        MARK: FORMAT,
+        "identity": full_identity(identity, plane, space, grad=grad),
+        "provenance": {**with_package(about), BOUNDS: bounds},
+        "units": list(space.units),
+    }
 
 
-class Samples:
-    """Hold the arrays `loss`, `status` and perhaps `grad` of an open store, in stored order.
-
-    A tile counts when it decodes, its status has no MISSING, loss and gradient are finite exactly where the status says
-    so, and its checksum is right. Everything else is as if it had never been written. `place` is the store's folder,
-    None of one in memory; `ascending` says that it was finished, so that every tile is there. `sloped` says along each
-    axis which samples have a gradient where the others on it do, too; the gradient of all others is NaN.
-    """
-
-    def __init__(
-        self,
-        group: zarr.Group,
-        shape: tuple[int, ...],
-        place: Path | None,
-        *,
-        ascending: bool,
-        sloped: Sequence[NDArray[np.bool_]],
-    ) -> None:
-        arrays = dict(group.arrays())
-        self.shape = shape
-        self.arrays = {name: arrays[name] for name in ("loss", "grad", "status") if name in arrays}
-        self.side = self.arrays["status"].chunks[: len(shape)]
-        self._sums = Checksums.of(group, self.tile_counts) if place else None
-        self._filling = None if ascending else place
-        self._sloped = sloped
-
-    @property
-    def whole(self) -> Box:
-        """The box of all samples."""
-        return tuple(slice(points) for points in self.shape)
-
-    @property
-    def tile_counts(self) -> tuple[int, ...]:
-        """Tiles along each axis."""
-        return tuple(math.ceil(points / side) for points, side in zip(self.shape, self.side, strict=True))
-
-    def tiles(self) -> list[Tile]:
-        """Return every tile, coarse to fine."""
-        return sorted(
-            map(Tile, np.ndindex(*self.tile_counts)), key=lambda tile: (tile.level, sum(tile.index), tile.index)
-        )
-
-    def place(self, tile: Tile) -> Box:
-        """Return the box of a tile."""
-        sizes = zip(tile.index, self.side, self.shape, strict=True)
-        return tuple(slice(at * side, min((at + 1) * side, points)) for at, side, points in sizes)
-
-    def sloped(self, box: Box) -> NDArray[np.bool_]:
-        """Return which samples of a box have a gradient."""
-        found: NDArray[np.bool_] = np.ones((), dtype=bool)
-        for axis, at in zip(self._sloped, box, strict=True):
-            found = found[..., None] & axis[at]
-        return found
-
-    def read_tile(self, tile: Tile) -> Arrays | None:
-        """Return the arrays of a tile that is finished, None of one that is not."""
-        place = self.place(tile)
-        try:
-            values = self._load(place)
-        except Exception:  # as in `read`
-            return None
-        if self._sums and self._sums.one(tile.index) != tile_sum(tile.index, values):
-            return None
-        return None if (self._check_status(values, place) == Status.MISSING).any() else values
-
-    def write_tile(self, tile: Tile, values: Mapping[str, NDArray[Any]]) -> None:
-        """Write the arrays of a tile, status last."""
-        if self._sums is not None:
-            self._sums.write(tile.index, values)
-        for name in self.arrays:  # loss, grad, status
-            self.arrays[name][self.place(tile)] = values[name]
-
-    def find_written(self, tiles: Sequence[Tile]) -> list[Tile]:
-        """Return those of the tiles that something was written of: their status is there, or torn."""
-        try:
-            status, begun = np.zeros(self.shape, np.int8), self._begun_corner(self.whole)
-            status[begun] = self.arrays["status"][begun]
-            return [tile for tile in tiles if status[self.place(tile)].any()]
-        except Exception:  # as in `read`
-            return [tile for tile in tiles if self._has_status(tile)]
-
-    def read(self, box: Box, known: Mapping[Tile, Mapping[str, NDArray[Any]]] | None = None) -> Arrays:
-        """Read a box of whole tiles, each array at once; where that fails, tile by tile, leaving out what is torn.
-
-        Where some tiles are `known`, the others are read one by one, too.
-        """
-        try:
-            values = self._read_tiles(box, known) if known else self._load(box)
-        except Exception:  # a damaged chunk raises whatever its codec does
-            values = self._read_tiles(box, {})
-        status = self._check_status(values, box)
-        sums = self._sums.read(self._tiles_begun()) if self._sums else None
-        for tile in self.tiles() if self._sums or (status == Status.MISSING).any() else ():
-            place = self.place(tile)
-            part = {name: array[place] for name, array in values.items()}
-            torn = sums is not None and part["status"].any() and sums[tile.index] != tile_sum(tile.index, part)
-            if torn or (part["status"] == Status.MISSING).any():  # finished whole or not at all
-                part["status"][...] = Status.MISSING
-        for name in values.keys() - {"status"}:
-            values[name][status == Status.MISSING] = np.nan
-        return values
-
-    def _check_status(self, values: Mapping[str, NDArray[Any]], box: Box) -> NDArray[np.int8]:
-        """Return the status, MISSING where it and the numbers contradict each other."""
-        status: NDArray[np.int8] = values["status"]
-        finite, lacking = np.isfinite(values["loss"]), np.zeros(status.shape, dtype=bool)
-        if "grad" in values:
-            lacking = ~np.isfinite(values["grad"]).all(axis=-1) & self.sloped(box)
-        whole = np.where(has_loss(status), finite & (lacking == (status == Status.NO_GRADIENT)), ~finite)
-        status[~whole] = Status.MISSING
-        return status
-
-    def _load(self, box: Box) -> Arrays:
-        """Read a box of every array; where its status says that nothing is there, nothing else is looked for."""
-        values, begun = self._blank(box), self._begun_corner(box)
-        inside = tuple(slice(len(range(points)[at])) for points, at in zip(self.shape, begun, strict=True))
-        values["status"][inside] = self.arrays["status"][begun]
-        for name, array in self.arrays.items() if values["status"].any() else ():
-            if name != "status":
-                values[name][inside] = array[begun]
-        return values
-
-    def _read_tiles(self, box: Box, known: Mapping[Tile, Mapping[str, NDArray[Any]]]) -> Arrays:
-        values = self._blank(box)
-        for tile in self.tiles():
-            place = self.place(tile)
-            inside = all(at.stop <= size for at, size in zip(place, values["status"].shape, strict=True))
-            if inside and (part := known.get(tile) or self.read_tile(tile)):
-                for name, array in part.items():
-                    values[name][place] = array
-        return values
-
-    def _has_status(self, tile: Tile) -> bool:
-        try:
-            return bool(np.asarray(self.arrays["status"][self.place(tile)]).any())
-        except Exception:  # as in `read`
-            return True
-
-    def _begun_corner(self, box: Box) -> Box:
-        """Return the corner of the whole beyond which no tile is, since looking for each of many files takes long."""
-        if box != self.whole:
-            return box
-        begun = zip(self._tiles_begun(), self.side, self.shape, strict=True)
-        return tuple(slice(min(count * side, points)) for count, side, points in begun)
-
-    def _tiles_begun(self) -> tuple[int, ...]:
-        """Return how many tiles along each axis there may be."""
-        return corner(self._filling / "status", len(self.shape)) if self._filling else self.tile_counts
-
-    def _blank(self, box: Box) -> Arrays:
-        shape = tuple(len(range(points)[at]) for at, points in zip(box, self.shape, strict=True))
-        return {
-            name: np.full(shape + array.shape[len(shape) :], array.fill_value, array.dtype)
-            for name, array in self.arrays.items()
-        }
+def _blank(header: Mapping[str, Any]) -> xr.Dataset:
+    return blank(header["identity"], header["provenance"], header["units"], error=header.get(ERROR, ""))

@@ -52,7 +52,7 @@ from ...landscapes.storage.arrays import FILL, consolidate, create_array, flags,
 from ...landscapes.storage.files import (
     check_ours,
     clear_halves,
-    has_lost_root,
+    lost_root,
     placing,
     replacing,
     resolve,
@@ -324,7 +324,7 @@ class RunStore:
         if not path.exists():
             raise StoreError(f"there is no run at {path}; make one with `landscape optimize`")
         if not is_run(path):
-            if has_lost_root(path, FILES):
+            if lost_root(path, FILES):
                 raise damage_error(path / "zarr.json", "it cannot be read")
             raise StoreError(f"{path} is no run of format {FORMAT}; move it away or write elsewhere")
         return cls(open_group(path).attrs.asdict(), path)
@@ -594,7 +594,7 @@ class RunStore:
 
 def check_replaceable(path: Path) -> None:
     """Raise ValueError unless a folder is a run's, its root damaged or not, and everything in it is of that."""
-    if not is_run(path) and not has_lost_root(path, FILES):
+    if not is_run(path) and not lost_root(path, FILES):
         raise StoreError(f"{path} is no run, so it is not replaced; move it away or write elsewhere")
     check_ours(path, FILES, "a run")
 

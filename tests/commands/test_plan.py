@@ -6,6 +6,8 @@ import pytest
 
 import gradscape as gs
 from gradscape.jobs import plan as module
+from gradscape.jobs.report import ReportedSlice, ReportJob
+from gradscape.jobs.watch import Watch
 from gradscape.landscapes.measures.undersampled import probes
 
 from ..command import Run
@@ -78,6 +80,18 @@ def test_a_plan_takes_as_many_episodes_as_the_slice(run: Run, tmp_path: Path) ->
     assert planned["episodes"] - planned["gradients"] >= made["undersampled"]["episodes"]
     taken = sum(file.stat().st_size for file in (tmp_path / made["folder"] / "slice.zarr").rglob("*") if file.is_file())
     assert taken <= planned["disk"]
+
+
+def test_a_plan_of_several_reports_counts_the_slices_that_have_none(tmp_path: Path) -> None:
+    slices = [gs.slice("branin", (0, 1), resolution=points, out=tmp_path / str(points)).folder for points in (6, 8)]
+    one, other = (gs.plan(gs.report, folder, points_per_axis=2) for folder in slices)
+    subjects = [ReportedSlice.of(folder) for folder in slices if folder]
+    job = ReportJob.open(subjects, what="all", single=False, out=tmp_path / "told", points=2)
+    both = module.plan_work(list(job.work()), "", Watch())
+    assert (both.gradients, both.episodes) == (one.gradients + other.gradients, one.episodes + other.episodes)
+    job.report(subjects[0], Watch())
+    left = module.plan_work(list(job.work()), "", Watch())
+    assert (left.gradients, left.episodes) == (other.gradients, other.episodes)
 
 
 def test_python_plans_a_function_of_its_own() -> None:

@@ -19,6 +19,7 @@ from gradscape.landscapes.identity import (
     stored_provenance,
 )
 from gradscape.landscapes.plane import Plane
+from gradscape.landscapes.sampling.fill import sample
 from gradscape.landscapes.storage.arrays import consolidate
 from gradscape.landscapes.storage.checkpoint import SETTINGS, Checkpoint
 from gradscape.landscapes.storage.store import SliceStore, open_slice
@@ -54,6 +55,7 @@ def test_a_slice_of_before_there_were_versions_goes_on(branin, tmp_path):
     plane = Plane.through(branin.space, branin.space.center, (0, 1), resolution=5)
     path, about = tmp_path / "slice.zarr", branin.identity()
     store = SliceStore.create(path, plane, branin.space, identity=about)
+    sample(branin, plane, store)
     place = store.place
     rewrite(place, before(store.identity), text=True)
     again = SliceStore.open_or_create(path, plane, branin.space, identity=about)

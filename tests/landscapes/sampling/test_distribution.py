@@ -1,11 +1,7 @@
 import functools
-import math
-import pickle
-import shutil
 import sys
 import threading
 import uuid
-from collections import defaultdict
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from pathlib import Path
 
@@ -13,18 +9,18 @@ import cloudpickle
 import numpy as np
 import pytest
 import torch
+import xarray as xr
 from hypothesis import given
 from hypothesis import strategies as st
 
 from gradscape.envs.adapters import from_torch
-from gradscape.landscapes.identity import StoreError
 from gradscape.landscapes.objective import Evaluation, Objective, Status
 from gradscape.landscapes.plane import Plane
 from gradscape.landscapes.sampling import distribution as spread
-from gradscape.landscapes.sampling.distribution import TileWriter, WorkersLostError, equal_groups
+from gradscape.landscapes.sampling.distribution import WorkersLostError, equal_groups
 from gradscape.landscapes.sampling.fill import sample
-from gradscape.landscapes.sampling.memory import MemoryBound
 from gradscape.landscapes.space import ParameterSpace
+from gradscape.landscapes.storage.arrays import Tiling
 from gradscape.landscapes.storage.store import SliceStore, open_slice
 
 from ...clock import Clock
@@ -126,18 +122,15 @@ def test_an_objective_is_made_once_in_each_worker(tmp_path, alone, processes):
 
 
 def test_what_cannot_be_sent_is_refused_with_what_to_do(tmp_path, processes):
-    with pytest.raises(ValueError, match="share no memory; give sample a store on disk"):
-        sample(from_torch(wave, SPACE), PLANE, executor=processes)
     lock = threading.Lock()
     holding = from_torch(lambda x: wave(x) + lock.locked(), SPACE, name="locked")
     with pytest.raises(ValueError, match=r"locked cannot be sent .* give sample made="):
         sample(holding, PLANE, store_at(tmp_path / "s.zarr"), executor=processes)
 
 
-def test_a_function_of_a_notebook_travels(tmp_path, alone, processes):
-    store = store_at(tmp_path / "s.zarr")
-    sample(from_torch(lambda x: wave(x), SPACE, name="wave"), PLANE, store, executor=processes)
-    assert same(store, alone)
+def test_a_function_of_a_notebook_travels_and_its_slice_may_be_in_memory(alone, processes):
+    found = sample(from_torch(lambda x: wave(x), SPACE, name="wave"), PLANE, executor=processes)
+    xr.testing.assert_equal(found, alone.dataset())
 
 
 @pytest.mark.slow
@@ -233,84 +226,12 @@ def test_workers_that_never_come_back_are_given_up(tmp_path, clock, monkeypatch)
     assert spread.WITHOUT_WORKERS < clock.now <= spread.WITHOUT_WORKERS + spread.POLL
 
 
-def test_a_worker_of_another_store_or_without_the_file_system_says_so(tmp_path):
-    store = store_at(tmp_path / "s.zarr")
-    make, arguments = TileWriter(
-        MemoryBound(from_torch(wave, SPACE)), store, functools.partial(from_torch, wave, SPACE)
-    ).__reduce__()
-    remote = make(*arguments)
-    (tmp_path / "s.filling.zarr").rename(tmp_path / "elsewhere.zarr")
-    with pytest.raises(StoreError, match=r"a worker finds no .*file system that they share"):
-        list(remote.fill(store.tiles(), 16))
-    SliceStore.create(tmp_path / "s.zarr", PLANE, SPACE, identity={"objective": "hill"})
-    with pytest.raises(StoreError, match="objective: wanted 'wave', found 'hill'"):
-        list(remote.fill(store.tiles(), 16))
-
-
-def test_a_batch_that_was_half_done_by_a_worker_that_died_is_not_done_again(tmp_path):
-    store = store_at(tmp_path / "s.zarr")
-    first = store.tiles()[0]
-    list(TileWriter(MemoryBound(from_torch(wave, SPACE)), store).fill([first], 16))
-    make, arguments = TileWriter(MemoryBound(Broken()), store).__reduce__()
-    remote = make(*arguments)
-    assert [filled.tile for filled in remote.fill([first], 16)] == [first]  # found: evaluated it would break
-    with pytest.raises(RuntimeError, match="broken cable"):
-        list(remote.fill(store.tiles(), 16))
-
-
-@pytest.fixture
-def hidden(monkeypatch):
-    """Return how often each tile is still looked for in vain, as on a file system that shows files late."""
-    finished, times = SliceStore.read_tile, defaultdict[object, float](lambda: 2)
-
-    def late(store, tile):
-        times[tile] -= 1
-        return None if times[tile] >= 0 else finished(store, tile)
-
-    monkeypatch.setattr(SliceStore, "read_tile", late)
-    return times
-
-
-def test_what_workers_wrote_is_waited_for(tmp_path, alone, hidden, clock):
-    store = store_at(tmp_path / "s.zarr")
-    with ThreadPoolExecutor(2) as threads:
-        dataset = sample(from_torch(wave, SPACE), PLANE, store, batch=40, executor=threads)
-    assert dataset["loss"].equals(alone.dataset()["loss"])
-    assert set(hidden.values()) == {-1}  # and read once
-    assert clock.slept == [spread.POLL]
-
-
-def test_what_workers_wrote_and_never_appears_is_an_error(tmp_path, hidden, clock):
-    store = store_at(tmp_path / "s.zarr")
-    hidden[store.tiles()[3]] = math.inf
-    with (
-        ThreadPoolExecutor(2) as threads,
-        pytest.raises(StoreError, match=r"s\.zarr: 1 tiles that workers finished have not appeared here"),
-    ):
-        sample(from_torch(wave, SPACE), PLANE, store, batch=40, executor=threads)
-    assert spread.LATE < clock.now <= spread.LATE + spread.POLL
-
-
-def test_a_worker_keeps_a_store_open_until_another_lies_there(tmp_path):
-    writer = TileWriter(
-        MemoryBound(from_torch(wave, SPACE)), store_at(tmp_path / "s.zarr"), lambda: from_torch(wave, SPACE)
-    )
-    remote = pickle.loads(pickle.dumps(writer))
-    tiles = writer.store.tiles()
-    assert list(remote.fill(tiles[:1], 16))
-    assert remote.here().store is remote.here().store
-    shutil.rmtree(writer.store.place)
-    again = store_at(writer.store.path)
-    assert list(remote.fill(tiles[:1], 16))
-    assert again.statuses(tiles[0])
-
-
 @given(batch=st.integers(1, 400), workers=st.integers(1, 9))
 def test_batches_are_equal_and_as_many_for_every_worker(batch, workers):
-    store = SliceStore.in_memory(Plane.through(SPACE, SPACE.center, ["x", "z"], resolution=32), SPACE)
-    groups = equal_groups(store, store.tiles(), batch, workers)
-    assert [tile for group in groups for tile in group] == store.tiles()
-    sizes = [sum(map(store.count, group)) for group in groups]
+    tiling = Tiling(Plane.through(SPACE, SPACE.center, ["x", "z"], resolution=32), every=1)
+    groups = equal_groups(tiling, tiling.tiles(), batch, workers)
+    assert [tile for group in groups for tile in group] == tiling.tiles()
+    sizes = [sum(map(tiling.count, group)) for group in groups]
     assert len(groups) == 64 or len(groups) % workers == 0
     assert max(sizes) - min(sizes) <= 16  # a tile
     assert max(sizes) < max(batch, 16) + 16

@@ -120,7 +120,7 @@ def test_sigkill_at_any_instant_changes_no_bit(tmp_path):
         assert alone(partial(sampling, path), tmp_path, Instant(instant)).returncode == -signal.SIGKILL
         left = store_at(path)
         pending = left.pending()
-        found.append(18 * 16 - sum(left.count(tile) for tile in pending))
+        found.append(18 * 16 - sum(left.tiling.count(tile) for tile in pending))
         objective = Wave()
         resumed = sample(objective, PLANE, store_at(path))
         verified = len(pending) < len(left.tiles())

@@ -22,7 +22,7 @@ from gradscape.landscapes.objective import Evaluation, Objective, Status
 from gradscape.landscapes.sampling.quadtree import Quadtree
 from gradscape.landscapes.sampling.refine import Refined, Refinement, refine
 from gradscape.landscapes.slice import Slice
-from gradscape.landscapes.storage.checkpoint import Checkpoint
+from gradscape.landscapes.storage.paths import filling_path
 from gradscape.landscapes.storage.store import SliceStore, open_slice
 
 Function = Callable[[Tensor], Tensor]
@@ -198,7 +198,7 @@ def runs(objective: Objective, path: Path, over: Plane, **how: Any) -> Iterator[
     while True:
         store = SliceStore.open_or_create(path, over, SPACE, identity={"objective": "stopping"})
         try:
-            yield refine(objective, over, store, Refinement(0.02), checkpoint=Checkpoint(path.parent / "pieces"), **how)
+            yield refine(objective, over, store, Refinement(0.02), **how)
         except KeyboardInterrupt:
             yield None
 
@@ -235,7 +235,7 @@ def test_a_damaged_piece_is_evaluated_again(tmp_path: Path) -> None:
     over, path = plane(65), tmp_path / "slice.zarr"
     attempts = runs(Stopping(jumping, 6), path, over)
     assert next(attempts) is None
-    piece = next((tmp_path / "pieces").rglob("*.npz"))
+    piece = next(filling_path(path).rglob("*.npz"))
     piece.write_bytes(b"no piece")
     with pytest.warns(RuntimeWarning, match="damaged"):
         result = next(one for one in attempts if one is not None)

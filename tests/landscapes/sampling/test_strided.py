@@ -23,6 +23,7 @@ from gradscape.landscapes.measures.undersampled import find_undersampled
 from gradscape.landscapes.objective import Evaluation, Objective, Status
 from gradscape.landscapes.sampling.distribution import equal_groups
 from gradscape.landscapes.sampling.fill import Progress, sample
+from gradscape.landscapes.storage.arrays import Tiling
 from gradscape.landscapes.storage.store import SliceStore, open_slice
 from gradscape.landscapes.verification import POINTS
 
@@ -135,8 +136,8 @@ def test_batches_of_gradients_and_of_losses_are_full_but_the_last(plane: Plane, 
 
 def full_batch(plane: Plane, every: int, batch: int, *, grad: bool) -> int:
     """As many points as the batch, or the least multiple of it that those of any tile fit into."""
-    store = SliceStore.in_memory(plane, SPACE, identity={"gradients_every": every})
-    most = max(int((store.sloped(tile) == grad).sum()) for tile in store.tiles())
+    tiling = Tiling(plane, every)
+    most = max(int((tiling.sloped(tile) == grad).sum()) for tile in tiling.tiles())
     return next(size for size in range(batch, 10**6, batch) if size >= most)
 
 
@@ -178,11 +179,11 @@ def test_a_run_that_goes_on_repeats_the_batches(tmp_path: Path) -> None:
 @pytest.mark.parametrize("workers", [1, 3])
 def test_workers_get_groups_of_tiles_whose_gradients_fill_a_batch(workers: int) -> None:
     plane = Plane.through(SPACE, SPACE.center, ["x", "z"], resolution=90)
-    store = SliceStore.in_memory(plane, SPACE, identity={"gradients_every": 3})
-    groups = equal_groups(store, store.tiles(), 32, workers)
-    having = [sum(int(store.sloped(tile).sum()) for tile in group) for group in groups]
-    most = max(int(store.sloped(tile).sum()) for tile in store.tiles())
-    assert [tile for group in groups for tile in group] == store.tiles()
+    tiling = Tiling(plane, every=3)
+    groups = equal_groups(tiling, tiling.tiles(), 32, workers)
+    having = [sum(int(tiling.sloped(tile).sum()) for tile in group) for group in groups]
+    most = max(int(tiling.sloped(tile).sum()) for tile in tiling.tiles())
+    assert [tile for group in groups for tile in group] == tiling.tiles()
     assert len(groups) % workers == 0
     assert max(having) < 32 + most
     assert sum(having) / len(having) > 32 / 2
@@ -215,18 +216,6 @@ def test_a_slice_that_another_process_finishes_meanwhile_is_left_as_it_is(tmp_pa
 
 def strided_store(path: Path, plane: Plane = PLANE) -> SliceStore:
     return SliceStore.open_or_create(path, plane, SPACE, identity={"objective": "wave", "gradients_every": 3})
-
-
-@pytest.mark.parametrize("sloped", [True, False])
-def test_a_gradient_that_is_lacking_where_it_belongs_is_a_tile_that_was_torn(tmp_path: Path, sloped: bool) -> None:
-    store = strided_store(tmp_path / "slice.zarr")
-    tile = next(one for one in store.tiles() if store.sloped(one).any() and not store.sloped(one).all())
-    whole = Counted().evaluate(store.points(tile))
-    assert whole.grad is not None
-    row = int(np.flatnonzero((store.sloped(tile) == sloped) & (whole.status == Status.OK).numpy())[0])
-    whole.grad[row] = torch.nan
-    store.write(tile, whole)
-    assert (tile in store.pending()) == sloped
 
 
 def test_other_gradients_are_another_slice(tmp_path: Path) -> None:

@@ -38,5 +38,6 @@ def finished(path: Path, **changes) -> SliceStore:
 
 
 def chunks(place: Path) -> list[Path]:
-    names = ("loss", "grad", "status", "checksum")
-    return sorted(file for name in names for file in (place / name / "c").rglob("*") if file.is_file())
+    """Return the files of a slice's samples: of its tiles, or of its chunks once it is finished."""
+    parts = (place / name / "c" for name in ("loss", "grad", "status", "checksum"))
+    return sorted(file for part in (*parts, place / "pieces") for file in part.rglob("*") if file.is_file())

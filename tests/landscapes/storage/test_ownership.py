@@ -26,7 +26,7 @@ from ...processes import alone
 
 SPACE = ParameterSpace.box(("x", "y"), -1.0, 1.0)
 PLANE = Plane.through(SPACE, SPACE.center, ("x", "y"), resolution=9)
-MINE = ["notes.txt", "loss/notes.txt", "loss/c/0/notes.txt", ".git/HEAD", "mass/zarr.json"]
+MINE = ["notes.txt", "loss/notes.txt", "loss/c/0/notes.txt", ".git/HEAD", "mass/zarr.json", "pieces/notes.txt"]
 
 
 def bowl(x: Tensor) -> Tensor:
@@ -66,7 +66,7 @@ def test_a_slice_with_anything_else_in_it_is_not_replaced(
     assert file.read_text() == "precious"
     file.unlink()
     assert make(tmp_path / "slice.zarr", overwrite=True).pending()
-    assert own(tmp_path) == ["slice.filling.zarr"]
+    assert own(tmp_path) == ["slice.filling"]
 
 
 def test_a_link_in_a_slice_is_not_ours_unless_it_leads_nowhere(tmp_path: Path) -> None:
@@ -81,13 +81,14 @@ def test_a_link_in_a_slice_is_not_ours_unless_it_leads_nowhere(tmp_path: Path) -
 
 
 @pytest.mark.parametrize("made", [finished, unfinished])
-@pytest.mark.parametrize("damage", [None, "", "{", "[1]", '{"attributes": 3}'])
+@pytest.mark.parametrize("damage", [None, "", "{", "[1]", '{"attributes": 3, "checksum": 0}'])
 def test_a_slice_without_its_root_can_be_begun_anew_as_its_refusal_says(
     made: Callable[[Path], Path], damage: str | None, tmp_path: Path
 ) -> None:
-    root = made(tmp_path / "slice.zarr") / "zarr.json"
+    place = made(tmp_path / "slice.zarr")
+    root = place / ("zarr.json" if made is finished else "slice.json")
     root.unlink() if damage is None else root.write_text(damage)
-    with pytest.raises(StoreError, match=r"zarr\.json is damaged .*; restore it, or sample the slice anew"):
+    with pytest.raises(StoreError, match=rf"{root.name} is damaged .*; restore it, or sample the slice anew"):
         SliceStore.open(tmp_path / "slice.zarr")
     assert make(tmp_path / "slice.zarr", overwrite=True).pending()
 
@@ -104,7 +105,8 @@ def test_another_zarr_store_of_our_names_is_not_replaced(tmp_path: Path) -> None
 
 def test_what_somebody_put_among_the_tiles_stays_when_they_go(tmp_path: Path) -> None:
     store = make(tmp_path / "slice.zarr")
-    mine = filling_path(tmp_path / "slice.zarr") / "status/notes.txt"
+    mine = filling_path(tmp_path / "slice.zarr") / "pieces/notes.txt"
+    mine.parent.mkdir()
     mine.write_text("precious")
     sample(from_torch(bowl, SPACE), PLANE, store)
     assert mine.read_text() == "precious"
@@ -228,7 +230,7 @@ def test_a_folder_that_cannot_be_put_in_its_place_leaves_the_one_that_is_there(t
     assert (tmp_path / "folder/mine").read_text() == "precious"
 
 
-@pytest.mark.parametrize("gone", ["status", "."])
+@pytest.mark.parametrize("gone", ["pieces", "."])
 def test_what_another_process_removes_meanwhile_is_removed(gone: str, tmp_path: Path) -> None:
     """Two processes that fill the same slice clear its tiles away at once: the other is first in the middle of it."""
     folder = unfinished(tmp_path / "s.zarr")

@@ -7,7 +7,6 @@ from functools import partial
 from itertools import combinations
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 import xarray as xr
@@ -38,23 +37,38 @@ def test_a_damaged_chunk_of_a_finished_slice_is_computed_again(tmp_path):
 
 
 @pytest.mark.parametrize("damage", ["truncated", "removed", "altered"])
-def test_a_damaged_chunk_costs_exactly_its_tile(tmp_path, damage):
+def test_a_damaged_tile_costs_exactly_its_points(tmp_path, damage):
     path = tmp_path / "s.zarr"
     small = {"plane": Plane.through(SPACE, SPACE.center, ["x", "y"], resolution=(7, 5))}
-    store = fill(make(path, **small))
+    fill(make(path, **small))
     whole = open_slice(path)
     for file in chunks(filling_path(path)):
         sound = file.read_bytes()
-        torn = {"truncated": sound[: len(sound) // 2], "altered": sound[:-1] + bytes([sound[-1] ^ 1])}
+        torn = {"truncated": sound[: len(sound) // 2], "altered": sound.replace(b"NUMPY", b"numpy", 1)}
         file.unlink() if damage == "removed" else file.write_bytes(torn[damage])
-        index = tuple(map(int, file.relative_to(filling_path(path)).parts[2:4]))
-        pending = make(path, **small).pending()
-        assert [tile.index for tile in pending] == [index]
+        store = make(path, **small)
+        pending = store.pending()
+        assert [tile.name for tile in pending] == [file.stem]
+        assert store.damaged_tiles(pending) == ([] if damage == "removed" else pending)
         seen = open_slice(path)["status"].to_numpy()
-        assert (seen == Status.MISSING).sum() == store.count(pending[0])
+        assert (seen == Status.MISSING).sum() == store.tiling.count(pending[0])
         fill(store, pending)
-        assert file.read_bytes() == sound
-    xr.testing.assert_identical(open_slice(path), whole)
+        xr.testing.assert_identical(open_slice(path), whole)
+
+
+def test_no_byte_of_a_tile_changes_a_sample_unseen(tmp_path):
+    path = tmp_path / "s.zarr"
+    store = fill(make(path))
+    first, *_ = store.tiles()
+    file, values = filling_path(path) / f"pieces/{first.name}.npz", store.read_tile(first)
+    sound, lost = file.read_bytes(), 0
+    for at in range(0, len(sound), 5):
+        file.write_bytes(sound[:at] + bytes([sound[at] ^ 16]) + sound[at + 1 :])
+        found = SliceStore.open(path).read_tile(first)
+        lost += found is None
+        for name in found or {}:
+            assert found[name].tobytes() == values[name].tobytes()
+    assert lost > len(sound) / 5 / 2
 
 
 @pytest.mark.parametrize("place", [filling_path, Path])
@@ -78,17 +92,8 @@ def test_chunks_in_each_others_place_are_missing_and_not_taken_for_right(tmp_pat
             one.write_bytes(contents[0])
             other.write_bytes(contents[1])
             swapped += 1
-    assert swapped > 20
+    assert swapped > 10
     xr.testing.assert_identical(open_slice(path), whole)
-
-
-def test_a_tile_without_its_status_is_not_there_yet(tmp_path):
-    path = tmp_path / "s.zarr"
-    store = fill(make(path))
-    (filling_path(path) / "status" / "c" / "0" / "0").unlink()
-    assert [tile.index for tile in store.pending()] == [(0, 0)]
-    dataset = store.dataset()
-    assert np.isnan(dataset["loss"].values[dataset["status"].values == Status.MISSING]).all()
 
 
 @pytest.mark.parametrize(
@@ -136,7 +141,7 @@ def test_overwriting_is_asked_for_and_leaves_only_the_new_store(tmp_path):
             SliceStore.create(path, PLANE, SPACE, identity=IDENTITY)
         new = SliceStore.create(path, PLANE, SPACE, identity={"objective": "hill"}, overwrite=True)
         assert new.pending() == new.tiles()
-        assert os.listdir(tmp_path) == ["s.filling.zarr"]
+        assert os.listdir(tmp_path) == ["s.filling"]
         with pytest.raises(StoreError, match="was replaced"):
             fill(old)
         assert new.pending() == new.tiles()
@@ -152,7 +157,7 @@ def test_plain_json_is_asked_for():
 def test_a_creation_that_is_killed_leaves_nothing_in_the_way(tmp_path):
     """Kill the making of a store at ever later instants; whatever is left, the same call goes on from it."""
     left = []
-    for instant in range(1, alone(partial(make, tmp_path / "whole.zarr"), tmp_path).changes + 1, 9):
+    for instant in range(1, alone(partial(make, tmp_path / "whole.zarr"), tmp_path).changes + 1):
         path = tmp_path / str(instant) / "s.zarr"
         assert alone(partial(make, path), tmp_path, Instant(instant)).returncode == -signal.SIGKILL
         left.append(len(list(path.parent.glob(".*"))))
@@ -164,8 +169,8 @@ def test_a_creation_that_is_killed_leaves_nothing_in_the_way(tmp_path):
 
 
 def test_hidden_leftovers_are_ignored_and_cleared_away_where_nobody_holds_them(tmp_path):
-    for name in ("s", "s.filling"):
-        held, left = (tmp_path / f".{name}.zarr.{digit * 32}.making" for digit in "ab")
+    for name in ("s.zarr", "s.filling"):
+        held, left = (tmp_path / f".{name}.{digit * 32}.making" for digit in "ab")
         for folder in (held, left):
             folder.mkdir()
             (folder / "zarr.json").write_text("{")
