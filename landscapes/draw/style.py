@@ -242,12 +242,7 @@ class Scale:
         return cls(Normalize(low, high), extend)
 
     @classmethod
-    def linear(cls, low: float, high: float) -> Scale:
-        """Span a range."""
-        return cls(Normalize(low, high), "neither")
-
-    @classmethod
-    def between(cls, low: float, high: float, *, logarithmic: bool, extend: str = "neither") -> Scale:
+    def between(cls, low: float, high: float, *, logarithmic: bool = False, extend: str = "neither") -> Scale:
         """Span a range, of positive values where it is logarithmic; `extend` says where values go on beyond it."""
         return cls(LogNorm(low, high) if logarithmic else Normalize(low, high), extend)
 

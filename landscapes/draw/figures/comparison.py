@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from ...identity import plane_of
 from ...measures.ruggedness import box_slopes
 from ...objective import has_loss
+from ...space import labelled
 from .. import style
 from . import contour, page
 
@@ -97,11 +98,11 @@ def _in_powers(found: SliceComparison) -> tuple[NDArray[np.float64], str]:
 
 def _name(what: str, power: str, unit: str) -> str:
     """Return what stands along an axis, with the power of ten and the unit of its numbers."""
-    return f"{what} [{' '.join(one for one in (power, unit) if one)}]" if power or unit else what
+    return labelled(what, f"{power} {unit}".strip())
 
 
 def _cosine_map(ax: Axes, dataset: xr.Dataset, cosine: xr.DataArray) -> None:
-    scale, colours = style.Scale.linear(-1.0, 1.0), style.COSINE["cmap"]
+    scale, colours = style.Scale.between(-1.0, 1.0), style.COSINE["cmap"]
     drawn = contour.cell_map(ax, dataset, cosine.to_numpy(), scale, colours)
     page.caption(ax, "gradients of A against B")
     page.colour_bar(ax, drawn, "cosine of gradients", scale)

@@ -21,6 +21,7 @@ from ...large import in_unit
 from ...lattice import own_cells, with_gradients
 from ...objective import Status
 from ...plane import Plane
+from ...space import labelled
 from .. import style
 from . import page
 
@@ -72,17 +73,17 @@ def frame(ax: Axes, dataset: xr.Dataset, plane: Plane) -> None:
 def _shade(ax: Axes, dataset: xr.Dataset, kind: Status, look: dict[str, Any]) -> None:
     """Shade the cells of the samples that ended in one way."""
     if (where := own_cells(dataset)["status"].to_numpy() == kind).any():
-        patch = PathPatch(_cells(*cell_edges(dataset), where), **look, zorder=1.5, antialiased=False, gid=kind.name)
-        ax.add_patch(patch)
+        ax.add_patch(cells_patch(*cell_edges(dataset), where, **look, zorder=1.5, gid=kind.name))
 
 
-def _cells(u: Grid, v: Grid, where: NDArray[np.bool_]) -> Path:
-    """Return the outlines of the chosen cells as one path: hatching it costs as much as hatching one cell."""
+def cells_patch(u: Grid, v: Grid, where: NDArray[np.bool_], **look: Any) -> PathPatch:
+    """Return the outlines of the chosen cells as one patch: hatching it costs as much as hatching one cell."""
     corners = [
         [(u[column], v[row]), (u[column + 1], v[row]), (u[column + 1], v[row + 1]), (u[column], v[row + 1])]
         for row, column in np.argwhere(where)
     ]
-    return Path.make_compound_path(*(Path([*corner, corner[0]], closed=True) for corner in corners))
+    path = Path.make_compound_path(*(Path([*corner, corner[0]], closed=True) for corner in corners))
+    return PathPatch(path, antialiased=False, **look)
 
 
 def loss_panel(ax: Axes, dataset: xr.Dataset, scale: style.Scale | None = None) -> list[Artist]:
@@ -123,7 +124,7 @@ def arrow_panel(ax: Axes, dataset: xr.Dataset, scale: style.Scale | None = None)
     plane = plane_of(dataset)
     rows, columns = (arrows_along(dataset, name) for name in ("v", "u"))
     slope = plane.slope(torch.from_numpy(dataset["grad"].to_numpy())).numpy()
-    size, label = magnitude(slope, plane, dataset["loss"].attrs.get("units", ""))
+    size, label = magnitude(slope, plane, page.loss_unit(dataset))
     flat = size == 0
     with np.errstate(divide="ignore", invalid="ignore"):
         logarithm = np.where(flat, np.nan, np.log10(size))
@@ -185,7 +186,7 @@ def magnitude(slope: Grid, plane: Plane, loss_unit: str) -> tuple[Grid, str]:
     else:
         along = slope * (plane.upper - plane.lower).numpy()
         unit = f"{loss_unit or 'loss'} per width of the box"
-    return _lengths(along), f"log₁₀ |gradient| [{unit}]" if unit else "log₁₀ |gradient|"
+    return _lengths(along), labelled("log₁₀ |gradient|", unit)
 
 
 def _lengths(vectors: Grid) -> Grid:

@@ -35,7 +35,7 @@ from ...measures.undersampled import Undersampled
 from ...objective import Status
 from ...plane import Plane
 from ...sampling.refine import Refined
-from ...space import LOG10
+from ...space import LOG10, labelled
 from ...storage.files import print_width, replacing, visible_files
 from .. import style
 from ..figure import Picture as Picture
@@ -117,10 +117,20 @@ def provenance(dataset: xr.Dataset) -> str:
     return " · ".join(said)
 
 
+def made_by(record: Any, *keys: str) -> list[str]:
+    """Return what is known of how a study was made: device, date and command unless other `keys` are asked for."""
+    known = {**record.provenance, **record.identity}
+    return [str(known[key]) for key in keys or ("device", "created", "command") if known.get(key)]
+
+
 def loss_name(dataset: xr.Dataset) -> str:
     """Return what stands along an axis of losses: the word, and their unit if they have one."""
-    unit = dataset["loss"].attrs.get("units", "")
-    return f"loss [{unit}]" if unit else "loss"
+    return labelled("loss", loss_unit(dataset))
+
+
+def loss_unit(dataset: xr.Dataset) -> str:
+    """Return the unit of losses, empty where they have none."""
+    return str(dataset["loss"].attrs.get("units", ""))
 
 
 def failure_key(dataset: xr.Dataset) -> list[Patch]:

@@ -18,6 +18,7 @@ from ...large import LARGEST, in_unit
 from ...lattice import sampled_line, with_gradients
 from ...objective import Status
 from ...plane import Plane
+from ...space import labelled
 from .. import style
 from . import page
 
@@ -99,7 +100,7 @@ def _draw_slope(ax: Axes, dataset: xr.Dataset, plane: Plane) -> list[Artist]:
     )
     low, high = style.span_of_line(slope, differences)
     ax.set_ylim(low, high)
-    page.name_axes(ax, y=_slope_label(plane, dataset["loss"].attrs.get("units", "")))
+    page.name_axes(ax, y=_slope_label(plane, page.loss_unit(dataset)))
     for drawn, values in ((line, slopes), (behind, differences)):
         if off := int(((values < low) | (values > high)).sum()):
             drawn.set_label(f"{drawn.get_label()} ({off} off scale)")
@@ -121,7 +122,7 @@ def _slope_label(plane: Plane, loss_unit: str) -> str:
     unit = plane.coordinate_units[0]
     per = f"({unit})" if "/" in unit else unit
     named = f"{loss_unit or '1'}/{per}" if unit else loss_unit
-    return f"slope of the loss [{named}]" if named else "slope of the loss"
+    return labelled("slope of the loss", named)
 
 
 def _frame(ax: Axes, dataset: xr.Dataset, plane: Plane) -> None:

@@ -193,7 +193,7 @@ def _say_smoothing(ax: Axes, smooth: xr.Dataset, number: int, sure: np.ndarray[A
 
 
 def _slope_label(dataset: xr.Dataset) -> str:
-    return f"slope [{dataset['loss'].attrs.get('units') or 'loss'} per side of the box]"
+    return f"slope [{page.loss_unit(dataset) or 'loss'} per side of the box]"
 
 
 def _percent(share: xr.DataArray) -> str:

@@ -16,13 +16,12 @@ from matplotlib.text import Text
 
 from gradscape.landscapes import draw
 from gradscape.landscapes.draw.figures import page
+from gradscape.landscapes.draw.figures.accuracy import fidelity_figure, model_figure
 from gradscape.landscapes.draw.figures.comparison import comparison_figure
 from gradscape.landscapes.draw.figures.contact import Caption, episode_figure
 from gradscape.landscapes.draw.figures.contour import landscape_figure
 from gradscape.landscapes.draw.figures.convergence import convergence_figure
 from gradscape.landscapes.draw.figures.extremes import extremes_figure
-from gradscape.landscapes.draw.figures.fidelity import fidelity_figure
-from gradscape.landscapes.draw.figures.model import model_figure
 from gradscape.landscapes.draw.figures.multiples import (
     CompanionSlice,
     Landscape,

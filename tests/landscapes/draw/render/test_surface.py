@@ -117,7 +117,7 @@ def behind_a_plateau(angle: float) -> tuple[relief.Relief, xr.Dataset]:
     u, v = np.meshgrid(DATASET["u"], DATASET["v"])
     towards = u * np.cos(np.radians(angle)) + v * np.sin(np.radians(angle))
     dataset = DATASET.assign(loss=(("v", "u"), np.where(towards > 0, 1.0, 0.0)))
-    return relief.Relief(RELIEF.plane, style.Scale.linear(0.0, 1.0)), dataset
+    return relief.Relief(RELIEF.plane, style.Scale.between(0.0, 1.0)), dataset
 
 
 @pytest.mark.parametrize("angle", [0.0, 90.0, 180.0, 270.0])
