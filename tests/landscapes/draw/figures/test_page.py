@@ -103,6 +103,7 @@ CUTS = [CompanionSlice("center", np.full((4, 4), np.nan)), CompanionSlice("rando
 HUNG = [
     Landscape("swing-velocity", "smooth with local minima 100 %, discontinuous 100 %, large flat regions 100 %", PLANE)
 ]
+RACE = race(tuple(methods()), provenance=json.dumps({"created": "2026-11-21", "command": COMMAND}))
 MIXED = mixed()
 CHOSEN = {"draft": MIXED.variants[-1].name, "standard": MIXED.variants[10].name}
 FIGURES: dict[str, list[Callable[[float | None], page.Picture]]] = {
@@ -125,7 +126,10 @@ FIGURES: dict[str, list[Callable[[float | None], page.Picture]]] = {
         lambda width: overlay_figure(dated(SLICE), LAID, width=width),
         lambda width: overlay_figure(dated(SLICE), LAID[:1] * 12, width=width),
     ],
-    "race_figure": [lambda width: race_figure(race(tuple(methods())), width=width)],
+    "race_figure": [
+        lambda width: race_figure(RACE, width=width),
+        lambda width: race_figure(RACE.assign(unsuccessful=RACE["unsuccessful"] + 2), width=width),
+    ],
     "comparison_figure": [
         lambda width: comparison_figure(compared(DATASET, SHIFTED), width=width),
         lambda width: comparison_figure(compared(LINE, LINE.assign(loss=1.2 * LINE["loss"])), width=width),
@@ -142,14 +146,8 @@ FIGURES: dict[str, list[Callable[[float | None], page.Picture]]] = {
     "convergence_figure": [lambda width: convergence_figure(convergence(), width=width)],
     "model_figure": [lambda width: model_figure(study(PARTS, failing=True), width=width)],
     "companions_figure": [
-        lambda width: companions_figure(
-            [CompanionSlice("example:aim", PLANE["loss"].to_numpy()), *CUTS], PLANE, width=width
-        ),
-        lambda width: companions_figure(
-            [CompanionSlice("center", LONG["loss"].to_numpy()), CompanionSlice("random:3", LONG["loss"].to_numpy())],
-            LONG,
-            width=width,
-        ),
+        lambda width: companions_figure([AIM, *CUTS], PLANE, width=width),
+        lambda width: companions_figure([CENTER, RANDOM], LONG, width=width),
     ],
     "card_figure": [lambda width: card_figure(card(), width=width)],
     "census_figure": [lambda width: census_figure(census(), width=width)],

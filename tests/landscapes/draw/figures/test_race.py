@@ -119,21 +119,6 @@ def test_a_logarithmic_axis_has_numbers_however_many_decades_it_spans(scale):
     assert 3 <= len([text for text in shown if text]) <= 10
 
 
-@pytest.mark.parametrize("failed", [0, 2])
-def test_nothing_overlaps_or_leaves_the_page_with_every_method(failed):
-    command = f"landscape race triple-move --methods {','.join(methods())} --fidelity reference --workers 2 --report"
-    dataset = race(tuple(methods()), provenance=json.dumps({"created": "2026-11-21", "command": command}))
-    dataset["unsuccessful"][:] = failed
-    figure = race_figure(dataset)
-    figure.canvas.draw()
-    boxes = [legend.get_window_extent() for legend in figure.legends]
-    boxes += [ax.get_tightbbox() for ax in figure.axes]
-    for box in boxes:
-        assert figure.bbox.x0 <= box.x0 <= box.x1 <= figure.bbox.x1
-        assert figure.bbox.y0 <= box.y0 <= box.y1 <= figure.bbox.y1
-    assert not any(one.overlaps(other) for number, one in enumerate(boxes) for other in boxes[:number])
-
-
 def test_methods_differ_in_colour_and_without_it():
     assert set(style.METHODS) == set(methods())
     looks = list(style.METHODS.values())
