@@ -24,8 +24,7 @@ if TYPE_CHECKING:
     from ...statistics import Estimate
 
 PITCH, LEAST = 4.8, 40.0  # room of a panel: on a screen [inch], and at least in print [mm]
-WIDTH, HEIGHT, ROOM = 8.0, 2.2, 1.2  # of the picture of a line, height of its panels, room beside them [inch]
-FLATTEST = 0.55  # of these panels, against those on a screen
+HEIGHT = 2.2  # of a panel over a line [inch]
 PLAIN = 3  # digits before or after the point, up to which differences have no power of ten
 LISTED = 4  # settings that differ, in the legend
 
@@ -120,10 +119,8 @@ def _farthest(ax: Axes, found: SliceComparison) -> list[Artist]:
 
 def _draw_lines(found: SliceComparison, width: float | None) -> tuple[page.Picture, list[Artist]]:
     panels, plane = 3 if found.slopes else 2, plane_of(found.data[0])
-    sheet = style.Sheet.of(width, pitch=WIDTH)
-    height = max(FLATTEST, sheet.zoom) * HEIGHT
-    picture = page.Picture(sheet, panels * height + 1.6)
-    axes = list(picture.subplots(panels, 1, sharex=True, squeeze=False)[:, 0])
+    sheet = style.Sheet.of(width, pitch=page.LINE_PITCH)
+    picture, axes = page.stack(sheet, [max(page.FLATTEST, sheet.zoom) * HEIGHT] * panels)
     entries = _curves(axes[0], found, [one["loss"].to_numpy() for one in found.data])
     page.name_axes(axes[0], y=page.loss_name(found.data[0]))
     look = sheet.look(style.stroke(found.points))
@@ -134,9 +131,8 @@ def _draw_lines(found: SliceComparison, width: float | None) -> tuple[page.Pictu
         _curves(axes[2], found, [box_slopes(one)[:, 0] for one in found.data])
         page.name_axes(axes[2], y=f"slope [{found.loss_unit or 'loss'} per side]")
     for ax in axes:
-        page.dress(ax, plane)
-        ax.set_box_aspect(height / (sheet.width - ROOM * sheet.type))
         ax.set_xlim(float(plane.lower[0]), float(plane.upper[0]))
+        page.dress(ax, plane)
     for ax in axes[1:]:
         ax.axhline(0, color=style.FAINT, linewidth=0.8 * sheet.weight, zorder=0.5)
     page.name_axes(axes[-1], plane.labels[0])

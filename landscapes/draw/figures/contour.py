@@ -61,10 +61,8 @@ def landscape_figure(dataset: xr.Dataset, *, width: float | None = None) -> page
 
 def frame(ax: Axes, dataset: xr.Dataset, plane: Plane) -> None:
     """Give a panel over a slice its limits, its ticks and its failures."""
+    ax.set(xlim=_limits(plane, 0), ylim=_limits(plane, 1), box_aspect=1)
     page.dress(ax, plane)
-    ax.set_box_aspect(1)
-    ax.set_xlim(*_limits(plane, 0))
-    ax.set_ylim(*_limits(plane, 1))
     page.name_axes(ax, y=plane.labels[1])
     for kind, look in style.STATUS_LOOKS.items():
         _shade(ax, dataset, kind, look)

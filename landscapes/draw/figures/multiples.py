@@ -186,13 +186,18 @@ def wall_figure(landscapes: Sequence[Landscape], *, width: float | None = None) 
 
 def _draw_wall(ax: Axes, dataset: xr.Dataset) -> None:
     _frame(ax, shape=0.75)
+    if _draw_alone(ax, dataset, linewidth=1.1) is None:
+        ax.set_facecolor("white")
+
+
+def _draw_alone(ax: Axes, dataset: xr.Dataset, *, linewidth: float) -> AxesImage | None:
+    """Draw the losses of a slice on their own scale, of a plane as a map that is returned, of a line as one."""
     if plane_of(dataset).rank == 1:
         line = sampled_line(dataset)
-        ax.plot(line["u"], line["loss"], color=style.LOSS_LINE, linewidth=1.1)
-        ax.set_facecolor("white")
-        return
+        ax.plot(line["u"], line["loss"], color=style.LOSS_LINE, linewidth=linewidth)
+        return None
     loss = own_cells(dataset)["loss"].to_numpy()
-    _map(ax, loss, style.Scale.of_loss(loss))
+    return _map(ax, loss, style.Scale.of_loss(loss))
 
 
 CARD_PITCH, CARD_ACROSS, SHAPE = 2.5, 6, 1.35  # room of a map on a screen [inch]; maps in a row; its height for that
@@ -301,12 +306,8 @@ def thumbnail_figure(dataset: xr.Dataset, *, width: float | None = None) -> Pict
     ax = picture.add_axes((0, 0, 1, 1))
     ax.set_axis_off()
     picture.set_facecolor(style.UNSAMPLED)
-    dataset = sampled_line(dataset) if plane_of(dataset).rank == 1 else own_cells(dataset)
-    loss = dataset["loss"].to_numpy()
-    if plane_of(dataset).rank == 1:
-        ax.plot(dataset["u"], loss, color=style.LOSS_LINE, linewidth=1.2)
-        return picture
-    _map(ax, loss, style.Scale.of_loss(loss)).set_interpolation("antialiased")
+    if (drawn := _draw_alone(ax, dataset, linewidth=1.2)) is not None:
+        drawn.set_interpolation("antialiased")
     return picture
 
 

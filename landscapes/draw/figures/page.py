@@ -242,8 +242,24 @@ def grid(picture: Picture, panels: int, *, share: bool = False) -> list[Axes]:
     return every[:panels]
 
 
+LINE_PITCH, LINE_ROOM = 8.0, 1.2  # width of a page of panels over a line on a screen, room beside them [inch]
+FLATTEST = 0.55  # of these panels, against those on a screen: narrow ones are drawn higher than they would be
+
+
+def stack(sheet: style.Sheet, heights: Sequence[float]) -> tuple[Picture, list[Axes]]:
+    """Return panels of some heights [inch] one below the other, which share their upright lines."""
+    picture = Picture(sheet, sum(heights) + 1.6)
+    axes = list(picture.subplots(len(heights), 1, sharex=True, squeeze=False, height_ratios=heights)[:, 0])
+    for ax, height in zip(axes, heights, strict=True):
+        ax.set_box_aspect(height / (sheet.width - LINE_ROOM * sheet.type))
+    return picture, axes
+
+
 def dress(ax: Axes, plane: Plane | None = None) -> None:
-    """Give a panel its ticks and frame; over a plane, or a line, logarithmic parameters have decades."""
+    """Give a panel its ticks and frame.
+
+    Over a plane, or a line, whose limits the panel already has, logarithmic parameters have decades.
+    """
     sheet = sheet_of(ax)
     ax.tick_params(which="both", **_ticks(sheet))
     ax.tick_params(which="minor", length=2 * sheet.type)
