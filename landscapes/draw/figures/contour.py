@@ -121,11 +121,9 @@ def arrow_panel(ax: Axes, dataset: xr.Dataset, scale: style.Scale | None = None)
     """Draw the negated gradients as arrows, on the slice's own scale unless given; return the legend's entries."""
     plane = plane_of(dataset)
     rows, columns = (arrows_along(dataset, name) for name in ("v", "u"))
-    slope = plane.slope(torch.from_numpy(dataset["grad"].to_numpy())).numpy()
+    slope = slopes(dataset)
     size, label = magnitude(slope, plane, page.loss_unit(dataset))
-    flat = size == 0
-    with np.errstate(divide="ignore", invalid="ignore"):
-        logarithm = np.where(flat, np.nan, np.log10(size))
+    flat, logarithm = size == 0, _log10(size)
     scale = scale or style.Scale.of_magnitude(logarithm)
     at = np.ix_(rows, columns)
     u, v = np.meshgrid(dataset["u"].to_numpy()[columns], dataset["v"].to_numpy()[rows])
@@ -151,11 +149,19 @@ def arrow_panel(ax: Axes, dataset: xr.Dataset, scale: style.Scale | None = None)
     return [*entries, Line2D([], [], **look, label=f"gradient exactly zero: {int(flat.sum())} of {asked}")]
 
 
+def slopes(dataset: xr.Dataset) -> Grid:
+    """Return the gradients along the plane's axes, shape (v, u, 2)."""
+    grad = torch.from_numpy(dataset["grad"].transpose("v", "u", "dim").to_numpy())
+    found: Grid = plane_of(dataset).slope(grad).numpy()
+    return found
+
+
 def log_magnitude(dataset: xr.Dataset) -> Grid:
     """Return the decimal logarithm of the gradient's length along the plane; NaN where it is zero or unknown."""
-    plane = plane_of(dataset)
-    slope = plane.slope(torch.from_numpy(dataset["grad"].transpose("v", "u", "dim").to_numpy())).numpy()
-    size, _ = magnitude(slope, plane, "")
+    return _log10(magnitude(slopes(dataset), plane_of(dataset), "")[0])
+
+
+def _log10(size: Grid) -> Grid:
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(size == 0, np.nan, np.log10(size))
 

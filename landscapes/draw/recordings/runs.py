@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
-import torch
 import xarray as xr
 from matplotlib.colors import to_rgba
 from numpy.typing import ArrayLike, NDArray
@@ -110,13 +109,12 @@ def descent_arrows(scene: Scene, dataset: xr.Dataset, scale: style.Scale | None 
     """Lay the directions of steepest descent on the cells, coloured by the gradient's magnitude."""
     rows, columns = (contour.arrows_along(dataset, name) for name in ("v", "u"))
     at = np.ix_(rows, columns)
-    slope = scene.body.plane.slope(torch.from_numpy(dataset["grad"].transpose("v", "u", "dim").to_numpy())).numpy()
     logarithm = contour.log_magnitude(dataset)
     norm = (scale or style.Scale.of_magnitude(logarithm)).norm
     u, v = np.meshgrid(dataset["u"].to_numpy(), dataset["v"].to_numpy())
     places = scene.at(u, v, dataset["loss"].transpose("v", "u").to_numpy())
     origins = places[at]
-    flat = contour.descent(slope, scene.body.plane)[at] * 0.8 * SIDE / max(len(rows), len(columns))
+    flat = contour.descent(contour.slopes(dataset), scene.body.plane)[at] * 0.8 * SIDE / max(len(rows), len(columns))
     vectors = np.concatenate([flat, np.zeros_like(flat[..., :1])], axis=-1)
     seen = np.isfinite(vectors).all(axis=-1) & np.isfinite(origins).all(axis=-1)
     return rr.Arrows3D(

@@ -49,8 +49,7 @@ from ....made_studies import fidelities, study
 from ...test_overlay import LAID, SLICE
 from .records import card, census, convergence, extremes, league, mixed
 from .test_contour import BOUNCES, DATASET, LINE, Bowl, plane
-from .test_curve import table
-from .test_race import race
+from .test_search import race, table
 from .test_sweep import SWEEP
 
 pytestmark = pytest.mark.slow
