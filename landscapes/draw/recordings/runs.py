@@ -322,7 +322,7 @@ def save_sweep(sweep: Sweep, path: Path) -> None:
     """Write the slices as surfaces on a rerun timeline named after what moves, numbered like the frames from 0."""
     scales, first = Scales.of(sweep), sweep.slices[0]
     scene = Scene.of(first, [], scales.loss)
-    arrays = [np.asarray(sweep.values), *(one["loss"] for one in sweep.slices)]
+    arrays = [np.asarray(sweep.values), *(one["loss"].to_numpy() for one in sweep.slices)]
     with recording(digest(arrays), path, _blueprint_sweep(sweep, scene)) as kept:
         log_axes(kept, scene, first)
         _log(kept, "about", rr.TextDocument(_about_sweep(sweep, scales), media_type=rr.MediaType.MARKDOWN))
