@@ -225,15 +225,6 @@ class Environment(Objective):
         return found
 
     @final
-    def __call__(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, " batch"]:
-        """Return losses that torch can differentiate. Raises ValueError for x that holds no floating-point numbers."""
-        if not isinstance(x, Tensor) or not x.is_floating_point():
-            kind = f"a tensor of {x.dtype}" if isinstance(x, Tensor) else type(x).__name__
-            raise ValueError(f"{self.name}(x) takes a floating-point tensor, and evaluate(x) any numbers; got {kind}")
-        losses: Tensor = _Bridge.apply(x, self)  # type: ignore[no-untyped-call]
-        return losses
-
-    @final
     @classmethod
     def version_on(cls, engine: str) -> int:
         """Return the version of the model on an engine: results of different versions are never mixed."""
@@ -553,20 +544,3 @@ def check_shape(got: tuple[int, ...], wanted: tuple[int, ...], what: str, name: 
     if got == (*wanted, 1):
         advice = "squeeze the last axis: `.squeeze(-1)`"
     raise SimulatorError(f"{name} must return {what} of shape {wanted}; got shape {got} ({advice})")
-
-
-class _Bridge(torch.autograd.Function):
-    """Make an environment one node of torch's graph: the gradient is computed with the loss, rows being independent."""
-
-    @staticmethod
-    def forward(ctx: Any, x: Tensor, environment: Environment) -> Tensor:
-        result = environment.evaluate(x, grad=ctx.needs_input_grad[0])
-        if result.grad is not None:
-            ctx.save_for_backward(result.grad.to(x))
-        return result.loss.to(x)
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, grad_loss: Tensor) -> tuple[Tensor, None]:
-        (grad,) = ctx.saved_tensors
-        return grad_loss[:, None] * grad, None

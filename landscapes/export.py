@@ -10,7 +10,7 @@ import torch
 import xarray as xr
 
 from .identity import plane_of, stored_scales
-from .space import LINEAR, scaled_labels, to_values
+from .space import LINEAR, labelled, scaled_labels, to_values
 from .storage.arrays import parameters_of
 from .storage.files import replacing
 
@@ -78,18 +78,18 @@ def frame(dataset: xr.Dataset) -> pd.DataFrame:
 
     columns = _places(dataset) if "x" not in dataset else _points(dataset)
     unit = str(dataset["loss"].attrs.get("units", ""))
-    columns[_label("loss", unit)] = dataset["loss"].to_numpy().ravel()
+    columns[labelled("loss", unit)] = dataset["loss"].to_numpy().ravel()
     for name in ("status", "kind"):
         if name in dataset:
             columns[name] = _name_codes(dataset[name])
     for name in ("forwards", "seconds"):
         if name in dataset:
-            columns[_label(name, str(dataset[name].attrs.get("units", "")))] = dataset[name].to_numpy()
+            columns[labelled(name, str(dataset[name].attrs.get("units", "")))] = dataset[name].to_numpy()
     if "grad" in dataset:
         grad = dataset["grad"].to_numpy().reshape(-1, dataset.sizes["dim"])
         for (name, by), scale, slope in zip(parameters_of(dataset), stored_scales(dataset), grad.T, strict=True):
             per = f"{unit or '1'}/({by})" if by and scale == LINEAR else unit
-            columns[_label(f"gradient by {scaled_labels([name], [scale])[0]}", per)] = slope
+            columns[labelled(f"gradient by {scaled_labels([name], [scale])[0]}", per)] = slope
     return pd.DataFrame(columns)
 
 
@@ -103,7 +103,7 @@ def _places(dataset: xr.Dataset) -> dict[str, np.ndarray]:
 def _points(run: xr.Dataset) -> dict[str, np.ndarray]:
     """Return number and parameters of every episode."""
     values = to_values(torch.from_numpy(run["x"].to_numpy()), stored_scales(run)).numpy().T
-    named = {_label(*one): column for one, column in zip(parameters_of(run), values, strict=True)}
+    named = {labelled(*one): column for one, column in zip(parameters_of(run), values, strict=True)}
     return {"episode": run["episodes"].to_numpy(), **named}
 
 
@@ -112,7 +112,3 @@ def _name_codes(codes: xr.DataArray) -> np.ndarray:
     words = str(codes.attrs["flag_meanings"]).split()
     by_code = dict(zip(codes.attrs["flag_values"], words, strict=True))
     return np.array([by_code[code] for code in codes.to_numpy().ravel().tolist()])
-
-
-def _label(name: str, unit: str) -> str:
-    return f"{name} [{unit}]" if unit else name

@@ -166,23 +166,15 @@ def _decode(dataset: xr.Dataset, name: str) -> dict[str, Any]:
 
 
 def check_identity(
-    path: Path | None,
-    *,
-    wanted: Mapping[str, Any],
-    found: Mapping[str, Any],
-    what: str = "slice",
-    losses: str = "",
+    path: Path | None, *, wanted: Mapping[str, Any], found: Mapping[str, Any], what: str = "slice"
 ) -> None:
-    """Raise `StoreMismatchError`, naming each setting that differs, unless the two are equal.
-
-    `losses` is a sentence on losses that were found to differ, which the refusal of another model shows.
-    """
+    """Raise `StoreMismatchError`, naming each setting that differs, unless the two are equal."""
     wanted, found = current_identity(wanted), current_identity(found)
     if wanted == found:
         return
     differ = differing_settings(wanted, found)
     if differ.keys() == {MODEL_VERSION} and MODEL_VERSION in wanted and MODEL_VERSION in found:
-        raise StoreMismatchError(_other_model(path, wanted, found, what, losses))
+        raise StoreMismatchError(_other_model(path, wanted, found, what))
     said = [f"{name}: wanted {ours}, found {theirs}" for name, (ours, theirs) in differ.items()][:LISTED_SETTINGS]
     if len(differ) > LISTED_SETTINGS:
         said.append(f"and {len(differ) - LISTED_SETTINGS} more")
@@ -192,11 +184,11 @@ def check_identity(
     )
 
 
-def _other_model(path: Path | None, wanted: Mapping[str, Any], found: Mapping[str, Any], what: str, losses: str) -> str:
+def _other_model(path: Path | None, wanted: Mapping[str, Any], found: Mapping[str, Any], what: str) -> str:
     """Say that a store is of another version of a model, and what to do."""
     name, theirs, ours = wanted.get("objective", "its"), found[MODEL_VERSION], wanted[MODEL_VERSION]
     said = f"the {what} in {path or 'memory'} was made by {name} model {theirs}; this is model {ours}."
-    return " ".join(filter(None, [said, losses, "Use --out, or --force to replace it."]))
+    return f"{said} Use --out, or --force to replace it."
 
 
 def differing_settings(ours: Mapping[str, Any], theirs: Mapping[str, Any]) -> dict[str, tuple[str, str]]:

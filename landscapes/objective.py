@@ -7,7 +7,8 @@ import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import TYPE_CHECKING, Any, overload
+from operator import attrgetter
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -16,10 +17,10 @@ from torch import Tensor
 from .space import ParameterSpace, as_tensor
 
 if TYPE_CHECKING:
-    import numpy as np
     import xarray as xr
     from numpy.typing import NDArray
 
+Codes = TypeVar("Codes", Tensor, "xr.DataArray", "NDArray[Any]", int)  # one Status, or many
 ROUNDING = 1e-9  # of the box; points that are no farther beyond it are moved back
 
 
@@ -45,30 +46,21 @@ FAILED = (Status.NONFINITE, Status.ESCAPED, Status.ERROR)
 LONGEST_ERROR = 200  # characters of a message that are shown
 
 
-@overload
-def has_loss(status: Tensor) -> Tensor: ...
-@overload
-def has_loss(status: xr.DataArray) -> xr.DataArray: ...
-@overload
-def has_loss(status: NDArray[Any]) -> NDArray[np.bool_]: ...
-@overload
-def has_loss(status: int) -> bool: ...
-def has_loss(status: Any) -> Any:
+def has_loss(status: Codes) -> Codes:
     """Say which points have a finite loss; `status` is a tensor, an array or one Status."""
     return _is_any(status, HAS_LOSS)
 
 
-@overload
-def failed(status: Tensor) -> Tensor: ...
-@overload
-def failed(status: xr.DataArray) -> xr.DataArray: ...
-@overload
-def failed(status: NDArray[Any]) -> NDArray[np.bool_]: ...
-@overload
-def failed(status: int) -> bool: ...
-def failed(status: Any) -> Any:
+def failed(status: Codes) -> Codes:
     """Say which points were evaluated and have no loss; `status` is a tensor, an array or one Status."""
     return _is_any(status, FAILED)
+
+
+def _is_any(status: Codes, kinds: tuple[Status, ...]) -> Codes:
+    found: Codes = status == kinds[0]
+    for kind in kinds[1:]:
+        found = found | (status == kind)
+    return found
 
 
 def describe_errors(count: int, first: str) -> str:
@@ -78,13 +70,6 @@ def describe_errors(count: int, first: str) -> str:
     said = " ".join(first.split())
     shown = said if len(said) <= LONGEST_ERROR else f"{said[:LONGEST_ERROR]}..."
     return f"{count} point{'s' if count > 1 else ''} raised" + (f": first {shown!r}" if shown else "")
-
-
-def _is_any(status: Any, kinds: tuple[Status, ...]) -> Any:
-    found = status == kinds[0]
-    for kind in kinds[1:]:
-        found = found | (status == kind)
-    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,6 +203,14 @@ class Objective(abc.ABC):
     def evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool = True) -> Evaluation:
         """Return losses, and gradients if asked, at points `x` of the space."""
 
+    def __call__(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, " batch"]:
+        """Return losses that torch can differentiate. Raises ValueError for x that holds no floating-point numbers."""
+        if not isinstance(x, Tensor) or not x.is_floating_point():
+            kind = f"a tensor of {x.dtype}" if isinstance(x, Tensor) else type(x).__name__
+            raise ValueError(f"{self.name}(x) takes a floating-point tensor, and evaluate(x) any numbers; got {kind}")
+        losses: Tensor = _Bridge.apply(x, self)  # type: ignore[no-untyped-call]
+        return losses
+
     @property
     def precision(self) -> str:
         """float32 or float64: what losses are computed in."""
@@ -259,8 +252,25 @@ class Objective(abc.ABC):
         return x.new_zeros(len(x), 1)
 
 
+class _Bridge(torch.autograd.Function):
+    """Make an objective one node of torch's graph: the gradient is computed with the loss, rows being independent."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, objective: Objective) -> Tensor:
+        result = objective.evaluate(x, grad=ctx.needs_input_grad[0])
+        if result.grad is not None:
+            ctx.save_for_backward(result.grad.to(x))
+        return result.loss.to(x)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, grad_loss: Tensor) -> tuple[Tensor, None]:
+        (grad,) = ctx.saved_tensors
+        return grad_loss[:, None] * grad, None
+
+
 class ObjectiveWrapper(Objective):
-    """An objective around another one, which has all that the other one has."""
+    """An objective around another one, which has all that the other one has: below, what is asked of that one."""
 
     def __init__(self, objective: Objective) -> None:
         self.objective = objective
@@ -268,57 +278,10 @@ class ObjectiveWrapper(Objective):
         self.beyond_box, self.device, self.decisions = objective.beyond_box, objective.device, objective.decisions
         self.whole_batches = objective.whole_batches
 
-    @property
-    def threads(self) -> int:  # type: ignore[override] # read only
-        """Number of threads that a batch is spread over."""
-        return self.objective.threads
 
-    @property
-    def preferred_batch(self) -> int:  # type: ignore[override] # read only
-        """Number of points worth evaluating at once."""
-        return self.objective.preferred_batch
-
-    @property
-    def precision(self) -> str:
-        """float32 or float64: what losses are computed in."""
-        return self.objective.precision
-
-    @property
-    def packages(self) -> tuple[str, ...]:
-        """Packages that losses depend on, beside those that all depend on."""
-        return self.objective.packages
-
-    def identity(self) -> dict[str, Any]:
-        """Return what decides the numbers, as plain JSON."""
-        return self.objective.identity()
-
-    def prepare(self) -> None:
-        """Do what the first evaluation would do beside evaluating."""
-        self.objective.prepare()
-
-    def shrink(self, rows: int) -> None:
-        """Take at most `rows` points at once from now on."""
-        self.objective.shrink(rows)
-
-    def memory(self) -> int:
-        """Estimate the bytes that the evaluation of one point takes."""
-        return self.objective.memory()
-
-    def events(self, x: Float[Tensor, "batch dim"]) -> Mapping[str, Int[Tensor, " batch"]]:
-        """Count what happens at each point."""
-        return self.objective.events(x)
-
-    def energy(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch step"] | None:
-        """Return the mechanical energy [J] over time."""
-        return self.objective.energy(x)
-
-    def noise(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, " batch"] | None:
-        """Return the standard error of the loss at each point."""
-        return self.objective.noise(x)
-
-    def observe(self, x: Float[Tensor, "batch dim"], decision: int) -> Float[Tensor, "batch feature"]:
-        """Return what a policy sees before a decision."""
-        return self.objective.observe(x, decision)
+PASSED_ON = "threads preferred_batch precision packages identity prepare shrink memory events energy noise observe"
+for _part in PASSED_ON.split():
+    setattr(ObjectiveWrapper, _part, property(attrgetter(f"objective.{_part}")))
 
 
 class BoxedObjective(ObjectiveWrapper):

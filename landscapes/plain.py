@@ -6,7 +6,7 @@ import hashlib
 import json
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from typing import Any
 
@@ -79,11 +79,6 @@ def number(value: Any) -> float:
     if not isinstance(value, int | float) or not math.isfinite(value):
         raise TypeError(f"{value!r} is no number")
     return value
-
-
-def optional(kind: Callable[[Any], Any], value: Any) -> Any:
-    """Return what has to be of a kind, or None."""
-    return None if value is None else kind(value)
 
 
 def read_share(text: str) -> float:

@@ -139,7 +139,7 @@ class ParameterSpace:
     @property
     def labels(self) -> tuple[str, ...]:
         """Names with units, as an axis shows them, and as columns of values are called."""
-        return tuple(f"{name} [{unit}]" if unit else name for name, unit in zip(self.names, self.units, strict=True))
+        return tuple(map(labelled, self.names, self.units))
 
     @property
     def scaled_labels(self) -> tuple[str, ...]:
@@ -208,6 +208,11 @@ class ParameterSpace:
         if not 0 <= number < self.dim:
             raise ValueError(f"parameters are numbered 0 to {self.dim - 1}; got {number}")
         return number
+
+
+def labelled(name: str, unit: str) -> str:
+    """Return a name with its unit, as axes and columns have it."""
+    return f"{name} [{unit}]" if unit else name
 
 
 def to_values(x: Float[Tensor, "*batch dim"], scales: Sequence[str]) -> Float[Tensor, "*batch dim"]:

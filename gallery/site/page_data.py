@@ -328,11 +328,11 @@ def _scales(loss: np.ndarray[Any, Any], below: Sequence[float]) -> dict[str, Col
 
     scale, finite = Scale.of_loss(loss), loss[np.isfinite(loss)]
     low, high = scale.ends
-    found = {LINEAR: Scale.between(low, high, logarithmic=False, extend=scale.extend)}
+    found = {LINEAR: Scale.between(low, high, extend=scale.extend)}
     if loss.ndim == 1 and finite.size:
         low, high = min([float(finite.min()), *below]), float(finite.max())
         room = 0.04 * (high - low) or 0.5
-        found = {LINEAR: Scale.linear(low - room, high + room)}
+        found = {LINEAR: Scale.between(low - room, high + room)}
     if finite.size and 0 < low < high and finite.min() > 0:
         found[LOGARITHMIC] = Scale.between(low, high, logarithmic=True, extend=scale.extend)
     return {name: ColourScale(*one.ends, one.logarithmic, one.extend, one.ticks()) for name, one in found.items()}

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ..objective import Evaluation, Objective, Status, failed
 from ..space import ParameterSpace
-from .finding import FAIL, SKIP, Finding, verdict
+from .finding import FAIL, Finding, refused, skip, verdict
 from .subject import Subject, difference
 
 CORNERS = 16  # a box of no more corners is checked at all of them
@@ -53,15 +53,15 @@ def checks(
     ends = corners(space.dim)
     some = f"{len(ends)} of 2^{space.dim} corners, every two parameters in all four combinations"
     many = f"all {len(ends)} corners" if len(ends) == 2**space.dim else some
-    yield "corners", lambda: _check_inside("corners", objective, space.from_unit(ends), many)
-    yield "centre", lambda: _check_inside("centre", objective, space.center[None])
+    yield "corners", lambda: _check_inside(objective, space.from_unit(ends), many)
+    yield "centre", lambda: _check_inside(objective, space.center[None])
     for share in OUTSIDE:
-        name, beyond = f"{share:.0%} outside the box", space.from_unit(ends + share * (2 * ends - 1))
-        yield name, partial(_check_beyond, name, objective, beyond)
-    yield "float32 against float64", lambda: _check_precisions(subject, "float32 against float64", other)
+        beyond = space.from_unit(ends + share * (2 * ends - 1))
+        yield f"{share:.0%} outside the box", partial(_check_beyond, objective, beyond)
+    yield "float32 against float64", lambda: _check_precisions(subject, other)
     for variant in variants:
         yield variant.name, partial(_check_variant, subject, variant)
-    yield "energy drift", lambda: _check_energy(subject, "energy drift")
+    yield "energy drift", lambda: _check_energy(subject)
 
 
 def corners(dim: int) -> Float[Tensor, "corner dim"]:
@@ -117,78 +117,71 @@ def describe_missing(space: ParameterSpace, x: Float[Tensor, "batch dim"], found
     return f"the gradient is NaN at {share} of the points (first at {at}), where the loss is finite"
 
 
-def _check_inside(name: str, objective: Objective, x: Float[Tensor, "batch dim"], what: str = "") -> Finding:
+def _check_inside(objective: Objective, x: Float[Tensor, "batch dim"], what: str = "") -> Finding:
     """Check points of the box itself, where a finite loss has a gradient."""
     found = objective.evaluate(x)
-    judged = _judge(name, found, what)
-    missing = describe_missing(objective.space, x, found, "" if len(x) > 1 else f"the {name}")
+    judged = _judge(found, what)
+    missing = describe_missing(objective.space, x, found, "" if len(x) > 1 else "the centre")
     return replace(judged, outcome=FAIL, why=missing) if missing else judged
 
 
-def _check_at(name: str, objective: Objective, x: Float[Tensor, "batch dim"], *, may_refuse: bool = False) -> Finding:
-    try:
-        found = objective.evaluate(x)
-    except ValueError as refusal:
-        if not may_refuse:
-            raise
-        return verdict(name, True, f"refused: {' '.join(str(refusal).split())}")
-    return _judge(name, found)
-
-
-def _check_beyond(name: str, objective: Objective, x: Float[Tensor, "batch dim"]) -> Finding:
+def _check_beyond(objective: Objective, x: Float[Tensor, "batch dim"]) -> Finding:
     if not objective.beyond_box:
-        return Finding(name, SKIP, "not asked", "it does not invite points beyond its box (beyond_box = True does)")
-    return _check_at(name, objective, x, may_refuse=True)
+        return skip("not asked", "it does not invite points beyond its box (beyond_box = True does)")
+    try:
+        return _judge(objective.evaluate(x))
+    except ValueError as refusal:
+        return refused(refusal)
 
 
-def _judge(name: str, found: Evaluation, what: str = "") -> Finding:
+def _judge(found: Evaluation, what: str = "") -> Finding:
     counts, wrong = count_endings(found)
     figure = f"{what}: {describe_counts(counts)}" if what else describe_counts(counts)
-    return replace(verdict(name, not wrong, figure, wrong), numbers=counts)
+    return verdict(not wrong, figure, wrong, counts)
 
 
 def _check_variant(subject: Subject, variant: ExtremeCase) -> Finding:
     if variant.make is None:
-        return Finding(variant.name, SKIP, "n/a", variant.why)
+        return skip("n/a", variant.why)
     try:
         objective = variant.make()
     except ValueError as refusal:
-        return verdict(variant.name, True, f"refused: {' '.join(str(refusal).split())}")
+        return refused(refusal)
     if objective is subject.objective and variant.x is None:
-        found = _judge(variant.name, subject.rows(torch.arange(ROWS)))
+        found = subject.rows(torch.arange(ROWS))
     else:
-        found = _check_at(variant.name, objective, subject.x[:ROWS] if variant.x is None else variant.x)
-    return replace(found, why="; ".join(filter(None, (found.why, variant.why))))
+        found = objective.evaluate(subject.x[:ROWS] if variant.x is None else variant.x)
+    judged = _judge(found)
+    return replace(judged, why="; ".join(filter(None, (judged.why, variant.why))))
 
 
-def _check_energy(subject: Subject, name: str) -> Finding:
+def _check_energy(subject: Subject) -> Finding:
     """Check that the energy of undriven motions does not rise, where the objective offers `energy`.
 
     `energy(x)` returns it over time, shape (batch, step), counted from rest at the lowest place, or None.
     """
-    offered = subject.objective.energy
-    found = None if offered is None else offered(subject.x[:ROWS])
+    found = subject.objective.energy(subject.x[:ROWS])
     if found is None:
-        return Finding(name, SKIP, "n/a", "the objective offers no energy")
+        return skip("n/a", "the objective offers no energy")
     first = found[:, :1]
     rise = difference((found - found.cummin(dim=1).values) / first, torch.zeros_like(found))
     left = float((found[:, -1:] / first).mean())
     figure = f"rises by up to {rise:.1e} of what there is at first, of which {left:.4g} are left at the end"
-    judged = verdict(name, rise <= RISE, figure, f"at most {RISE:g} is wanted: the steps add energy")
-    return replace(judged, numbers={"rise": rise, "left": left, "limit": RISE})
+    why = f"at most {RISE:g} is wanted: the steps add energy"
+    return verdict(rise <= RISE, figure, why, {"rise": rise, "left": left, "limit": RISE})
 
 
-def _check_precisions(subject: Subject, name: str, other: Callable[[], Subject] | None) -> Finding:
+def _check_precisions(subject: Subject, other: Callable[[], Subject] | None) -> Finding:
     """Hold an objective against itself in the other precision: gradients agree as a third of float32's digits."""
     if other is None:
-        return Finding(name, SKIP, "n/a", f"it computes in {subject.precision} only")
+        return skip("n/a", f"it computes in {subject.precision} only")
     twin = other()
     both = (subject.first.status == Status.OK) & (twin.first.status == Status.OK)
     loss = difference(subject.first.loss[both], twin.first.loss[both]) / subject.scale
     numbers: dict[str, float | None] = {"both_finite": float(both.sum()), "loss": loss, "gradient": None}
     figure = f"{int(both.sum())} of {len(both)} points finite in both, losses up to {loss:.1e} of their range apart"
     if subject.first.grad is None or twin.first.grad is None or not bool(both.any()):
-        return Finding(name, SKIP, figure, "no gradients to compare", numbers)
+        return skip(figure, "no gradients to compare", numbers)
     space, flat = subject.objective.space, max(one.flat(one.first.loss[both]) for one in (subject, twin))
     width = space.upper - space.lower
     ours, theirs = (grad[both] * width for grad in (subject.first.grad, twin.first.grad))
@@ -196,5 +189,5 @@ def _check_precisions(subject: Subject, name: str, other: Callable[[], Subject] 
     apart = torch.where(length > flat, (ours - theirs).norm(dim=1) / length, 0.0)
     error = float(apart.quantile(0.5))
     limit = 10 * max(subject.eps, twin.eps) ** (1 / 3)
-    found = verdict(name, error <= limit, f"{figure}, gradients {error:.1e} (median)", f"wanted: at most {limit:.0e}")
-    return replace(found, numbers={**numbers, "gradient": error, "limit": limit})
+    figure, numbers = f"{figure}, gradients {error:.1e} (median)", {**numbers, "gradient": error, "limit": limit}
+    return verdict(error <= limit, figure, f"wanted: at most {limit:.0e}", numbers)

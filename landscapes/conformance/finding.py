@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
+Numbers = Mapping[str, float | None]
 PASS, FAIL, SKIP, WARN, KNOWN, UNEXPECTED = "pass", "fail", "skip", "warn", "known", "unexpected"
 
 
@@ -21,8 +22,8 @@ class Finding:
     outcome: str
     figure: str
     why: str = ""
-    numbers: Mapping[str, float | None] | None = None
-    table: tuple[Mapping[str, float | None], ...] = ()
+    numbers: Numbers | None = None
+    table: tuple[Numbers, ...] = ()
 
     @property
     def bad(self) -> bool:
@@ -39,6 +40,28 @@ class Finding:
         return replace(self, outcome=UNEXPECTED, why=f"it passes, so this is no longer true: {reason}")
 
 
-def verdict(check: str, ok: bool, figure: str, why: str = "") -> Finding:
-    """Return a pass, or a failure for the reason given."""
-    return Finding(check, PASS if ok else FAIL, figure, "" if ok else why)
+def verdict(
+    ok: bool, figure: str, why: str = "", numbers: Numbers | None = None, table: tuple[Numbers, ...] = ()
+) -> Finding:
+    """Return a pass, or a failure for the reason given; the suite says of which check."""
+    return Finding("", PASS if ok else FAIL, figure, "" if ok else why, numbers, table)
+
+
+def within(apart: float, limit: float, figure: str, why: str) -> Finding:
+    """Return a pass where numbers are no farther apart than a limit; `figure` describes those that are not equal."""
+    return verdict(apart <= limit, "same bits" if apart == 0 else figure, f"at most {limit:.0e} is wanted: {why}")
+
+
+def skip(figure: str, why: str = "", numbers: Numbers | None = None, table: tuple[Numbers, ...] = ()) -> Finding:
+    """Return a check that was not made, with the reason."""
+    return Finding("", SKIP, figure, why, numbers, table)
+
+
+def refused(refusal: ValueError) -> Finding:
+    """Return the pass of what was refused."""
+    return verdict(True, f"refused: {one_line(refusal)}")
+
+
+def one_line(error: Exception) -> str:
+    """Return what an error says, in one line."""
+    return " ".join(str(error).split())

@@ -1,8 +1,8 @@
-"""Checks of gradients: against central differences over several steps, by gradcheck, and by two backward passes."""
+"""Checks of gradients: by central differences, gradcheck and two backward passes, at special places, over horizons."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -11,9 +11,10 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.gradcheck import GradcheckError
 
-from ..objective import Objective, Status, evaluate
-from .finding import PASS, SKIP, WARN, Finding, verdict
-from .subject import Subject, difference, size
+from ..objective import Evaluation, Objective, Status, evaluate
+from ..space import ParameterSpace
+from .finding import PASS, WARN, Finding, one_line, skip, verdict, within
+from .subject import Subject, difference, size, spread
 
 DIFFERENCE_STEPS = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1)  # steps, as shares of the box
 OPTIMISER_STEP = 1e-2  # of the box: what a step of a search is long
@@ -25,11 +26,23 @@ SIGNS = 0.75  # share of slopes whose sign has to agree
 CLEAR = 10  # times the noise is what a slope has to be, to be compared
 USEFUL = 0.5  # what the median relative error of slopes may be over an optimiser's step
 LEAST_SHARE = 0.25  # share of slopes to compare for a step to be judged by
-Function = Callable[[Tensor], Tensor]
 Row = dict[str, float | None]
+NOTHING_TO_COMPARE = "no slope to compare", "all are flat, lost in noise, or failed"
+
+PLACE_STEPS = (1e-6, 1e-5, 1e-4, 1e-3)  # as shares of the box
+AXES = 4  # at each place, drawn from all
+INSIDE = 2e-3  # how far from the corner of the box, so that the longest step stays within it
+OUTSIDE_SLOPES = 0.05  # of the larger of gradient and slopes: how far outside the slopes a gradient is wrong
+
+LONGEST_STEP, PARTING = 1e-4, 1e-6  # of the box: the longest step, and how near neighbours are that may part
+FINEST = 100  # times the precision is what a parameter can be changed by
+GROWTH_ROWS, GROWTH_STEPS = 3, 3  # points, at most, and steps at each
+TOO_STEEP = 10  # times what the loss rises: what no gradient is that is right
+PARTED = 0.01  # of the losses' range: neighbours that end farther apart have parted
+MOST_POINTS = 0.5  # share of the points
 
 
-def check_slopes(subject: Subject, name: str) -> Finding:
+def check_slopes(subject: Subject) -> Finding:
     """Compare slopes along random directions and axes with central differences, one row of the table for each step.
 
     What passes is the agreement at the best step: a median relative error of at most ten times the third root of the
@@ -37,23 +50,23 @@ def check_slopes(subject: Subject, name: str) -> Finding:
     """
     slopes = _slopes(subject)
     if slopes is None:
-        return Finding(name, SKIP, "no gradient")
+        return skip("no gradient")
     limit, count = 10 * subject.eps ** (1 / 3), len(slopes[0])
     table = [_step(subject, *slopes, step) for step in DIFFERENCE_STEPS]
     if subject.precision == "float64" and _best(table, limit, count)[1] is False:
         table = [_step(subject, *slopes, step) for step in FINER_STEPS] + table
     best, agrees = _best(table, limit, count)
     if best is None:
-        return Finding(name, SKIP, "no slope to compare", "all are flat, lost in noise, or failed", table=tuple(table))
+        return skip(*NOTHING_TO_COMPARE, table=tuple(table))
     figure = (
         f"in {subject.precision}, best at {best['step']:.0e} of the box: median relative error {best['error']:.1e}, "
         f"sign right {best['sign']:.0%}, cosine {best['cosine']:z.4f}"
     )
-    found = verdict(name, agrees, figure, f"wanted: error {limit:.0e}, sign right {SIGNS:.0%}")
-    return replace(found, numbers={**best, "limit": limit}, table=tuple(table))
+    why = f"wanted: error {limit:.0e}, sign right {SIGNS:.0%}"
+    return verdict(agrees, figure, why, {**best, "limit": limit}, tuple(table))
 
 
-def check_usefulness(subject: Subject, name: str) -> Finding:
+def check_usefulness(subject: Subject) -> Finding:
     """Compare the same slopes with differences over a hundredth of the box, which is what an optimiser steps.
 
     A gradient may be right and yet say nothing of the loss so far away, where it is rugged or jumps: that is a warning
@@ -61,15 +74,15 @@ def check_usefulness(subject: Subject, name: str) -> Finding:
     """
     slopes = _slopes(subject)
     if slopes is None:
-        return Finding(name, SKIP, "no gradient")
+        return skip("no gradient")
     row = _step(subject, *slopes, OPTIMISER_STEP)
     if (row["compared"] or 0) < LEAST_SHARE * len(slopes[0]):
-        return Finding(name, SKIP, "no slope to compare", "all are flat, lost in noise, or failed")
+        return skip(*NOTHING_TO_COMPARE)
     sign, error = _number(row["sign"]), _number(row["error"])
     useful = sign >= SIGNS and error <= USEFUL
     figure = f"over {OPTIMISER_STEP:g} of the box: sign right {sign:.0%}, median relative error {error:.2g}"
     why = f"slopes do not hold that far: wanted are sign right {SIGNS:.0%} and an error of {USEFUL:g} for a search"
-    return Finding(name, PASS if useful else WARN, figure, "" if useful else why, row)
+    return Finding("", PASS if useful else WARN, figure, "" if useful else why, row)
 
 
 def _best(table: Sequence[Row], limit: float, slopes: int) -> tuple[Row | None, bool]:
@@ -133,13 +146,13 @@ def _step(subject: Subject, base: Tensor, direction: Tensor, exact: Tensor, step
     }
 
 
-def gradcheck(double: Subject, name: str) -> Finding:
+def gradcheck(double: Subject) -> Finding:
     """Hold gradients in float64 against torch's own check, at finer and finer steps until one agrees."""
     if max(double.noise) > 0:
-        return Finding(name, SKIP, "not checked", "repeats differ, and a pointwise check would measure that")
+        return skip("not checked", "repeats differ, and a pointwise check would measure that")
     rows = (double.first.status == Status.OK).nonzero().flatten()[:2]
     if not len(rows):
-        return Finding(name, SKIP, "not checked", "no point has a gradient")
+        return skip("not checked", "no point has a gradient")
     room = 2 * GRADCHECK_STEPS[0]  # so that the longest step stays within the box
     function, u = _unit(double), double.objective.space.to_unit(double.x[rows]).clamp(room, 1 - room)
     said = ""
@@ -148,49 +161,186 @@ def gradcheck(double: Subject, name: str) -> Finding:
         try:
             torch.autograd.gradcheck(function, (u.clone().requires_grad_(),), fast_mode=True, **agreement)
         except GradcheckError as error:
-            said = said or " ".join(str(error).split())[:160]
+            said = said or one_line(error)[:160]
         else:
-            return verdict(name, True, f"agrees at {len(rows)} points in float64 over {step:.0e} of the box")
-    return verdict(
-        name, False, f"disagrees over {', '.join(f'{step:.0e}' for step in GRADCHECK_STEPS)} of the box", said
-    )
+            return verdict(True, f"agrees at {len(rows)} points in float64 over {step:.0e} of the box")
+    steps = ", ".join(f"{step:.0e}" for step in GRADCHECK_STEPS)
+    return verdict(False, f"disagrees over {steps} of the box", said)
 
 
-def second_backward(subject: Subject, name: str) -> Finding:
+def second_backward(subject: Subject) -> Finding:
     """Go back twice through one graph: the second gradient is the first."""
     u = subject.objective.space.to_unit(subject.x[:2]).requires_grad_()
     total = _unit(subject)(u).nansum()
     first, second = (torch.autograd.grad(total, u, retain_graph=True)[0] for _ in range(2))
-    apart, limit = difference(first, second) / size(first), subject.tolerances[1]
-    figure = "same bits" if apart == 0 else f"{apart:.1e} of the largest component apart"
-    return verdict(name, apart <= limit, figure, f"at most {limit:.0e} is wanted: the first backward changes its tape")
+    apart = difference(first, second) / size(first)
+    figure = f"{apart:.1e} of the largest component apart"
+    return within(apart, subject.tolerances[1], figure, "the first backward changes its tape")
 
 
-def _unit(subject: Subject) -> Function:
+def _unit(subject: Subject) -> Callable[[Tensor], Tensor]:
     """Return the objective as a torch function of the unit cube, losses as shares of their range."""
     objective, scale = subject.objective, subject.scale
-    function: Function = objective if callable(objective) else _Bridge.of(objective)
-    return lambda u: function(objective.space.from_unit(u)) / scale
+    return lambda u: objective(objective.space.from_unit(u)) / scale
 
 
-class _Bridge(torch.autograd.Function):
-    """Make an objective one node of torch's graph; its backward evaluates anew, so a second one is a second look."""
+def places(space: ParameterSpace, seed: int) -> dict[str, Float[Tensor, " dim"]]:
+    """Return the places by name, in the unit cube: those that are there, and differ."""
+    zero = space.to_unit(torch.zeros(space.dim, dtype=torch.float64))
+    inside = (zero > INSIDE) & (zero < 1 - INSIDE)
+    drawn = space.to_unit(space.uniform(1, seed=seed)[0])
+    signs = torch.rand(space.dim, generator=torch.Generator().manual_seed(seed)) < 0.5
+    found = {"the centre": torch.full_like(zero, 0.5), "a corner": torch.where(signs, INSIDE, 1 - INSIDE).double()}
+    if bool(inside.any()):
+        found["zero"] = torch.where(inside, zero, drawn)
+        found["a zero"] = torch.where(torch.arange(space.dim) == int(inside.nonzero()[0]), zero, drawn)
+    return {name: u for name, u in found.items() if name != "zero" or bool((u != 0.5).any())}
 
-    @classmethod
-    def of(cls, objective: Objective) -> Function:
-        return lambda x: cls.apply(x, objective)  # type: ignore[no-untyped-call]
 
-    @staticmethod
-    def forward(ctx: Any, x: Float[Tensor, "batch dim"], objective: Objective) -> Float[Tensor, " batch"]:
-        ctx.objective = objective
-        ctx.save_for_backward(x)
-        with torch.enable_grad():  # torch switches it off around `forward` and `backward`
-            return evaluate(objective, x.detach(), grad=False).loss
+def place_episodes(dim: int) -> int:
+    """Return how many losses `check_special_places` takes, at most."""
+    return 4 * min(AXES, dim) * 2 * len(PLACE_STEPS)
 
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, grad_loss: Float[Tensor, " batch"]) -> tuple[Tensor, None]:
-        (x,) = ctx.saved_tensors
-        with torch.enable_grad():
-            grad = evaluate(ctx.objective, x.detach(), grad=True).grad
-        return grad_loss[:, None] * (x.new_zeros(x.shape) if grad is None else grad), None
+
+def check_special_places(subject: Subject) -> Finding:
+    """Hold gradients at special places against the slopes to either side, along some axes.
+
+    Random points never meet the centre, parameters that are exactly zero, and corners. A contact that does not slide, a
+    distance of zero, a tie: there a rule of differentiation may divide by zero, or choose a branch.
+
+    A gradient is wrong that is outside these slopes over every step from 1e-6 to 1e-3 of the box, by more than a
+    twentieth of the larger; where the noise hides them it is left out. A kink is none: one of its slopes is as good.
+    """
+    space = subject.objective.space
+    where = places(space, subject.seed)
+    base = torch.stack(list(where.values()))
+    here = subject.evaluate(space.from_unit(base))
+    if here.grad is None:
+        return skip("no gradient")
+    if missing := _name_missing(where, here):
+        return verdict(False, f"{len(missing)} of {len(where)} places have no gradient", "; ".join(missing))
+    generator = torch.Generator().manual_seed(subject.seed)
+    axes = torch.randperm(space.dim, generator=generator)[:AXES].sort().values
+    exact = (here.grad * (space.upper - space.lower))[:, axes]
+    beside = torch.stack(
+        [_slopes_beside(subject, base, here.loss, axes, step) for step in PLACE_STEPS]
+    )  # step, side, place, axis
+    low, high = beside.amin(dim=1), beside.amax(dim=1)
+    largest = torch.maximum(beside.abs().amax(dim=1), exact.abs())
+    outside = torch.maximum(low - exact, exact - high) > OUTSIDE_SLOPES * largest
+    noise = torch.tensor([subject.blur(here.loss) / step for step in PLACE_STEPS], dtype=torch.float64)
+    flat = subject.flat(here.loss)
+    seen = beside.isfinite().all(dim=1) & exact.isfinite() & (largest > (CLEAR * noise).clamp(min=flat)[:, None, None])
+    wrong = seen.any(dim=0) & (outside | ~seen).all(dim=0)
+    if not bool(seen.any()):
+        return skip(*NOTHING_TO_COMPARE)
+    count = f"{int(seen.any(dim=0).sum())} slopes at {', '.join(where)}"
+    if not bool(wrong.any()):
+        return verdict(True, f"{count}: between those to either side")
+    place, axis = wrong.nonzero()[0].tolist()
+    step = int(seen[:, place, axis].nonzero()[0])
+    left, right = beside[step, :, place, axis].tolist()
+    figure = (
+        f"{int(wrong.sum())} of {count} are wrong: at {[*where][place]}, by {space.names[int(axes[axis])]}, the "
+        f"gradient is {float(exact[place, axis]):.3g} and the loss rises by {left:.3g} and {right:.3g} to either side"
+    )
+    numbers: Row = {"wrong": float(wrong.sum()), "compared": float(seen.any(dim=0).sum())}
+    return verdict(False, figure, "a gradient has to lie between the slopes to either side", numbers)
+
+
+def _name_missing(where: Iterable[str], found: Evaluation) -> list[str]:
+    """Say at which places the gradient is NaN beside a finite loss."""
+    missing = found.status == Status.NO_GRADIENT
+    rows = zip(where, found.loss.tolist(), missing.tolist(), strict=True)
+    return [f"the gradient is NaN at {place}, where the loss is {loss:.4g}" for place, loss, none in rows if none]
+
+
+def _slopes_beside(
+    subject: Subject, base: Tensor, loss: Tensor, axes: Tensor, step: float
+) -> Float[Tensor, "2 place axis"]:
+    """Return the slopes over one step to either side of each place along each axis [loss unit per side of the box]."""
+    space = subject.objective.space
+    offset = step * torch.eye(space.dim, dtype=torch.float64)[axes]
+    ends = torch.stack([base[:, None] - offset, base[:, None] + offset])
+    found = evaluate(subject.objective, space.from_unit(ends.reshape(-1, space.dim)), grad=False).loss
+    behind, ahead = found.reshape(2, len(base), len(axes))
+    return torch.stack([(loss[:, None] - behind) / step, (ahead - loss[:, None]) / step])
+
+
+def growth_episodes(horizons: int) -> tuple[int, int]:
+    """Return how many losses, and losses with gradients, `check_growth` takes over so many horizons."""
+    return horizons * GROWTH_ROWS * 2 * GROWTH_STEPS, horizons * GROWTH_ROWS
+
+
+def check_growth(subject: Subject, horizons: Mapping[float, Callable[[], Objective]]) -> Finding:
+    """Hold |gradient| against the rise of the loss along it, in episodes of several lengths.
+
+    A tape that keeps too little, or a solver's rule of differentiation, may be right for a short episode and grow
+    without bounds in a longer one, in which the motion stays tame. Where neighbours part, large gradients are true.
+
+    A gradient is too steep where the loss rises along it by less than a tenth of what it says, over the shortest step
+    at which that would be seen, over ten times that step and over 1e-6 of the box, while neighbours stay within a
+    hundredth of the losses' range. It fails where most points are too steep at one length. `horizons` makes the
+    objective for a factor of its length.
+    """
+    if not horizons:
+        return skip("n/a", "it has no option `horizon`")
+    space = subject.objective.space
+    x = space.from_unit(space.to_unit(subject.x[:GROWTH_ROWS]).clamp(LONGEST_STEP, 1 - LONGEST_STEP))
+    table, refused = [], ""
+    for factor, make in horizons.items():
+        try:
+            row = _measure(replace(subject, objective=make()), x)
+        except ValueError as refusal:
+            refused = f"{factor:g}x is refused: {one_line(refusal)}"
+            continue
+        if row is None:
+            return skip("no gradient")
+        table.append({"horizon": factor, **row})
+    judged = [row for row in table if row["judged"]]
+    if not judged:
+        return skip(NOTHING_TO_COMPARE[0], refused or NOTHING_TO_COMPARE[1])
+    told = ", ".join(f"{row['gradient']:.2g} at {row['horizon']:g}x" for row in judged)
+    rises = ", ".join(f"{row['slope']:.2g}" for row in judged)
+    figure = f"|gradient| {told} the length; the loss rises along it by {rises}"
+    steep = [row for row in judged if row["steep"] > MOST_POINTS * row["judged"]]
+    said = [f"{row['steep']:.0f} of {row['judged']:.0f} points at {row['horizon']:g}x" for row in steep]
+    why = f"gradients grow where motions do not part: too steep at {', '.join(said)}"
+    found = verdict(not steep, figure, why, judged[-1])
+    return replace(found, why="; ".join(filter(None, (found.why, refused))))
+
+
+def _measure(subject: Subject, x: Float[Tensor, "batch dim"]) -> dict[str, float] | None:
+    """Measure the medians of |gradient| and of the loss's rise along it, and count the points where it is too steep."""
+    space = subject.objective.space
+    here = subject.evaluate(x)
+    if here.grad is None:
+        return None
+    slopes = here.grad * (space.upper - space.lower)
+    length = slopes.norm(dim=1)
+    direction = (slopes / length[:, None]).nan_to_num()
+    blur = subject.blur(here.loss)
+    finest = FINEST * subject.eps
+    shortest = (CLEAR**2 * blur / (2 * length)).nan_to_num(LONGEST_STEP).clamp(finest, LONGEST_STEP)
+    steps = torch.stack(
+        [shortest, (CLEAR * shortest).clamp(max=LONGEST_STEP), torch.full_like(shortest, max(PARTING, finest))]
+    )
+    offset = steps[:, :, None] * direction
+    ends = space.to_unit(x) + torch.stack([offset, -offset])  # side, step, point, parameter
+    loss = evaluate(subject.objective, space.from_unit(ends.view(-1, space.dim)), grad=False).loss
+    ahead, behind = loss.view(2, GROWTH_STEPS, -1)
+    rise, told = (ahead - behind).abs(), 2 * steps * length
+    known = (told > CLEAR * blur) & rise.isfinite() & told.isfinite()
+    judged = known.any(dim=0)
+    steep = judged & ((told > TOO_STEEP * rise) | ~known).all(dim=0) & (rise[-1] < PARTED * spread(here.loss))
+    slope = (rise / (2 * steps)).masked_fill(~known, torch.nan).nanquantile(0.5, dim=0)
+    return {
+        "gradient": _median(length[judged]),
+        "slope": _median(slope[judged]),
+        "judged": float(judged.sum()),
+        "steep": float(steep.sum()),
+    }
+
+
+def _median(values: Float[Tensor, " point"]) -> float:
+    return float(values.quantile(0.5)) if len(values) else torch.nan

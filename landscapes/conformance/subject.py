@@ -85,6 +85,10 @@ class Subject:
         finite = loss[loss.isfinite()].abs()
         return self.rounding * (float(finite.max()) if len(finite) else 0.0)
 
+    def blur(self, loss: Float[Tensor, " batch"]) -> float:
+        """Return what noise and rounding change of such losses."""
+        return self.noise[0] * self.scale + self.eps * float(loss.abs().nan_to_num().max())
+
     def evaluate(self, x: Float[Tensor, "batch dim"]) -> Evaluation:
         """Return losses and gradients at other points, held against the protocol."""
         return evaluate(self.objective, x, grad=True)

@@ -16,11 +16,7 @@ from ..sampling.memory import ADVICE, is_out_of_memory
 from . import extremes
 from . import gradients as gradient_checks
 from .extremes import ExtremeCase
-from .finding import FAIL, SKIP, UNEXPECTED, Finding, verdict
-from .horizons import check_growth
-from .horizons import episodes as growth_episodes
-from .special import check_special_places
-from .special import episodes as special_episodes
+from .finding import FAIL, SKIP, UNEXPECTED, Finding, one_line, skip, verdict, within
 from .subject import Subject, difference
 
 REPEATS = 3
@@ -81,8 +77,8 @@ def episodes(dim: int, points: int, horizons: Sequence[float] = ()) -> tuple[int
     Those of other `horizons`, factors of the length, count by their lengths.
     """
     plain = 2 * points * gradient_checks.SLOPES * (len(gradient_checks.DIFFERENCE_STEPS) + 1) + points
-    plain += special_episodes(dim)
-    longer, sloped = (round(count * sum(horizons)) for count in growth_episodes(1))
+    plain += gradient_checks.place_episodes(dim)
+    longer, sloped = (round(count * sum(horizons)) for count in gradient_checks.growth_episodes(1))
     return plain + longer, sloped + points * (REPEATS + 8) + 3 * len(extremes.corners(dim)) + 10
 
 
@@ -102,45 +98,41 @@ def _checks(
     other_mode: Callable[[], Objective] | None,
 ) -> Iterator[tuple[str, Callable[[], Finding]]]:
     for name, run in PROMISES.items():
-        yield name, partial(run, subject, name)
+        yield name, partial(run, subject)
     exact = other if subject.precision == "float32" else lambda: subject
+    best = exact or (lambda: subject)
     for name, judge in SLOPES.items():
-        yield name, partial(_judge, judge, name, exact or (lambda: subject))
+        yield name, lambda judge=judge: judge(best())  # type: ignore[misc]
     yield "gradcheck", lambda: _gradcheck(subject, exact)
-    yield "second backward", lambda: gradient_checks.second_backward(subject, "second backward")
-    yield "forward against reverse", lambda: _check_modes(subject, "forward against reverse", other_mode)
-    growth = "growth over horizons"
-    yield growth, lambda: check_growth(exact() if exact else subject, growth, horizons)
+    yield "second backward", lambda: gradient_checks.second_backward(subject)
+    yield "forward against reverse", lambda: _check_modes(subject, other_mode)
+    yield "growth over horizons", lambda: gradient_checks.check_growth(best(), horizons)
     yield from extremes.checks(subject, other, variants)
-
-
-def _judge(judge: Callable[[Subject, str], Finding], name: str, subject: Callable[[], Subject]) -> Finding:
-    return judge(subject(), name)
 
 
 def _gradcheck(subject: Subject, exact: Callable[[], Subject] | None) -> Finding:
     if exact is None:
-        return Finding("gradcheck", SKIP, "not checked", f"it computes in {subject.precision} only")
-    return gradient_checks.gradcheck(exact(), "gradcheck")
+        return skip("not checked", f"it computes in {subject.precision} only")
+    return gradient_checks.gradcheck(exact())
 
 
-def _check_modes(subject: Subject, name: str, other_mode: Callable[[], Objective] | None) -> Finding:
+def _check_modes(subject: Subject, other_mode: Callable[[], Objective] | None) -> Finding:
     """Hold gradients of the forward mode of automatic differentiation against those of the reverse mode."""
     if other_mode is None:
-        return Finding(name, SKIP, "n/a", "it has one mode of differentiation only")
+        return skip("n/a", "it has one mode of differentiation only")
     try:
         found = evaluate(other_mode(), subject.x, grad=True)
     except ValueError as refusal:
-        return Finding(name, SKIP, "not checked", " ".join(str(refusal).split()))
+        return skip("not checked", one_line(refusal))
     apart, limit = subject.differences(found, subject.first), 10 * subject.eps ** (1 / 3)
-    figure = "same bits" if max(apart) == 0 else f"gradients up to {apart[1]:.1e} of the largest component apart"
-    return verdict(name, max(apart) <= limit, figure, f"at most {limit:.0e} is wanted: one of the two is wrong")
+    figure = f"gradients up to {apart[1]:.1e} of the largest component apart"
+    return within(max(apart), limit, figure, "one of the two is wrong")
 
 
 def _try(name: str, run: Callable[[], Finding]) -> Finding:
     """Run a check; what it raises is a failure of the objective's, whatever it is."""
     try:
-        return run()
+        return replace(run(), check=name)
     except Exception as error:
         return _failure(name, error)
 
@@ -165,7 +157,7 @@ def _check_shapes(objective: Objective, x: Float[Tensor, "batch dim"]) -> Findin
         if raw.loss.requires_grad or (raw.grad is not None and raw.grad.requires_grad):
             wrong.append("loss and grad must be detached; got tensors that require gradients")
     shape = f"loss ({len(x)},), grad ({len(x)}, {x.shape[1]}), status ({len(x)},)"
-    return verdict("shapes", not wrong, shape, "; ".join(dict.fromkeys(wrong)))
+    return verdict(not wrong, shape, "; ".join(dict.fromkeys(wrong)))
 
 
 class _Given(ObjectiveWrapper):
@@ -179,19 +171,19 @@ class _Given(ObjectiveWrapper):
         return self._evaluation
 
 
-def _check_status(subject: Subject, name: str) -> Finding:
+def _check_status(subject: Subject) -> Finding:
     found = subject.objective.evaluate(subject.x)
     counts, wrong = extremes.count_endings(found)
     missing = extremes.describe_missing(subject.objective.space, subject.x, found)
-    return verdict(name, not (wrong or missing), extremes.describe_counts(counts), missing or wrong)
+    return verdict(not (wrong or missing), extremes.describe_counts(counts), missing or wrong)
 
 
-def _check_refusal_of_shapes(subject: Subject, name: str) -> Finding:
+def _check_refusal_of_shapes(subject: Subject) -> Finding:
     x, dim = subject.x, subject.objective.space.dim
     shapes = {"(2, dim + 1)": x.new_zeros(2, dim + 1), "(dim,)": x[0], "(1, 1, dim)": x[None, :1]}
     taken = [shape for shape, wrong in shapes.items() if not _refuses(subject.objective, wrong)]
     why = f"ValueError is wanted; x of shape {' and '.join(taken)} was taken"
-    return verdict(name, not taken, f"{len(shapes) - len(taken)} of {len(shapes)} shapes refused", why)
+    return verdict(not taken, f"{len(shapes) - len(taken)} of {len(shapes)} shapes refused", why)
 
 
 def _refuses(objective: Objective, x: Tensor) -> bool:
@@ -202,75 +194,73 @@ def _refuses(objective: Objective, x: Tensor) -> bool:
     return False
 
 
-def _check_refusal_of_nan(subject: Subject, name: str) -> Finding:
+def _check_refusal_of_nan(subject: Subject) -> Finding:
     """Check that nan is refused by a ValueError, or by a status of its row that changes no other row."""
     x = subject.x.clone()
     x[0, -1] = torch.nan
     try:
         found = evaluate(subject.objective, x, grad=True)
     except ValueError:
-        return verdict(name, True, "refused")
+        return verdict(True, "refused")
     others = subject.rows(torch.arange(1, len(x)))
     clean = subject.agree(found.rows(slice(1, None)), others)
     status = Status(int(found.status[0]))
     why = "the other rows changed with it" if not clean else f"a row of nan was given a loss and status {status.name}"
-    return verdict(name, failed(status) and clean, f"answered by status {status.name}", why)
+    return verdict(bool(failed(status)) and clean, f"answered by status {status.name}", why)
 
 
-def _check_determinism(subject: Subject, name: str) -> Finding:
+def _check_determinism(subject: Subject) -> Finding:
     loss, grad = subject.noise
     figure = f"same bits in {REPEATS} repeats"
     if max(loss, grad) > 0:
         figure = f"{REPEATS} repeats differ by {loss:.1e} of the loss range, {grad:.1e} of the largest gradient"
     limits = subject.repeatable
-    ok = loss <= limits[0] and grad <= limits[1]
-    found = verdict(name, ok, figure, f"at most {limits[0]:.0e} and {limits[1]:.0e} is wanted")
-    return replace(found, numbers={"loss": loss, "gradient": grad, "limit": limits[0], "gradient_limit": limits[1]})
+    numbers = {"loss": loss, "gradient": grad, "limit": limits[0], "gradient_limit": limits[1]}
+    ok, why = loss <= limits[0] and grad <= limits[1], f"at most {limits[0]:.0e} and {limits[1]:.0e} is wanted"
+    return verdict(ok, figure, why, numbers)
 
 
-def _check_rows_alone(subject: Subject, name: str) -> Finding:
+def _check_rows_alone(subject: Subject) -> Finding:
     """Evaluate the first row and the last by themselves."""
     rows = torch.tensor([0, len(subject.x) - 1])
     parts = [subject.evaluate(subject.x[row][None]) for row in rows]
-    return _compare(subject, name, Evaluation.join(parts, dim=subject.x.shape[1], grad=True), rows)
+    return _compare(subject, Evaluation.join(parts, dim=subject.x.shape[1], grad=True), rows)
 
 
-def _check_order_of_rows(subject: Subject, name: str) -> Finding:
+def _check_order_of_rows(subject: Subject) -> Finding:
     order = torch.arange(len(subject.x)).flip(0).roll(1)
-    return _compare(subject, name, subject.evaluate(subject.x[order]), order)
+    return _compare(subject, subject.evaluate(subject.x[order]), order)
 
 
-def _compare(subject: Subject, name: str, found: Evaluation, rows: Tensor) -> Finding:
+def _compare(subject: Subject, found: Evaluation, rows: Tensor) -> Finding:
     apart = subject.differences(found, subject.rows(rows))
     limits = subject.tolerances
     figure = "same bits" if max(apart) == 0 else f"loss {apart[0]:.1e} of its range, gradient {apart[1]:.1e} apart"
     why = f"at most {limits[0]:.0e} and {limits[1]:.0e} is wanted: a row depends on the rows it is evaluated with"
-    return verdict(name, all(a <= limit for a, limit in zip(apart, limits, strict=True)), figure, why)
+    return verdict(all(a <= limit for a, limit in zip(apart, limits, strict=True)), figure, why)
 
 
-def _check_empty_batch(subject: Subject, name: str) -> Finding:
+def _check_empty_batch(subject: Subject) -> Finding:
     found = subject.objective.evaluate(subject.x[:0])
     fields = {"loss": found.loss, "grad": found.grad, "status": found.status}
     shapes = {field: tuple(tensor.shape) for field, tensor in fields.items() if tensor is not None}
     wanted: dict[str, Any] = {"loss": (0,), "grad": (0, subject.objective.space.dim), "status": (0,)}
     figure = ", ".join(f"{field} {shape}" for field, shape in shapes.items())
-    return verdict(name, shapes == wanted, figure, f"wanted {wanted}")
+    return verdict(shapes == wanted, figure, f"wanted {wanted}")
 
 
-def _check_loss_without_gradient(subject: Subject, name: str) -> Finding:
+def _check_loss_without_gradient(subject: Subject) -> Finding:
     found = evaluate(subject.objective, subject.x, grad=False)
     apart = difference(found.loss, subject.first.loss) / subject.scale
-    limit = subject.tolerances[0]
-    figure = "same bits" if apart == 0 else f"{apart:.1e} of the loss range apart"
-    return verdict(name, apart <= limit, figure, f"at most {limit:.0e} is wanted: the loss depends on grad=")
+    return within(apart, subject.tolerances[0], f"{apart:.1e} of the loss range apart", "the loss depends on grad=")
 
 
-SLOPES: Mapping[str, Callable[[Subject, str], Finding]] = {
+SLOPES: Mapping[str, Callable[[Subject], Finding]] = {
     "finite differences": gradient_checks.check_slopes,
     "an optimiser's step": gradient_checks.check_usefulness,
-    "special places": check_special_places,
+    "special places": gradient_checks.check_special_places,
 }
-PROMISES: Mapping[str, Callable[[Subject, str], Finding]] = {
+PROMISES: Mapping[str, Callable[[Subject], Finding]] = {
     "status": _check_status,
     "refusal of a wrong shape": _check_refusal_of_shapes,
     "refusal of nan": _check_refusal_of_nan,

@@ -22,9 +22,9 @@ FIGURES = {
     "ConvergenceRecord": "landscapes.draw.figures.convergence:convergence_figure",
     "Episode": "landscapes.draw.figures.contact:episode_figure",
     "ExtremesRecord": "landscapes.draw.figures.extremes:extremes_figure",
-    "FidelityRecord": "landscapes.draw.figures.fidelity:fidelity_figure",
-    "MixedRecord": "landscapes.draw.figures.fidelity:mixed_figure",
-    "ModelRecord": "landscapes.draw.figures.model:model_figure",
+    "FidelityRecord": "landscapes.draw.figures.accuracy:fidelity_figure",
+    "MixedRecord": "landscapes.draw.figures.accuracy:mixed_figure",
+    "ModelRecord": "landscapes.draw.figures.accuracy:model_figure",
     "SliceComparison": "landscapes.draw.figures.comparison:comparison_figure",
 }
 _PACKAGE = __name__.partition(".landscapes.")[0]

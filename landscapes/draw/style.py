@@ -13,7 +13,7 @@ from matplotlib import colormaps
 from matplotlib.axis import Axis
 from matplotlib.colors import Colormap, ListedColormap, LogNorm, Normalize
 from matplotlib.patheffects import withStroke
-from matplotlib.ticker import FuncFormatter, Locator, LogLocator, MaxNLocator, NullFormatter
+from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 from numpy.typing import NDArray
 
 from ..large import refuse_large
@@ -242,12 +242,7 @@ class Scale:
         return cls(Normalize(low, high), extend)
 
     @classmethod
-    def linear(cls, low: float, high: float) -> Scale:
-        """Span a range."""
-        return cls(Normalize(low, high), "neither")
-
-    @classmethod
-    def between(cls, low: float, high: float, *, logarithmic: bool, extend: str = "neither") -> Scale:
+    def between(cls, low: float, high: float, *, logarithmic: bool = False, extend: str = "neither") -> Scale:
         """Span a range, of positive values where it is logarithmic; `extend` says where values go on beyond it."""
         return cls(LogNorm(low, high) if logarithmic else Normalize(low, high), extend)
 
@@ -400,11 +395,6 @@ def decades(low: float, high: float, most: int = WIDE) -> list[float]:
     return [min(max(math.log10(value), low), high) for value in values]
 
 
-def between_decades(low: float, high: float, most: int = WIDE) -> list[float]:
-    """Return where minor ticks are: at 2 to 9 times powers of ten where there is room, else at decades."""
-    return _multiples(low, high, range(1, 10) if high - low <= most else (1,))
-
-
 def _multiples(low: float, high: float, factors: Sequence[int]) -> list[float]:
     powers = range(math.floor(low), math.ceil(high) + 1)
     places = [power + math.log10(factor) for power in powers for factor in factors]
@@ -417,25 +407,12 @@ def write_power(place: float) -> str:
     return power(10.0**place, PLAIN) if abs(factor - round(factor)) < 1e-6 else number(10.0**place)
 
 
-class DecadeLocator(Locator):
-    """Find the ticks of a matplotlib axis whose coordinates are decimal logarithms: `decades`, or those between."""
-
-    def __init__(self, most: int, *, minor: bool = False) -> None:
-        self.most, self.minor = most, minor
-
-    def __call__(self) -> Sequence[float]:
-        """Return where ticks are on the axis as it is seen."""
-        assert self.axis is not None  # as matplotlib has set it
-        return self.tick_values(*self.axis.get_view_interval())
-
-    def tick_values(self, vmin: float, vmax: float) -> Sequence[float]:
-        """Return where ticks are between two ends."""
-        low, high = sorted((vmin, vmax))
-        return between_decades(low, high, self.most) if self.minor else decades(low, high, self.most)
-
-
 def mark_decades(axis: Axis, most: int = WIDE) -> None:
-    """Give a matplotlib axis whose coordinates are decimal logarithms the ticks of the values."""
-    axis.set_major_locator(DecadeLocator(most))
-    axis.set_minor_locator(DecadeLocator(most, minor=True))
+    """Give a matplotlib axis with its limits, whose coordinates are decimal logarithms, the ticks of the values.
+
+    Minor ticks are at 2 to 9 times powers of ten where there is room, else at decades.
+    """
+    low, high = sorted(axis.get_view_interval())
+    axis.set_major_locator(FixedLocator(decades(low, high, most)))
+    axis.set_minor_locator(FixedLocator(_multiples(low, high, range(1, 10) if high - low <= most else (1,))))
     axis.set_major_formatter(FuncFormatter(lambda place, _: write_power(place)))

@@ -24,10 +24,11 @@ from ..objective import Objective, evaluate, in_box
 from ..plane import Plane
 from ..space import ParameterSpace
 from ..statistics import CONFIDENCE, Estimate
-from .classify import WORDS, Verdict, classify
-from .discontinuities import EVALUATIONS_PER_PAIR, Jumps, find_jumps_abreast
+from .classify import WORDS, Verdict, classify, likeness
+from .discontinuities import EVALUATIONS_PER_PAIR, Jumps, find_jumps
 from .gradient_quality import compare_samples
-from .ruggedness import Ruggedness, ruggedness
+from .noise import noise_floor
+from .ruggedness import Ruggedness, half_step, ruggedness
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -112,9 +113,8 @@ class CensusDesign:
         generator = np.random.default_rng(seed)
         count = math.isqrt(slices)
         if along == RANDOM:
-            cuts = [
-                PlaneSpec(None, tuple(map(tuple, orthonormal(generator, space.dim).tolist()))) for _ in range(count)
-            ]
+            frames = [orthonormal(generator, space.dim).tolist() for _ in range(count)]
+            cuts = [PlaneSpec(None, tuple(map(tuple, frame))) for frame in frames]
         else:
             every = list(combinations(range(space.dim), 2))
             cuts = [PlaneSpec(every[at]) for at in sorted(generator.permutation(len(every))[:count])]
@@ -175,10 +175,10 @@ def survey(
     wholes = sample_cuts(objective, planes, gradients=gradients)
     rugged = [_ruggedness(whole, deviation) for whole in wholes]
     least = [
-        max(_floor(whole, deviation), float(np.nan_to_num(found.range)) / (max(plane.resolution) - 1) / 2)
+        max(noise_floor(deviation, whole["loss"].size), half_step(found.range, plane.resolution))
         for plane, whole, found in zip(planes, wholes, rugged, strict=True)
     ]
-    jumps = find_jumps_abreast(objective, wholes, least=least, most=STEEP, seed=seed)
+    jumps = find_jumps(objective, wholes, least=least, most=STEEP, seed=seed)
     surveyed = []
     for plane, whole, found, steep in zip(planes, wholes, rugged, jumps, strict=True):
         measures, verdict = _measure(whole, found, steep, deviation)
@@ -235,11 +235,7 @@ def _dataset(plane: Plane, loss: Array, grad: Array, status: Array) -> xr.Datase
 
 
 def _ruggedness(dataset: xr.Dataset, deviation: float) -> Ruggedness:
-    return ruggedness(dataset, floor=_floor(dataset, deviation), estimate=_alone)
-
-
-def _floor(dataset: xr.Dataset, deviation: float) -> float:
-    return 2 * deviation * math.sqrt(2 * math.log(dataset["loss"].size))
+    return ruggedness(dataset, floor=noise_floor(deviation, dataset["loss"].size), estimate=_alone)
 
 
 def _measure(dataset: xr.Dataset, found: Ruggedness, steep: Jumps | None, deviation: float) -> tuple[Array, Verdict]:
@@ -254,7 +250,6 @@ def _alone(statistic: Any, samples: Array, **bounds: float) -> Estimate:
 
 
 def _values(found: Ruggedness, jumps: float, cosine: Array) -> Array:
-    known = cosine[np.isfinite(cosine) & (cosine != 0)]
     flat = found.flat.value if found.flat is not None else math.nan
     return np.array(
         [
@@ -269,8 +264,7 @@ def _values(found: Ruggedness, jumps: float, cosine: Array) -> Array:
             found.information.value,
             found.dispersion.value,
             found.fitness_distance.value,
-            known.mean() if len(known) else math.nan,
-            (known < 0).mean() if len(known) else math.nan,
+            *likeness(cosine),
             found.range,
         ]
     )

@@ -74,24 +74,6 @@ class Jumps:
 
 def find_jumps(
     objective: Objective,
-    dataset: xr.Dataset,
-    *,
-    least: float,
-    most: int = 64,
-    seed: int = 0,
-    events: Count | None = None,
-) -> Jumps:
-    """Look for jumps of at least `least` [loss unit] between neighbouring samples, by new evaluations.
-
-    At most so many pairs, drawn at random from those that differ by as much, are bisected towards the larger half: a
-    jump keeps its height, a slope loses half of it every time.
-    """
-    (found,) = find_jumps_abreast(objective, [dataset], least=[least], most=most, seed=seed, events=events)
-    return found
-
-
-def find_jumps_abreast(
-    objective: Objective,
     datasets: Sequence[xr.Dataset],
     *,
     least: Sequence[float],
@@ -99,7 +81,12 @@ def find_jumps_abreast(
     seed: int = 0,
     events: Count | None = None,
 ) -> list[Jumps]:
-    """Return what `find_jumps` does of several slices, whose points are evaluated in one batch."""
+    """Look for jumps between neighbouring samples of slices, by new evaluations; those of all slices are in one batch.
+
+    A jump is at least as high as its slice's bound in `least` [loss unit]. At most so many pairs of a slice, drawn at
+    random from those that differ by as much, are bisected towards the larger half: a jump keeps its height, a slope
+    loses half of it every time.
+    """
     planes = [plane_of(dataset) for dataset in datasets]
     pairs = [_steep_pairs(*one) for one in zip(datasets, planes, least, strict=True)]
     drawn = [ends[np.sort(np.random.default_rng(seed).permutation(len(ends))[:most])] for ends, _ in pairs]

@@ -31,11 +31,16 @@ class Noise:
         return max(self.again, self.batch, self.rounding)
 
     def floor(self, samples: int) -> float:
-        """Return how far apart noise alone should put the extremes of so many samples [loss unit].
+        """Return how far apart noise alone should put the extremes of so many samples [loss unit]."""
+        return noise_floor(self.deviation, samples)
 
-        Twice the expected maximum of so many normal draws, sqrt(2 ln n) deviations.
-        """
-        return 2 * self.deviation * math.sqrt(2 * math.log(max(samples, 2)))
+
+def noise_floor(deviation: float, samples: int) -> float:
+    """Return how far apart noise of a standard deviation should put the extremes of so many samples.
+
+    Twice the expected maximum of so many normal draws, sqrt(2 ln n) deviations.
+    """
+    return 2 * deviation * math.sqrt(2 * math.log(max(samples, 2)))
 
 
 def noise(
@@ -55,12 +60,9 @@ def noise(
     reach = rounding * (objective.space.upper - objective.space.lower)
     moves = 2 * torch.rand(repeats, *x.shape, generator=generator, dtype=torch.float64) - 1
     moved = torch.stack([evaluate(objective, x + move * reach, grad=False).loss for move in moves])
-    known = objective.noise(x)
-    if known is not None:  # of random numbers that are the same in repeats
-        return Noise(
-            float(known.square().mean().sqrt()), _deviation(first, shuffled[None]), _deviation(first, moved), len(x)
-        )
-    return Noise(_deviation(first, again), _deviation(first, shuffled[None]), _deviation(first, moved), len(x))
+    known = objective.noise(x)  # of random numbers that are the same in repeats
+    repeated = _deviation(first, again) if known is None else float(known.square().mean().sqrt())
+    return Noise(repeated, _deviation(first, shuffled[None]), _deviation(first, moved), len(x))
 
 
 def _deviation(first: Float[Tensor, " points"], others: Float[Tensor, "repeats points"]) -> float:

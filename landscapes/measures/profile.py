@@ -23,7 +23,7 @@ from .discontinuities import Count, Jumps, find_jumps
 from .doubled_resolution import DoubledResolution, double_resolution, doubling_episodes
 from .lyapunov import GradientGrowth
 from .noise import Noise, noise
-from .ruggedness import Ruggedness, ruggedness
+from .ruggedness import Ruggedness, half_step, ruggedness
 from .undersampled import Undersampled, find_undersampled, probes
 
 PRECISION = {"float32": 2.0**-23, "float64": 2.0**-52}  # relative, of an engine that computes in it
@@ -156,8 +156,9 @@ def measure_profile(
     fuzz = noise(objective, plane.lift(drawn), rounding=rounding, repeats=REPEATS, seed=seed)
     floor = float(np.nan_to_num(fuzz.floor(dataset["loss"].size)))
     found = ruggedness(dataset, floor=floor)
-    least = max(floor, float(np.nan_to_num(found.range)) / (max(plane.resolution) - 1) / 2)
-    jumps = find_jumps(objective, dataset, least=least, most=PAIRS_PER_POINT * points, seed=seed, events=events)
+    least = [max(floor, half_step(found.range, plane.resolution))]
+    most = PAIRS_PER_POINT * points
+    (jumps,) = find_jumps(objective, [dataset], least=least, most=most, seed=seed, events=events)
     deviation = float(np.nan_to_num(fuzz.deviation))
     steps = gradients.compare_differences(objective, plane, places, deviation=deviation)
     smooth = gradients.smoothed_slopes(objective, plane, places, pairs=PAIRS, seed=seed)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -91,6 +91,11 @@ def span(loss: Values) -> float:
     refuse_large(loss)
     known = loss[np.isfinite(loss)]
     return float(known.max() - known.min()) if known.size else math.nan
+
+
+def half_step(whole: float, shape: Sequence[int]) -> float:
+    """Return half the step, from sample to sample of the longer axis, of a ramp through a range; 0 where it is NaN."""
+    return float(np.nan_to_num(whole)) / (max(shape) - 1) / 2
 
 
 def level_samples(loss: Values, depth: float) -> Values:

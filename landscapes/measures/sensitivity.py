@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 
 STEP, LINE = 0.025, 5  # of a short line: distance of its points in widths of the box, how many they are
 MOST, LEAST, AFFORDED = 16, 4, 2000  # base points by default, and the episodes up to which they are the most
-BATCH = 64  # points at a time, of an objective that does not say
 CROSSED = 8  # the most sensitive parameters, whose pairs are varied together
 Array = NDArray[np.float64]
 

@@ -36,7 +36,7 @@ from ..lattice import has_all_gradients, lift_between
 from ..objective import Objective, Status, evaluate
 from ..plane import Plane
 from ..statistics import Estimate, Values, share
-from .ruggedness import box_slopes, span
+from .ruggedness import box_slopes, half_step, span
 
 ATTRIBUTE = "unresolved"  # the attribute of a slice that holds its record
 COST = {True: 5, False: 10}  # samples of a slice, with or without gradients, that cost ten times as much as a loss
@@ -172,7 +172,7 @@ def contradicted_cells(dataset: xr.Dataset) -> NDArray[np.bool_]:
 def _least(loss: Values, floor: float) -> float:
     """Return the difference that counts from on: half a step of a ramp, and no less than the noise and rounding."""
     known = np.isfinite(loss)
-    least = max(floor, np.nan_to_num(span(loss)) / (max(loss.shape) - 1) / 2)
+    least = max(floor, half_step(span(loss), loss.shape))
     return float(max(least, ROUNDING * np.abs(loss[known]).max())) if known.any() else float(least)
 
 

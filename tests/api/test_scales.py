@@ -129,7 +129,7 @@ def test_ticks_are_at_decades_or_at_round_values_where_these_are_few(low: float,
 
 
 def test_a_surface_and_a_page_of_the_gallery_have_the_same_decades(map_of_spring: gs.Slice) -> None:
-    relief = Relief(map_of_spring.plane, Scale.linear(0, 1))
+    relief = Relief(map_of_spring.plane, Scale.between(0, 1))
     places, _ = relief.ticks(0)
     assert [relief.write(0, place) for place in places] == ["0.01", "1", "100", "10⁴", "10⁶"]
     across, up = read_off_nodes(map_of_spring.data, [], []).axes

@@ -13,7 +13,7 @@ from gradscape.envs.engines.jax_functions import compiled, computing_in
 from gradscape.envs.mjx.scene import MjxScene, Parameter
 from gradscape.envs.mjx.scenes import Drop, Push
 from gradscape.envs.registry import entries
-from gradscape.landscapes.conformance.special import check_special_places
+from gradscape.landscapes.conformance.gradients import check_special_places
 from gradscape.landscapes.conformance.subject import Subject
 
 from .scenes import made_once
@@ -175,7 +175,7 @@ def test_a_drop_that_does_not_slide_has_a_gradient_that_the_slope_beside_it_does
     assert abs(float(drop.evaluate(beside).grad[0, 0]) / float(slope) - 1) < 0.2
     assert abs(float(drop.evaluate(at).grad[0, 0]) / float(slope)) > 5
     subject = Subject.observe(drop, drop.space.uniform(2, seed=0), precision="float64", seed=0, repeats=2)
-    found = check_special_places(subject, "special places")
+    found = check_special_places(subject)
     assert found.outcome == "fail"
     assert "at the centre, by velocity x, the gradient is" in found.figure
 

@@ -1,4 +1,4 @@
-"""Records come back from JSON as they were, and what is no such record is refused."""
+"""Values and records as plain JSON and back; what JSON would not keep, or is no such record, is refused."""
 
 from __future__ import annotations
 
@@ -8,9 +8,13 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any, ClassVar, Literal
 
+import numpy as np
 import pytest
+import torch
 
 from gradscape.landscapes.convert import from_json, to_json
+from gradscape.landscapes.plain import finite, jsonable, plain_json
+from gradscape.landscapes.statistics import Estimate
 
 
 class Side(StrEnum):
@@ -70,3 +74,36 @@ def test_what_is_no_record_is_refused(changed: dict[str, Any]) -> None:
 def test_a_record_without_a_field_is_refused() -> None:
     with pytest.raises(KeyError, match="name"):
         from_json(Whole, {key: value for key, value in to_json(WHOLE).items() if key != "name"})
+
+
+def test_whatever_is_measured_becomes_strict_json():
+    found = {
+        "nan": float("nan"),
+        "pair": (np.float32(0.5), np.int64(3)),
+        "array": np.array([[1.0, np.inf]]),
+        "tensor": torch.tensor([1, 2]),
+        "estimate": Estimate(1.0, float("-inf"), 2.0),
+        "flag": np.True_,
+        "whole": 4,
+    }
+    wanted = {
+        "nan": None,
+        "pair": [0.5, 3],
+        "array": [[1.0, None]],
+        "tensor": [1, 2],
+        "estimate": {"value": 1.0, "low": None, "high": 2.0},
+        "flag": True,
+        "whole": 4,
+    }
+    assert jsonable(found) == wanted
+    assert json.loads(json.dumps(jsonable(found), allow_nan=False)) == wanted
+    assert isinstance(jsonable(4), int)
+    assert finite(float("inf")) is None
+
+
+def test_what_json_does_not_know_is_refused():
+    with pytest.raises(TypeError, match="set has no form in JSON"):
+        jsonable({"a": {1, 2}})
+    with pytest.raises(ValueError, match="a run's identity must be plain JSON"):
+        plain_json({"a": float("nan")}, "a run's identity")
+    assert plain_json({"a": (1, 2)}, "settings") == {"a": [1, 2]}

@@ -104,13 +104,6 @@ def test_another_model_is_refused_by_both_versions(branin, tmp_path, monkeypatch
         gs.slice(gs.make("branin"), **how)
 
 
-def test_the_refusal_of_another_model_shows_what_is_known_of_the_losses():
-    said = r"model 1; this is model 2\. Losses differ: 0\.163 then, 0\.171 now\. Use --out"
-    losses = "Losses differ: 0.163 then, 0.171 now."
-    with pytest.raises(StoreMismatchError, match=said):
-        check_identity(Path("cut"), wanted={**NOW, "model_version": 2}, found=NOW, losses=losses)
-
-
 def test_another_setting_beside_another_model_is_named():
     with pytest.raises(StoreMismatchError, match=r"model_version: wanted 2, found 1; seed: wanted 5, found 0"):
         check_identity(None, wanted={**NOW, "model_version": 2, "seed": 5}, found=NOW)

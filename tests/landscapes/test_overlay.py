@@ -5,13 +5,15 @@ import xarray as xr
 from matplotlib.collections import LineCollection, PathCollection
 from matplotlib.colors import to_rgba
 
+from gradscape.envs.adapters import from_torch
 from gradscape.landscapes.draw import style
 from gradscape.landscapes.draw.figures.overlay import joint_scale, overlay_figure
-from gradscape.landscapes.objective import Evaluation, Objective
 from gradscape.landscapes.overlay import best_point, improvements, overlay, principal_plane
 from gradscape.landscapes.plane import Plane
 from gradscape.landscapes.sampling.fill import sample
 from gradscape.landscapes.space import ParameterSpace
+
+from .made_runs import run_table
 
 # Units that differ a thousandfold: half-widths 1 m/s, 1000 N and 10.
 LOWER, UPPER = [-1.0, 0.0, -10.0], [1.0, 2000.0, 10.0]
@@ -21,30 +23,18 @@ SPACE = ParameterSpace(
 CENTER, HALF = np.array([0.0, 1000, 0]), np.array([1.0, 1000, 10])
 
 
-class Bowl(Objective):
-    """The squared distance from the middle of the scaled box, and a corner that is not finite."""
+def bowl(x):
+    """Return the squared distance from the middle of the scaled box, and nothing in a corner."""
+    z = (x - torch.from_numpy(CENTER)) / torch.from_numpy(HALF)
+    return torch.where((z[:, :2] > 0.75).all(dim=1), torch.nan, z.square().sum(dim=1))
 
-    space = SPACE
-    name = "bowl"
 
-    def evaluate(self, x, *, grad=True):
-        z = 2 * self.space.to_unit(x) - 1
-        loss, slope = z.square().sum(dim=1), 2 * z / torch.from_numpy(HALF)
-        loss[(z[:, :2] > 0.75).all(dim=1)] = torch.nan
-        return Evaluation.from_results(loss, slope if grad else None)
+BOWL = from_torch(bowl, SPACE, name="bowl")
 
 
 def run(z, kind, *, seed=0, method="bo-leap", grad=True) -> xr.Dataset:
     """Return the table of a run that evaluated these points of the scaled box."""
-    x = CENTER + HALF * np.asarray(z, dtype=float)
-    done = Bowl().evaluate(torch.from_numpy(x))
-    slope = done.grad.numpy() if grad else np.full_like(x, np.nan)
-    columns = {"x": x, "grad": slope, "loss": done.loss.numpy(), "status": done.status.numpy(), "kind": kind}
-    shaped = {name: (("evaluation", "dim")[: np.ndim(values)], values) for name, values in columns.items()}
-    names = ["random", "population", "descent", "acquisition", "policy"]
-    table = xr.Dataset(shaped, {"dim": list(SPACE.names)})
-    table["kind"].attrs = {"flag_values": list(range(5)), "flag_meanings": " ".join(names)}
-    return table.assign_attrs(method=method, seed=seed, lower=LOWER, upper=UPPER)
+    return run_table(BOWL, CENTER + HALF * np.asarray(z, dtype=float), kind, method=method, seed=seed, grad=grad)
 
 
 def descent(start, *, step=0.1, count=6):
@@ -55,7 +45,7 @@ def descent(start, *, step=0.1, count=6):
 
 
 PLANE = Plane.through(SPACE, SPACE.center, ("speed", "force"), resolution=(9, 5))
-SLICE = sample(Bowl(), PLANE)
+SLICE = sample(BOWL, PLANE)
 SPREAD = np.random.default_rng(0).uniform(-0.7, 0.7, (30, 3))
 
 
@@ -69,7 +59,7 @@ def test_points_fall_on_the_plane_and_their_distance_is_in_half_widths_of_the_bo
 def test_a_skew_plane_is_nearest_in_the_scaled_box_whatever_the_units():
     directions = torch.tensor([[1.0, 1000, 0], [0, 0, 10.0]]).double()  # (1, 1, 0) and (0, 0, 1) there
     skew = Plane.span(SPACE.center, directions, resolution=5)
-    (laid,) = overlay(sample(Bowl(), skew), [run([[0.6, 0.0, 0.3]], [0])])
+    (laid,) = overlay(sample(BOWL, skew), [run([[0.6, 0.0, 0.3]], [0])])
     np.testing.assert_allclose([laid["u"][0], laid["v"][0]], [0.3, 0.3])
     np.testing.assert_allclose(laid["distance"], np.hypot(0.3, 0.3))
 
@@ -83,7 +73,7 @@ def test_the_loss_beneath_is_that_of_the_cell_the_point_is_drawn_in():
 
 def test_points_beyond_the_window_are_marked_and_have_nothing_beneath():
     small = Plane.through(SPACE, SPACE.center, ("speed", "force"), resolution=5, extent=0.5)
-    (laid,) = overlay(sample(Bowl(), small), [run([[0.55, 0, 0], [0.6, 0, 0], [0, -0.99, 0]], [0, 0, 0])])
+    (laid,) = overlay(sample(BOWL, small), [run([[0.55, 0, 0], [0.6, 0, 0], [0, -0.99, 0]], [0, 0, 0])])
     np.testing.assert_array_equal(laid["outside"], [False, False, True])  # a sample is 0.25 wide
     np.testing.assert_array_equal(np.isnan(laid["beneath"]), laid["outside"])
 
@@ -128,7 +118,7 @@ def test_the_principal_plane_does_not_depend_on_units():
     flat = np.stack([np.cos(angle), np.sin(angle)], axis=1) * np.linspace(0.2, 0.8, 40)[:, None]
     z = flat @ np.array([[1, 0, 0], [0, 0.6, 0.8]])
     table = run(z, [0] * 40)
-    (laid,) = overlay(sample(Bowl(), principal_plane([table], resolution=4)), [table])
+    (laid,) = overlay(sample(BOWL, principal_plane([table], resolution=4)), [table])
     np.testing.assert_allclose(laid["distance"], 0, atol=1e-9)
     assert not laid["outside"].any()
     np.testing.assert_allclose(laid["u"] ** 2 + laid["v"] ** 2, ((z - z.mean(axis=0)) ** 2).sum(axis=1))
@@ -140,7 +130,7 @@ def test_runs_of_other_parameters_and_lines_are_refused():
     other = run(SPREAD, [0] * 30).assign_coords(dim=["a", "b", "c"])
     with pytest.raises(ValueError, match=r"bo-leap-s0 searched 3 parameters \(a, b, c\), the slice has 3 \(speed"):
         overlay(SLICE, [other])
-    line = sample(Bowl(), Plane.through(SPACE, SPACE.center, ("speed",), resolution=5))
+    line = sample(BOWL, Plane.through(SPACE, SPACE.center, ("speed",), resolution=5))
     with pytest.raises(ValueError, match="laid over planes; got a slice of rank 1"):
         overlay(line, [run(SPREAD, [0] * 30)])
 
@@ -209,7 +199,7 @@ def test_failures_are_crosses_and_neither_points_nor_best():
 @pytest.mark.drawn
 def test_points_beyond_the_map_are_hollow_at_its_border_and_counted():
     small = Plane.through(SPACE, SPACE.center, ("speed", "force"), resolution=5, extent=0.5)
-    dataset = sample(Bowl(), small)
+    dataset = sample(BOWL, small)
     laid = overlay(dataset, [run([[0.0, 0, 0], [0.9, 0, 0], [0, -0.99, 0]], [0, 0, 0])])
     figure = overlay_figure(dataset, laid)
     (hollow,) = drawn(figure.axes[0], "outside")

@@ -39,9 +39,11 @@ def test_the_interval_of_a_mean_is_students():
 
 
 def test_the_jackknife_of_a_mean_over_blocks_is_the_interval_of_the_blocks_means():
-    samples = np.repeat(RNG.normal(size=16), 3)  # a line whose 16 blocks are each of one value
-    found, wanted = jackknife(lambda at: float(np.nanmean(at)), samples), mean(samples[::3])
-    assert (found.value, found.low, found.high) == pytest.approx((wanted.value, wanted.low, wanted.high))
+    values = RNG.normal(size=16)
+    wanted = mean(values)
+    for samples in (np.repeat(values, 3), np.kron(values.reshape(4, 4), np.ones((3, 2)))):  # 16 blocks of one value
+        found = jackknife(lambda at: float(np.nanmean(at)), samples)
+        assert (found.value, found.low, found.high) == pytest.approx((wanted.value, wanted.low, wanted.high))
 
 
 @pytest.mark.parametrize("count", [2, 3, 20])

@@ -6,7 +6,7 @@ from matplotlib.text import Text
 
 from gradscape.landscapes import cost
 from gradscape.landscapes.convert import from_json, to_json
-from gradscape.landscapes.draw.figures.model import model_figure
+from gradscape.landscapes.draw.figures.accuracy import model_figure
 from gradscape.landscapes.objective import Evaluation, Objective
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.studies import samples

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from gradscape.envs.adapters import from_torch
 from gradscape.landscapes.convert import from_json, to_json
-from gradscape.landscapes.draw.figures.fidelity import fidelity_figure, short_name
+from gradscape.landscapes.draw.figures.accuracy import fidelity_figure, short_name
 from gradscape.landscapes.draw.figures.page import save
 from gradscape.landscapes.objective import Objective, Status
 from gradscape.landscapes.space import ParameterSpace

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from ...identity import plane_of
 from ...measures.ruggedness import box_slopes
 from ...objective import has_loss
+from ...space import labelled
 from .. import style
 from . import contour, page
 
@@ -23,8 +24,7 @@ if TYPE_CHECKING:
     from ...statistics import Estimate
 
 PITCH, LEAST = 4.8, 40.0  # room of a panel: on a screen [inch], and at least in print [mm]
-WIDTH, HEIGHT, ROOM = 8.0, 2.2, 1.2  # of the picture of a line, height of its panels, room beside them [inch]
-FLATTEST = 0.55  # of these panels, against those on a screen
+HEIGHT = 2.2  # of a panel over a line [inch]
 PLAIN = 3  # digits before or after the point, up to which differences have no power of ten
 LISTED = 4  # settings that differ, in the legend
 
@@ -97,11 +97,11 @@ def _in_powers(found: SliceComparison) -> tuple[NDArray[np.float64], str]:
 
 def _name(what: str, power: str, unit: str) -> str:
     """Return what stands along an axis, with the power of ten and the unit of its numbers."""
-    return f"{what} [{' '.join(one for one in (power, unit) if one)}]" if power or unit else what
+    return labelled(what, f"{power} {unit}".strip())
 
 
 def _cosine_map(ax: Axes, dataset: xr.Dataset, cosine: xr.DataArray) -> None:
-    scale, colours = style.Scale.linear(-1.0, 1.0), style.COSINE["cmap"]
+    scale, colours = style.Scale.between(-1.0, 1.0), style.COSINE["cmap"]
     drawn = contour.cell_map(ax, dataset, cosine.to_numpy(), scale, colours)
     page.caption(ax, "gradients of A against B")
     page.colour_bar(ax, drawn, "cosine of gradients", scale)
@@ -119,10 +119,8 @@ def _farthest(ax: Axes, found: SliceComparison) -> list[Artist]:
 
 def _draw_lines(found: SliceComparison, width: float | None) -> tuple[page.Picture, list[Artist]]:
     panels, plane = 3 if found.slopes else 2, plane_of(found.data[0])
-    sheet = style.Sheet.of(width, pitch=WIDTH)
-    height = max(FLATTEST, sheet.zoom) * HEIGHT
-    picture = page.Picture(sheet, panels * height + 1.6)
-    axes = list(picture.subplots(panels, 1, sharex=True, squeeze=False)[:, 0])
+    sheet = style.Sheet.of(width, pitch=page.LINE_PITCH)
+    picture, axes = page.stack(sheet, [max(page.FLATTEST, sheet.zoom) * HEIGHT] * panels)
     entries = _curves(axes[0], found, [one["loss"].to_numpy() for one in found.data])
     page.name_axes(axes[0], y=page.loss_name(found.data[0]))
     look = sheet.look(style.stroke(found.points))
@@ -133,9 +131,8 @@ def _draw_lines(found: SliceComparison, width: float | None) -> tuple[page.Pictu
         _curves(axes[2], found, [box_slopes(one)[:, 0] for one in found.data])
         page.name_axes(axes[2], y=f"slope [{found.loss_unit or 'loss'} per side]")
     for ax in axes:
-        page.dress(ax, plane)
-        ax.set_box_aspect(height / (sheet.width - ROOM * sheet.type))
         ax.set_xlim(float(plane.lower[0]), float(plane.upper[0]))
+        page.dress(ax, plane)
     for ax in axes[1:]:
         ax.axhline(0, color=style.FAINT, linewidth=0.8 * sheet.weight, zorder=0.5)
     page.name_axes(axes[-1], plane.labels[0])

@@ -21,6 +21,7 @@ from ...large import in_unit
 from ...lattice import own_cells, with_gradients
 from ...objective import Status
 from ...plane import Plane
+from ...space import labelled
 from .. import style
 from . import page
 
@@ -60,10 +61,8 @@ def landscape_figure(dataset: xr.Dataset, *, width: float | None = None) -> page
 
 def frame(ax: Axes, dataset: xr.Dataset, plane: Plane) -> None:
     """Give a panel over a slice its limits, its ticks and its failures."""
+    ax.set(xlim=_limits(plane, 0), ylim=_limits(plane, 1), box_aspect=1)
     page.dress(ax, plane)
-    ax.set_box_aspect(1)
-    ax.set_xlim(*_limits(plane, 0))
-    ax.set_ylim(*_limits(plane, 1))
     page.name_axes(ax, y=plane.labels[1])
     for kind, look in style.STATUS_LOOKS.items():
         _shade(ax, dataset, kind, look)
@@ -72,17 +71,17 @@ def frame(ax: Axes, dataset: xr.Dataset, plane: Plane) -> None:
 def _shade(ax: Axes, dataset: xr.Dataset, kind: Status, look: dict[str, Any]) -> None:
     """Shade the cells of the samples that ended in one way."""
     if (where := own_cells(dataset)["status"].to_numpy() == kind).any():
-        patch = PathPatch(_cells(*cell_edges(dataset), where), **look, zorder=1.5, antialiased=False, gid=kind.name)
-        ax.add_patch(patch)
+        ax.add_patch(cells_patch(*cell_edges(dataset), where, **look, zorder=1.5, gid=kind.name))
 
 
-def _cells(u: Grid, v: Grid, where: NDArray[np.bool_]) -> Path:
-    """Return the outlines of the chosen cells as one path: hatching it costs as much as hatching one cell."""
+def cells_patch(u: Grid, v: Grid, where: NDArray[np.bool_], **look: Any) -> PathPatch:
+    """Return the outlines of the chosen cells as one patch: hatching it costs as much as hatching one cell."""
     corners = [
         [(u[column], v[row]), (u[column + 1], v[row]), (u[column + 1], v[row + 1]), (u[column], v[row + 1])]
         for row, column in np.argwhere(where)
     ]
-    return Path.make_compound_path(*(Path([*corner, corner[0]], closed=True) for corner in corners))
+    path = Path.make_compound_path(*(Path([*corner, corner[0]], closed=True) for corner in corners))
+    return PathPatch(path, antialiased=False, **look)
 
 
 def loss_panel(ax: Axes, dataset: xr.Dataset, scale: style.Scale | None = None) -> list[Artist]:
@@ -122,11 +121,9 @@ def arrow_panel(ax: Axes, dataset: xr.Dataset, scale: style.Scale | None = None)
     """Draw the negated gradients as arrows, on the slice's own scale unless given; return the legend's entries."""
     plane = plane_of(dataset)
     rows, columns = (arrows_along(dataset, name) for name in ("v", "u"))
-    slope = plane.slope(torch.from_numpy(dataset["grad"].to_numpy())).numpy()
-    size, label = magnitude(slope, plane, dataset["loss"].attrs.get("units", ""))
-    flat = size == 0
-    with np.errstate(divide="ignore", invalid="ignore"):
-        logarithm = np.where(flat, np.nan, np.log10(size))
+    slope = slopes(dataset)
+    size, label = magnitude(slope, plane, page.loss_unit(dataset))
+    flat, logarithm = size == 0, _log10(size)
     scale = scale or style.Scale.of_magnitude(logarithm)
     at = np.ix_(rows, columns)
     u, v = np.meshgrid(dataset["u"].to_numpy()[columns], dataset["v"].to_numpy()[rows])
@@ -152,11 +149,19 @@ def arrow_panel(ax: Axes, dataset: xr.Dataset, scale: style.Scale | None = None)
     return [*entries, Line2D([], [], **look, label=f"gradient exactly zero: {int(flat.sum())} of {asked}")]
 
 
+def slopes(dataset: xr.Dataset) -> Grid:
+    """Return the gradients along the plane's axes, shape (v, u, 2)."""
+    grad = torch.from_numpy(dataset["grad"].transpose("v", "u", "dim").to_numpy())
+    found: Grid = plane_of(dataset).slope(grad).numpy()
+    return found
+
+
 def log_magnitude(dataset: xr.Dataset) -> Grid:
     """Return the decimal logarithm of the gradient's length along the plane; NaN where it is zero or unknown."""
-    plane = plane_of(dataset)
-    slope = plane.slope(torch.from_numpy(dataset["grad"].transpose("v", "u", "dim").to_numpy())).numpy()
-    size, _ = magnitude(slope, plane, "")
+    return _log10(magnitude(slopes(dataset), plane_of(dataset), "")[0])
+
+
+def _log10(size: Grid) -> Grid:
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(size == 0, np.nan, np.log10(size))
 
@@ -185,7 +190,7 @@ def magnitude(slope: Grid, plane: Plane, loss_unit: str) -> tuple[Grid, str]:
     else:
         along = slope * (plane.upper - plane.lower).numpy()
         unit = f"{loss_unit or 'loss'} per width of the box"
-    return _lengths(along), f"log₁₀ |gradient| [{unit}]" if unit else "log₁₀ |gradient|"
+    return _lengths(along), labelled("log₁₀ |gradient|", unit)
 
 
 def _lengths(vectors: Grid) -> Grid:

@@ -56,7 +56,7 @@ def convergence_figure(found: ConvergenceRecord, *, width: float | None = None) 
         _draw_distributions(axes[-1], found, entries)
         axes[-1].set_box_aspect(max(FLAT, ROW * len(found.distributions.compared)) if flat else SHAPE)
     page.entitle(picture, f"{found.env} · self-convergence · {found.points} points")
-    page.finish(picture, list(entries.values()), columns=3, heading=_provenance(found))
+    page.finish(picture, list(entries.values()), columns=3, heading=" · ".join(page.made_by(found)))
     return picture
 
 
@@ -172,9 +172,3 @@ def _draw_distributions(ax: Axes, found: ConvergenceRecord, entries: dict[str, A
     ax.margins(y=0.15)
     page.name_axes(ax, "Wasserstein's distance from the reference [share of the spread]")
     page.caption(ax, f"losses over {apart.neighbourhoods} neighbourhoods")
-
-
-def _provenance(found: ConvergenceRecord) -> str:
-    """Say who measured it, and how."""
-    known = {**found.provenance, **found.identity}
-    return " · ".join(f"{known[key]}" for key in ("device", "created", "command") if known.get(key))

@@ -10,14 +10,14 @@ import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
-from matplotlib.patches import Patch, PathPatch
-from matplotlib.path import Path
+from matplotlib.patches import Patch
 from matplotlib.ticker import FixedLocator
 from numpy.typing import NDArray
 
 from ...objective import Status
+from ...space import labelled
 from .. import style
-from . import page
+from . import contour, page
 
 if TYPE_CHECKING:
     from ....studies.extremes import ExtremesRecord, Limit, StabilityMap
@@ -57,14 +57,15 @@ def extremes_figure(found: ExtremesRecord, *, width: float | None = None) -> pag
         for one in maps:
             entries |= _draw_map(next(axes), one)
     page.entitle(picture, f"{found.env} · {found.fidelity} · extremes · {found.points} points")
-    page.finish(picture, list(entries.values()), columns=4, heading=_provenance(found))
+    page.finish(
+        picture,
+        list(entries.values()),
+        columns=4,
+        heading=" · ".join(
+            [f"judged by {found.reference}", *page.made_by(found, "device", "engine", "created"), found.command]
+        ),
+    )
     return picture
-
-
-def _provenance(found: ExtremesRecord) -> str:
-    known = {**found.provenance, **found.identity}
-    said = [f"judged by {found.reference}", *(str(known[key]) for key in ("device", "engine", "created") if known[key])]
-    return " · ".join([*said, found.command])
 
 
 def _draw_errors(ax: Axes, limits: Sequence[Limit], tolerance: float, precision: str) -> dict[str, Artist]:
@@ -131,7 +132,7 @@ def _draw_map(ax: Axes, found: StabilityMap) -> dict[str, Artist]:
     edges = _edges(found.xs), _edges(found.ys)
     for outcome in [name for name in style.OUTCOMES if (outcomes == name).any()]:
         look = style.OUTCOMES[outcome]
-        ax.add_patch(PathPatch(_cells(edges[0], edges[1], outcomes == outcome), **look, antialiased=False, gid=outcome))
+        ax.add_patch(contour.cells_patch(*edges, outcomes == outcome, **look, gid=outcome))
         entries[outcome] = Patch(**look, label=NAMES[outcome])
     lines = {"limit of accuracy, bisected": found.accurate_boundary, "limit of stability, bisected": found.boundary}
     for label, ends in lines.items():
@@ -149,13 +150,9 @@ def _draw_map(ax: Axes, found: StabilityMap) -> dict[str, Artist]:
         if min(values) > 0:
             page.log_axis(axis)
     ax.set_box_aspect(1)
-    page.name_axes(ax, *(_label(name, unit) for name, unit in zip((found.x, found.y), found.units, strict=True)))
+    page.name_axes(ax, *map(labelled, (found.x, found.y), found.units))
     page.caption(ax, f"{found.precision}: {found.x} against {found.y}")
     return entries
-
-
-def _label(name: str, unit: str) -> str:
-    return f"{name} [{unit}]" if unit else name
 
 
 def _edges(values: Sequence[float]) -> Grid:
@@ -165,12 +162,3 @@ def _edges(values: Sequence[float]) -> Grid:
     half = np.diff(at) / 2 if len(at) > 1 else np.array([0.5])
     found: Grid = np.concatenate([[at[0] - half[0]], at[:-1] + half[: len(at) - 1], [at[-1] + half[-1]]])
     return np.exp(found) if ratio else found
-
-
-def _cells(u: Grid, v: Grid, where: NDArray[np.bool_]) -> Path:
-    """Return the outlines of the chosen cells as one path."""
-    corners = [
-        [(u[column], v[row]), (u[column + 1], v[row]), (u[column + 1], v[row + 1]), (u[column], v[row + 1])]
-        for row, column in np.argwhere(where)
-    ]
-    return Path.make_compound_path(*(Path([*corner, corner[0]], closed=True) for corner in corners))

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from ...identity import plane_of
 from ...lattice import own_cells, sampled_line
+from ...space import labelled
 from .. import style
 from ..figure import Picture
 from . import page
@@ -122,17 +123,16 @@ def census_figure(census: Census, *, width: float | None = None) -> page.Picture
         drawn = _map(ax, census.losses[number], scale)
     for empty in axes[len(census.slices) :]:
         empty.set_axis_off()
-    unit = f" [{census.loss_unit}]" if census.loss_unit else ""
-    page.colour_bar(axes[0], drawn, f"loss{unit}", scale, beside=axes)
+    page.colour_bar(axes[0], drawn, labelled("loss", census.loss_unit), scale, beside=axes)
     many = f"{len(census.slices)} slices, the least rugged first"
     page.entitle(picture, f"{census.env} · census at {census.fidelity} · {many}")
-    page.finish(picture, _words(census), columns=2, heading=_made(census))
+    page.finish(
+        picture,
+        _words(census),
+        columns=2,
+        heading=" · ".join([*page.made_by(census, "device", "created"), *filter(None, [census.command])]),
+    )
     return picture
-
-
-def _made(census: Census) -> str:
-    known = (census.identity.get("device"), census.provenance.get("created"), census.command)
-    return " · ".join(str(one) for one in known if one)
 
 
 def _words(census: Census) -> list[Patch]:
@@ -186,20 +186,21 @@ def wall_figure(landscapes: Sequence[Landscape], *, width: float | None = None) 
 
 def _draw_wall(ax: Axes, dataset: xr.Dataset) -> None:
     _frame(ax, shape=0.75)
+    if _draw_alone(ax, dataset, linewidth=1.1) is None:
+        ax.set_facecolor("white")
+
+
+def _draw_alone(ax: Axes, dataset: xr.Dataset, *, linewidth: float) -> AxesImage | None:
+    """Draw the losses of a slice on their own scale, of a plane as a map that is returned, of a line as one."""
     if plane_of(dataset).rank == 1:
         line = sampled_line(dataset)
-        ax.plot(line["u"], line["loss"], color=style.LOSS_LINE, linewidth=1.1)
-        ax.set_facecolor("white")
-        return
+        ax.plot(line["u"], line["loss"], color=style.LOSS_LINE, linewidth=linewidth)
+        return None
     loss = own_cells(dataset)["loss"].to_numpy()
-    _map(ax, loss, style.Scale.of_loss(loss))
+    return _map(ax, loss, style.Scale.of_loss(loss))
 
 
-CARD_PITCH, CARD_ACROSS, SHAPE = (
-    2.5,
-    6,
-    1.35,
-)  # room of a map on a screen [inch]; so many in a row; height of a row for that
+CARD_PITCH, CARD_ACROSS, SHAPE = 2.5, 6, 1.35  # room of a map on a screen [inch]; maps in a row; its height for that
 FEWEST = 3  # for the legend below
 CARD_LEAST = 27.0  # room of a map in print [mm]
 ARROWS = 9  # most along each axis of a map
@@ -245,9 +246,8 @@ def _draw_scene(scene: str, places: Sequence[tuple[int | None, Axes]], card: Car
         else:
             _draw_map(ax, card.grades[number], card.slices.get(number), scale)
     if cuts:
-        unit = f" [{cuts[0].loss_unit}]" if cuts[0].loss_unit else ""
-        shown = ScalarMappable(scale.norm, style.LOSS_MAP)
-        page.colour_bar(places[0][1], shown, f"{scene}: loss{unit}", scale, beside=[ax for _, ax in places], aspect=12)
+        shown, said = ScalarMappable(scale.norm, style.LOSS_MAP), labelled(f"{scene}: loss", cuts[0].loss_unit)
+        page.colour_bar(places[0][1], shown, said, scale, beside=[ax for _, ax in places], aspect=12)
 
 
 def _draw_map(ax: Axes, grade: Grade, cut: CardSlice | None, scale: style.Scale) -> None:
@@ -306,12 +306,8 @@ def thumbnail_figure(dataset: xr.Dataset, *, width: float | None = None) -> Pict
     ax = picture.add_axes((0, 0, 1, 1))
     ax.set_axis_off()
     picture.set_facecolor(style.UNSAMPLED)
-    dataset = sampled_line(dataset) if plane_of(dataset).rank == 1 else own_cells(dataset)
-    loss = dataset["loss"].to_numpy()
-    if plane_of(dataset).rank == 1:
-        ax.plot(dataset["u"], loss, color=style.LOSS_LINE, linewidth=1.2)
-        return picture
-    _map(ax, loss, style.Scale.of_loss(loss)).set_interpolation("antialiased")
+    if (drawn := _draw_alone(ax, dataset, linewidth=1.2)) is not None:
+        drawn.set_interpolation("antialiased")
     return picture
 
 

@@ -19,6 +19,7 @@ from ...identity import plane_of
 from ...objective import failed
 from ...overlay import IMPROVEMENTS_OF, improvements, run_name
 from ...plane import Plane
+from ...space import labelled
 from .. import style
 from . import contour, page
 
@@ -175,9 +176,8 @@ def _draw_against(ax: Axes, dataset: xr.Dataset, runs: Runs, reach: float) -> No
         for name, here in by_kind(run):
             at = some & here
             ax.scatter(beneath[at], loss[at], s=areas[at], marker=style.POINT_MARKS[name]["marker"], gid=name, **look)
-    unit = dataset["loss"].attrs.get("units", "")
-    per = f" [{unit}]" if unit else ""
-    page.name_axes(ax, f"loss of the sample beneath{per}", f"loss of the point itself{per}")
+    unit = page.loss_unit(dataset)
+    page.name_axes(ax, *(labelled(f"loss of the {what}", unit) for what in ("sample beneath", "point itself")))
     off = int(((values < low) | (values > high)).sum())
     said = f"{len(values) // 2} of {_count(runs)} points have a loss, and so has the sample beneath"
     page.remark(ax, said + (f"; {off} values off scale" if off else ""))
@@ -218,8 +218,7 @@ def _describe_best(runs: Runs) -> str:
     away = float(run["distance"][row])
     where = f", {half_widths(away)} off the plane" if away > 1e-9 else ""
     beyond = ", outside the map" if bool(run["outside"][row]) else ""
-    unit = run["loss"].attrs.get("units", "")
-    return f"best {style.number(loss)}{f' {unit}' if unit else ''}{where}{beyond}"
+    return f"best {style.number(loss)} {page.loss_unit(run)}".rstrip() + where + beyond
 
 
 def half_widths(distance: float) -> str:

@@ -35,7 +35,7 @@ from ...measures.undersampled import Undersampled
 from ...objective import Status
 from ...plane import Plane
 from ...sampling.refine import Refined
-from ...space import LOG10
+from ...space import LOG10, labelled
 from ...storage.files import print_width, replacing, visible_files
 from .. import style
 from ..figure import Picture as Picture
@@ -117,10 +117,20 @@ def provenance(dataset: xr.Dataset) -> str:
     return " · ".join(said)
 
 
+def made_by(record: Any, *keys: str) -> list[str]:
+    """Return what is known of how a study was made: device, date and command unless other `keys` are asked for."""
+    known = {**record.provenance, **record.identity}
+    return [str(known[key]) for key in keys or ("device", "created", "command") if known.get(key)]
+
+
 def loss_name(dataset: xr.Dataset) -> str:
     """Return what stands along an axis of losses: the word, and their unit if they have one."""
-    unit = dataset["loss"].attrs.get("units", "")
-    return f"loss [{unit}]" if unit else "loss"
+    return labelled("loss", loss_unit(dataset))
+
+
+def loss_unit(dataset: xr.Dataset) -> str:
+    """Return the unit of losses, empty where they have none."""
+    return str(dataset["loss"].attrs.get("units", ""))
 
 
 def failure_key(dataset: xr.Dataset) -> list[Patch]:
@@ -232,8 +242,24 @@ def grid(picture: Picture, panels: int, *, share: bool = False) -> list[Axes]:
     return every[:panels]
 
 
+LINE_PITCH, LINE_ROOM = 8.0, 1.2  # width of a page of panels over a line on a screen, room beside them [inch]
+FLATTEST = 0.55  # of these panels, against those on a screen: narrow ones are drawn higher than they would be
+
+
+def stack(sheet: style.Sheet, heights: Sequence[float]) -> tuple[Picture, list[Axes]]:
+    """Return panels of some heights [inch] one below the other, which share their upright lines."""
+    picture = Picture(sheet, sum(heights) + 1.6)
+    axes = list(picture.subplots(len(heights), 1, sharex=True, squeeze=False, height_ratios=heights)[:, 0])
+    for ax, height in zip(axes, heights, strict=True):
+        ax.set_box_aspect(height / (sheet.width - LINE_ROOM * sheet.type))
+    return picture, axes
+
+
 def dress(ax: Axes, plane: Plane | None = None) -> None:
-    """Give a panel its ticks and frame; over a plane, or a line, logarithmic parameters have decades."""
+    """Give a panel its ticks and frame.
+
+    Over a plane, or a line, whose limits the panel already has, logarithmic parameters have decades.
+    """
     sheet = sheet_of(ax)
     ax.tick_params(which="both", **_ticks(sheet))
     ax.tick_params(which="minor", length=2 * sheet.type)

@@ -18,12 +18,12 @@ from ...large import LARGEST, in_unit
 from ...lattice import sampled_line, with_gradients
 from ...objective import Status
 from ...plane import Plane
+from ...space import labelled
 from .. import style
 from . import page
 
-WIDTH, LOSS, SLOPE, ROOM = 8.0, 2.6, 2.2, 1.2  # of the page, height of the panels, room beside them [inch]
+LOSS, SLOPE = 2.6, 2.2  # height of the panels [inch]
 STRIP = 2.7  # height of a strip of event counts, in that of its type
-FLATTEST = 0.55  # of the panels, against those on a screen: narrow ones are drawn higher than they would be
 
 
 def profile_figure(
@@ -42,14 +42,11 @@ def profile_figure(
     dataset = in_unit(dataset)
     counted = {name: _counts(name, values, dataset.sizes["u"]) for name, values in (events or {}).items()}
     places, whole, dataset = dataset["u"].to_numpy(), dataset, sampled_line(dataset)
-    sheet = style.Sheet.of(width, pitch=WIDTH)
+    sheet = style.Sheet.of(width, pitch=page.LINE_PITCH)
     heights = [STRIP * sheet.small / 72] * len(counted)
-    heights += [max(FLATTEST, sheet.zoom) * height for height in (LOSS, SLOPE)[: 1 + ("grad" in dataset)]]
-    picture = page.Picture(sheet, sum(heights) + 1.6)
-    grid = picture.subplots(len(heights), 1, sharex=True, squeeze=False, height_ratios=heights)[:, 0]
-    for ax, height in zip(grid, heights, strict=True):
-        ax.set_box_aspect(height / (sheet.width - ROOM * sheet.type))
-    strips, panels = list(grid[: len(counted)]), list(grid[len(counted) :])
+    heights += [max(page.FLATTEST, sheet.zoom) * height for height in (LOSS, SLOPE)[: 1 + ("grad" in dataset)]]
+    picture, axes = page.stack(sheet, heights)
+    strips, panels = axes[: len(counted)], axes[len(counted) :]
     entries = _draw_loss(panels[0], dataset)
     entries += _draw_slope(panels[1], dataset, plane) if "grad" in dataset else []
     for ax in panels:
@@ -58,7 +55,7 @@ def profile_figure(
         _draw_strip(strip, panels, places, name, counts)
     page.name_axes(panels[-1], plane.labels[0])
     picture.align_ylabels(panels)
-    page.head(picture, [*strips, *panels][0], whole)
+    page.head(picture, axes[0], whole)
     page.finish(picture, [*entries, *page.failure_key(whole), *page.sampling_key(whole)])
     return picture
 
@@ -99,7 +96,7 @@ def _draw_slope(ax: Axes, dataset: xr.Dataset, plane: Plane) -> list[Artist]:
     )
     low, high = style.span_of_line(slope, differences)
     ax.set_ylim(low, high)
-    page.name_axes(ax, y=_slope_label(plane, dataset["loss"].attrs.get("units", "")))
+    page.name_axes(ax, y=_slope_label(plane, page.loss_unit(dataset)))
     for drawn, values in ((line, slopes), (behind, differences)):
         if off := int(((values < low) | (values > high)).sum()):
             drawn.set_label(f"{drawn.get_label()} ({off} off scale)")
@@ -121,12 +118,12 @@ def _slope_label(plane: Plane, loss_unit: str) -> str:
     unit = plane.coordinate_units[0]
     per = f"({unit})" if "/" in unit else unit
     named = f"{loss_unit or '1'}/{per}" if unit else loss_unit
-    return f"slope of the loss [{named}]" if named else "slope of the loss"
+    return labelled("slope of the loss", named)
 
 
 def _frame(ax: Axes, dataset: xr.Dataset, plane: Plane) -> None:
-    page.dress(ax, plane)
     ax.set_xlim(float(plane.lower[0]), float(plane.upper[0]))
+    page.dress(ax, plane)
     for kind, look in style.STATUS_LOOKS.items():
         _shade(ax, dataset, kind, look)
 
@@ -152,7 +149,7 @@ def _draw_strip(strip: Axes, panels: list[Axes], u: NDArray[np.float64], name: s
     labels = counts[[0, *meets.tolist()]].tolist()
     for number, ((low, high), label) in enumerate(zip(pairwise(edges), labels, strict=True)):
         strip.axvspan(low, high, color=style.BAND[number % 2], linewidth=0)
-        room = (high - low) / (u[-1] - u[0]) * (sheet.width - ROOM * sheet.type)
+        room = (high - low) / (u[-1] - u[0]) * (sheet.width - page.LINE_ROOM * sheet.type)
         if room > page.text_width(str(label), sheet.small) + sheet.small / 72:
             strip.text((low + high) / 2, 0.5, str(label), size=sheet.small, color=style.INK, ha="center", va="center")
     for edge in edges[1:-1]:

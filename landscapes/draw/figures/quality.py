@@ -110,9 +110,9 @@ def _slope_lines(ax: Axes, dataset: xr.Dataset) -> list[Artist]:
     look = page.sheet_of(ax).look(style.stroke(len(u)))
     lines = ax.plot(u, difference, color=style.LOSS_LINE, **look, label="difference over two samples")
     lines += ax.plot(u, slope, color=style.SLOPE_LINE, **look, label="gradient", alpha=0.8)
-    page.dress(ax, plane)
     ax.set_box_aspect(FLAT)
     ax.set_xlim(float(u[0]), float(u[-1]))
+    page.dress(ax, plane)
     ax.set_ylim(*style.span_of_line(difference, slope))
     page.name_axes(ax, plane.labels[0], _slope_label(dataset))
     return list(lines)
@@ -193,7 +193,7 @@ def _say_smoothing(ax: Axes, smooth: xr.Dataset, number: int, sure: np.ndarray[A
 
 
 def _slope_label(dataset: xr.Dataset) -> str:
-    return f"slope [{dataset['loss'].attrs.get('units') or 'loss'} per side of the box]"
+    return f"slope [{page.loss_unit(dataset) or 'loss'} per side of the box]"
 
 
 def _percent(share: xr.DataArray) -> str:

@@ -13,6 +13,7 @@ from matplotlib.ticker import PercentFormatter
 from numpy.typing import NDArray
 
 from ...objective import failed
+from ...space import labelled
 from .. import style
 from . import page
 
@@ -157,7 +158,7 @@ def _where_finite(values: xr.DataArray, where: xr.DataArray) -> NDArray[np.float
 
 def _frame_losses(ax: Axes, dataset: xr.Dataset) -> None:
     unit, seeds = dataset.attrs["loss_unit"], dataset.attrs["seeds"]
-    page.name_axes(ax, y=f"best loss so far [{unit}]" if unit else "best loss so far")
+    page.name_axes(ax, y=labelled("best loss so far", unit))
     count, hardest, easiest = dataset.attrs["targets"]
     said = "one seed: no interval" if seeds == 1 else f"mean of {seeds} seeds and 95 % bootstrap interval"
     if not np.isfinite(dataset["mean"]).any():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -14,13 +13,12 @@ import pyvista as pv
 import rerun as rr
 import rerun.blueprint as rrb
 import torch
-from matplotlib.colors import to_rgba
 from numpy.typing import NDArray
 
 from ..render import solids
-from ..render.replay import LONGEST, is_still
+from ..render.replay import LONGEST, is_still, pick_frames
 from ..render.solids import mesh
-from .runs import recording
+from .runs import digest, recording, rgba
 
 if TYPE_CHECKING:
     from ...episode import Episode, Part, View
@@ -41,9 +39,10 @@ def save_episode(episode: Episode, path: str | Path, *, title: str, longest: int
     thickness. No clock is recorded, so that equal episodes give equal recordings.
     """
     view = episode.viewpoint()
-    chosen = np.unique(np.linspace(0, len(episode.time) - 1, longest).round().astype(int)).tolist()
+    chosen = pick_frames(episode, longest)
     blueprint = _blueprint(view, title, float(episode.time[-1]))
-    with recording(_digest(episode, title), Path(path), blueprint) as stream:
+    arrays = [episode.time, *(part.at for part in episode.parts)]
+    with recording(digest(arrays, title), Path(path), blueprint) as stream:
         stream.log(SCENE, rr.ViewCoordinates.RIGHT_HAND_Y_UP, static=True, strict=True)
         if view.ground is not None:
             stream.log(f"{SCENE}/ground", _ground(view), static=True, strict=True)
@@ -110,10 +109,7 @@ def _surface(surface: pv.PolyData, color: NDArray[np.uint8]) -> rr.Mesh3D:
 
 def _color(part: Part) -> NDArray[np.uint8]:
     look = solids.look(part)
-    found: NDArray[np.uint8] = np.rint(255 * np.array(to_rgba(look["color"], look.get("opacity", 1.0)))).astype(
-        np.uint8
-    )
-    return found
+    return rgba(look["color"], look.get("opacity", 1.0))
 
 
 def _ground(view: View) -> rr.Mesh3D:
@@ -121,12 +117,11 @@ def _ground(view: View) -> rr.Mesh3D:
     half = EXTENT * np.linalg.norm(high - low) / 2
     corners = (low + high) / 2 + half * np.array([[-1, 0, -1], [-1, 0, 1], [1, 0, 1], [1, 0, -1]])
     corners[:, 1] = view.ground
-    color = np.rint(255 * np.array(to_rgba(solids.GROUND))).astype(np.uint8)
     return rr.Mesh3D(
         vertex_positions=corners,
         triangle_indices=[[0, 1, 2], [0, 2, 3]],
         vertex_normals=[[0.0, 1.0, 0.0]] * 4,
-        albedo_factor=color,
+        albedo_factor=rgba(solids.GROUND),
     )
 
 
@@ -135,17 +130,8 @@ def _blueprint(view: View, title: str, duration: float) -> rrb.Blueprint:
     center, eye = (low + high) / 2, np.array(view.eye) / np.linalg.norm(view.eye)
     place = center + FAR * np.linalg.norm(high - low) * eye
     controls = rrb.EyeControls3D(position=place, look_target=center, eye_up=(0.0, 1.0, 0.0))
-    background = np.rint(255 * np.array(to_rgba(solids.BACKGROUND))).astype(np.uint8)
-    space = rrb.Spatial3DView(
-        name=title, origin=SCENE, eye_controls=controls, background=rrb.Background(color=background), line_grid=False
-    )
+    background = rrb.Background(color=rgba(solids.BACKGROUND))
+    space = rrb.Spatial3DView(name=title, origin=SCENE, eye_controls=controls, background=background, line_grid=False)
     playing: dict[str, Any] = {"play_state": "playing", "loop_mode": "all", "playback_speed": duration / PLAYED or 1.0}
     panel = rrb.TimePanel(timeline=TIMELINE, state="collapsed", **playing)
     return rrb.Blueprint(space, panel, collapse_panels=True)
-
-
-def _digest(episode: Episode, title: str) -> str:
-    """Return a name that equal recordings share."""
-    arrays = [episode.time, *(part.at for part in episode.parts)]
-    content = b"".join(np.ascontiguousarray(array.numpy()).tobytes() for array in arrays)
-    return hashlib.sha256(title.encode() + content).hexdigest()[:16]

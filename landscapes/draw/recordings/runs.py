@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,15 +11,13 @@ from pathlib import Path
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
-import torch
 import xarray as xr
 from matplotlib.colors import to_rgba
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ...identity import plane_of
 from ...objective import failed
 from ...overlay import improvements
-from ...plane import Plane
 from ...storage.files import replacing
 from .. import style
 from ..figures import contour, page
@@ -48,7 +46,8 @@ def save_stream(dataset: xr.Dataset, runs: Runs, path: str | Path) -> None:
     `evaluation` shows there; nothing else, no clock, is recorded, so that equal runs give equal recordings.
     """
     scene = Scene.of(dataset, runs)
-    with recording(_digest(dataset, runs), Path(path), _blueprint(dataset, scene)) as stream:
+    arrays = [dataset["loss"], *(run[name] for run in runs for name in ("x", "loss"))]
+    with recording(digest(arrays), Path(path), _blueprint(dataset, scene)) as stream:
         _log(stream, SURFACE, surface(scene, dataset))
         if "grad" in dataset:
             _log(stream, ARROWS, descent_arrows(scene, dataset))
@@ -72,17 +71,7 @@ class Scene:
     def of(cls, dataset: xr.Dataset, runs: Runs, scale: style.Scale | None = None) -> Scene:
         """Return the scene of a slice and of runs laid over it, on the scale of their losses unless given."""
         body = relief.Relief(plane_of(dataset), scale or joint_scale(dataset, runs))
-        return cls(body, farthest_distance(runs), relief.stand(body, dataset))
-
-    @property
-    def plane(self) -> Plane:
-        """The plane of the slice."""
-        return self.body.plane
-
-    @property
-    def scale(self) -> style.Scale:
-        """The scale of the losses."""
-        return self.body.scale
+        return cls(body, farthest_distance(runs), relief.Stand(relief.azimuth(body, dataset)))
 
     @property
     def eye(self) -> rrb.EyeControls3D:
@@ -92,7 +81,7 @@ class Scene:
 
     def at(self, u: Grid, v: Grid, loss: Grid) -> Grid:
         """Return positions, shape (..., 3); places beyond the window are moved to its border."""
-        (left, front), (right, back) = (side.numpy() for side in self.plane.cell_bounds())
+        (left, front), (right, back) = (side.numpy() for side in self.body.plane.cell_bounds())
         return self.body.at(np.clip(u, left, right), np.clip(v, front, back), loss)
 
     def tint(self, loss: Grid) -> NDArray[np.uint8]:
@@ -120,13 +109,12 @@ def descent_arrows(scene: Scene, dataset: xr.Dataset, scale: style.Scale | None 
     """Lay the directions of steepest descent on the cells, coloured by the gradient's magnitude."""
     rows, columns = (contour.arrows_along(dataset, name) for name in ("v", "u"))
     at = np.ix_(rows, columns)
-    slope = scene.plane.slope(torch.from_numpy(dataset["grad"].transpose("v", "u", "dim").to_numpy())).numpy()
     logarithm = contour.log_magnitude(dataset)
     norm = (scale or style.Scale.of_magnitude(logarithm)).norm
     u, v = np.meshgrid(dataset["u"].to_numpy(), dataset["v"].to_numpy())
     places = scene.at(u, v, dataset["loss"].transpose("v", "u").to_numpy())
     origins = places[at]
-    flat = contour.descent(slope, scene.plane)[at] * 0.8 * SIDE / max(len(rows), len(columns))
+    flat = contour.descent(contour.slopes(dataset), scene.body.plane)[at] * 0.8 * SIDE / max(len(rows), len(columns))
     vectors = np.concatenate([flat, np.zeros_like(flat[..., :1])], axis=-1)
     seen = np.isfinite(vectors).all(axis=-1) & np.isfinite(origins).all(axis=-1)
     return rr.Arrows3D(
@@ -141,7 +129,7 @@ def log_axes(stream: rr.RecordingStream, scene: Scene, dataset: xr.Dataset) -> N
     """Frame the scene, with the ticks of both parameters and of the loss."""
     frame = rr.LineStrips3D(scene.stand.frame(), colors=rgba(style.MID_GREY), radii=LINE / 2)
     _log(stream, "landscape/axes/frame", frame)
-    for axis, name in enumerate((*scene.plane.labels, page.loss_name(dataset))):
+    for axis, name in enumerate((*scene.body.plane.labels, page.loss_name(dataset))):
         ticks, share = scene.body.ticks(axis)
         places = [scene.stand.beside(axis, part, TICKS) for part in share]
         places.append(scene.stand.beside(axis, 0.5, NAMES) if axis < 2 else scene.stand.beside(axis, OVER, TICKS))
@@ -197,7 +185,7 @@ def _log_best(stream: rr.RecordingStream, scene: Scene, run: xr.Dataset) -> None
     if not len(known):
         return
     with np.errstate(divide="ignore", invalid="ignore"):  # a run may go below the losses of a slice, and below zero
-        curve = np.log10(best[known]) if scene.scale.logarithmic else best[known]
+        curve = np.log10(best[known]) if scene.body.scale.logarithmic else best[known]
     _log(stream, f"best/{_path_of(run)}", rr.SeriesLines(colors=rgba(color), names=label, widths=1.5))
     stream.send_columns(f"best/{_path_of(run)}", _times(known), rr.Scalars.columns(scalars=curve), strict=True)
     lowered = improvements(run)
@@ -235,9 +223,9 @@ def _times(rows: NDArray[np.intp]) -> list[rr.TimeColumn]:
     return [rr.TimeColumn(TIMELINE, sequence=rows + 1)]
 
 
-def rgba(color: str) -> NDArray[np.uint8]:
+def rgba(color: str, opacity: float | None = None) -> NDArray[np.uint8]:
     """Return a colour as rerun takes it."""
-    found: NDArray[np.uint8] = np.rint(255 * np.array(to_rgba(color))).astype(np.uint8)
+    found: NDArray[np.uint8] = np.rint(255 * np.array(to_rgba(color, opacity))).astype(np.uint8)
     return found
 
 
@@ -245,23 +233,31 @@ def _blueprint(dataset: xr.Dataset, scene: Scene) -> rrb.Blueprint:
     so_far = rrb.VisibleTimeRange(
         TIMELINE, start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.cursor_relative()
     )
-    space = rrb.Spatial3DView(
-        name=page.title(dataset), origin="landscape", time_ranges=so_far, eye_controls=scene.eye, line_grid=False
-    )
-    what = "best loss so far, log10" if scene.scale.logarithmic else "best loss so far"
+    what = "best loss so far, log10" if scene.body.scale.logarithmic else "best loss so far"
     curves = rrb.TimeSeriesView(name=what, origin="best", plot_legend=rrb.Corner2D.RightTop)
-    about = rrb.TextDocumentView(name="about", origin="about")
-    return rrb.Blueprint(
-        rrb.Horizontal(space, rrb.Vertical(curves, about), column_shares=[2.2, 1.0]),
-        rrb.TimePanel(timeline=TIMELINE, play_state="following", state="collapsed"),
-        collapse_panels=True,
+    panel = rrb.TimePanel(timeline=TIMELINE, play_state="following", state="collapsed")
+    return _views(dataset, scene, curves, panel, so_far)
+
+
+def _views(
+    dataset: xr.Dataset,
+    scene: Scene,
+    curves: rrb.TimeSeriesView,
+    panel: rrb.TimePanel,
+    ranges: rrb.VisibleTimeRange | None = None,
+) -> rrb.Blueprint:
+    """Return the scene on the left, curves and what is said of all on the right."""
+    space = rrb.Spatial3DView(
+        name=page.title(dataset), origin="landscape", time_ranges=ranges, eye_controls=scene.eye, line_grid=False
     )
+    right = rrb.Vertical(curves, rrb.TextDocumentView(name="about", origin="about"))
+    return rrb.Blueprint(rrb.Horizontal(space, right, column_shares=[2.2, 1.0]), panel, collapse_panels=True)
 
 
 def _about(dataset: xr.Dataset, runs: Runs, scene: Scene) -> str:
     """Say in Markdown what is to be seen, and where it comes from."""
-    low, high = map(style.number, scene.scale.ends)
-    kind = "logarithmic" if scene.scale.logarithmic else "linear"
+    low, high = map(style.number, scene.body.scale.ends)
+    kind = "logarithmic" if scene.body.scale.logarithmic else "linear"
     unit = dataset["loss"].attrs.get("units", "")
     distance = (
         f"A point on the plane is largest; one {half_widths(scene.reach)} off it has "
@@ -283,7 +279,7 @@ def _about(dataset: xr.Dataset, runs: Runs, scene: Scene) -> str:
         "|---|---|---|---|---|",
         *(_row(run) for run in runs),
         "",
-        f"Best losses are plotted as {'their decimal logarithm' if scene.scale.logarithmic else 'they are'}.",
+        f"Best losses are plotted as {'their decimal logarithm' if scene.body.scale.logarithmic else 'they are'}.",
         "",
         page.provenance(dataset),
     ]
@@ -297,10 +293,10 @@ def _row(run: xr.Dataset) -> str:
     return f"| {run.attrs['label']} | {run.sizes['evaluation']} | {lost} | {int(run['outside'].sum())} | {said} |"
 
 
-def _digest(dataset: xr.Dataset, runs: Runs) -> str:
+def digest(arrays: Iterable[ArrayLike], title: str = "") -> str:
     """Return a name that equal recordings share."""
-    arrays = [dataset["loss"], *(run[name] for run in runs for name in ("x", "loss"))]
-    return hashlib.sha256(b"".join(np.ascontiguousarray(array).tobytes() for array in arrays)).hexdigest()[:16]
+    content = b"".join(np.ascontiguousarray(array).tobytes() for array in arrays)
+    return hashlib.sha256(title.encode() + content).hexdigest()[:16]
 
 
 @contextmanager
@@ -326,10 +322,10 @@ def save_sweep(sweep: Sweep, path: Path) -> None:
     """Write the slices as surfaces on a rerun timeline named after what moves, numbered like the frames from 0."""
     scales, first = Scales.of(sweep), sweep.slices[0]
     scene = Scene.of(first, [], scales.loss)
-    with recording(_digest_sweep(sweep), path, _blueprint_sweep(sweep, scene)) as kept:
+    arrays = [np.asarray(sweep.values), *(one["loss"].to_numpy() for one in sweep.slices)]
+    with recording(digest(arrays), path, _blueprint_sweep(sweep, scene)) as kept:
         log_axes(kept, scene, first)
-        about = rr.TextDocument(_about_sweep(sweep, scales), media_type=rr.MediaType.MARKDOWN)
-        kept.log("about", about, static=True, strict=True)
+        _log(kept, "about", rr.TextDocument(_about_sweep(sweep, scales), media_type=rr.MediaType.MARKDOWN))
         for number, dataset in enumerate(sweep.slices):
             kept.set_time(sweep.name, sequence=number)
             kept.log(SURFACE, surface(scene, dataset), strict=True)
@@ -347,18 +343,10 @@ def _label(sweep: Sweep, scene: Scene, number: int) -> rr.Points3D:
 
 
 def _blueprint_sweep(sweep: Sweep, scene: Scene) -> rrb.Blueprint:
-    space = rrb.Spatial3DView(
-        name=page.title(sweep.slices[0]), origin="landscape", eye_controls=scene.eye, line_grid=False
-    )
-    curve = rrb.TimeSeriesView(
-        name="lowest loss of each frame", origin="lowest", plot_legend=rrb.PlotLegend(visible=False)
-    )
-    about = rrb.TextDocumentView(name="about", origin="about")
-    return rrb.Blueprint(
-        rrb.Horizontal(space, rrb.Vertical(curve, about), column_shares=[2.2, 1.0]),
-        rrb.TimePanel(timeline=sweep.name, state="expanded", fps=RATES[-1], loop_mode="all"),
-        collapse_panels=True,
-    )
+    hidden = rrb.PlotLegend(visible=False)
+    curve = rrb.TimeSeriesView(name="lowest loss of each frame", origin="lowest", plot_legend=hidden)
+    panel = rrb.TimePanel(timeline=sweep.name, state="expanded", fps=RATES[-1], loop_mode="all")
+    return _views(sweep.slices[0], scene, curve, panel)
 
 
 def _about_sweep(sweep: Sweep, scales: Scales) -> str:
@@ -384,9 +372,3 @@ def _row_sweep(sweep: Sweep, number: int) -> str:
     said = style.number(least) if np.isfinite(least) else "none"
     lost = int(failed(dataset["status"]).sum())
     return f"| {number} | {sweep.write_value(sweep.values[number])} | {said} | {lost} |"
-
-
-def _digest_sweep(sweep: Sweep) -> str:
-    """Return a name that equal recordings share."""
-    arrays: list[NDArray[np.float64]] = [np.asarray(sweep.values), *(one["loss"].to_numpy() for one in sweep.slices)]
-    return hashlib.sha256(b"".join(np.ascontiguousarray(array).tobytes() for array in arrays)).hexdigest()[:16]

@@ -163,11 +163,6 @@ class Stand:
         return [np.array(line, dtype=np.float64) for line in (floor, *walls)]
 
 
-def stand(relief: Relief, dataset: xr.Dataset) -> Stand:
-    """Return where most of the valley is seen from."""
-    return Stand(azimuth(relief, dataset))
-
-
 def azimuth(relief: Relief, dataset: xr.Dataset) -> float:
     """Return from which of the azimuths [degrees] most of the valley is seen, over what stands in front of it."""
     height = relief.height(own_cells(dataset)["loss"].transpose("v", "u").to_numpy())

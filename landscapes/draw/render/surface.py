@@ -95,15 +95,8 @@ def surface_figure(dataset: xr.Dataset, runs: Runs = (), *, width: float | None 
         _label(ax, dataset, shown)
     page.head(picture, ax, dataset)
     scale = shown.relief.scale
-    page.colour_bar(
-        ax,
-        ScalarMappable(scale.norm, style.LOSS_MAP),
-        page.loss_name(dataset),
-        scale,
-        fraction=0.03,
-        pad=0.02,
-        shrink=0.8,
-    )
+    shown_scale = ScalarMappable(scale.norm, style.LOSS_MAP)
+    page.colour_bar(ax, shown_scale, page.loss_name(dataset), scale, fraction=0.03, shrink=0.8)
     page.finish(picture, [*_entries(sheet, runs), *_holes(dataset)], columns=3)
     return picture
 
@@ -118,7 +111,7 @@ def scene(dataset: xr.Dataset, runs: Runs, *, pixels: tuple[int, int] = PIXELS) 
     if plane.rank != 2:
         raise ValueError(f"a surface shows a plane; got a slice of rank {plane.rank}, so vary two parameters")
     body = Relief(plane, joint_scale(dataset, runs))
-    stand = relief.stand(body, dataset)
+    stand = Stand(relief.azimuth(body, dataset))
     with off_screen(pixels) as plotter:
         focus = (0.0, 0.0, FOCUS)
         for (turn, away, up), strength in LIGHTS:

@@ -1,10 +1,12 @@
-"""Gradients that are right and useless, that grow with the episode alone, and that two modes give differently."""
+"""Gradients: useless ones, those that grow with the episode, differ by mode or repeat, and are wrong in one place."""
 
+import pytest
 import torch
 
+from gradscape.landscapes.conformance.suite import check
 from gradscape.landscapes.objective import Evaluation
 
-from .test_suite import OneWrongSign, Sound, failures, outcomes, refusing
+from .test_suite import OneWrongSign, Sound, Spoiled, WrongWhere, failures, outcomes, refusing
 
 
 class Rippled(Sound):
@@ -16,9 +18,8 @@ class Rippled(Sound):
         return Evaluation.from_results(loss, found.grad + 30 * torch.cos(3e4 * x) if grad else None)
 
 
-class TenfoldGradient(Sound):
-    def slope(self, slope):
-        return 20 * slope
+def steep():
+    return Spoiled(slope=lambda slope: 20 * slope)
 
 
 def warnings(objective, **settings):
@@ -33,8 +34,8 @@ def test_a_right_gradient_that_does_not_hold_over_an_optimiser_s_step_is_a_warni
 
 def test_a_gradient_that_grows_with_the_episode_alone_fails():
     assert failures(Sound(), horizons={1: Sound, 4: Sound}) == set()
-    assert failures(Sound(), horizons={1: Sound, 4: TenfoldGradient}) == {"growth over horizons"}
-    found = outcomes(Sound(), horizons={1: Sound, 4: TenfoldGradient})["growth over horizons"]
+    assert failures(Sound(), horizons={1: Sound, 4: steep}) == {"growth over horizons"}
+    found = outcomes(Sound(), horizons={1: Sound, 4: steep})["growth over horizons"]
     assert found.why == "gradients grow where motions do not part: too steep at 3 of 3 points at 4x"
     assert outcomes(Sound(), horizons={1: refusing})["growth over horizons"].outcome == "skip"
 
@@ -55,3 +56,53 @@ def test_forward_is_held_against_reverse():
     assert outcomes(Sound(), other_mode=Sound)[name].outcome == "pass"
     assert failures(Sound(), other_mode=OneWrongSign) == {name}
     assert outcomes(Sound(), other_mode=refusing)[name].figure == "not checked"
+
+
+def test_a_wrong_gradient_at_a_special_place_is_said_with_what_it_should_be():
+    found = outcomes(WrongWhere())["special places"]
+    assert "at a zero, by a, the gradient is" in found.figure or "at zero, by a, the gradient is" in found.figure
+    assert "the loss rises by" in found.figure
+
+
+@pytest.mark.parametrize("side", [0.0, 0.4, 1.0])
+def test_at_a_kink_either_slope_will_do_and_nothing_beyond(side):
+    def kinked(slope):
+        class Kinked(Sound):
+            def evaluate(self, x, *, grad=True):
+                found = super().evaluate(x, grad=grad)
+                kink = x.abs().sum(dim=1)
+                push = torch.where(x == 0, slope, x.sign()) if grad else None
+                return Evaluation(found.loss + kink, None if push is None else found.grad + push, found.status)
+
+        return Kinked()
+
+    assert outcomes(kinked(2 * side - 1))["special places"].outcome == "pass"
+    assert outcomes(kinked(3 + side))["special places"].outcome == "fail"
+
+
+def unsteady(share):
+    """Return an objective whose repeats differ by a share of its gradients."""
+    generator = torch.Generator().manual_seed(0)
+    return Spoiled(slope=lambda slope: slope * (1 + share * torch.randn(slope.shape, generator=generator)))
+
+
+def test_gradients_that_do_not_repeat_fail():
+    assert failures(unsteady(1e-4)) == {"determinism"}
+
+
+def test_gradients_may_repeat_less_exactly_than_losses():
+    found = outcomes(unsteady(1e-7))["determinism"]
+    assert found.outcome == "pass"
+    assert found.numbers["limit"] < found.numbers["gradient"] < found.numbers["gradient_limit"]
+
+
+def test_memory_that_runs_out_is_said_with_what_to_do():
+    class Large(Sound):
+        def evaluate(self, x, *, grad=True):
+            if len(x) > 4:
+                raise RuntimeError("Failed to allocate 123456 bytes on device 'cuda:0'")
+            return super().evaluate(x, grad=grad)
+
+    found = [finding for finding in check(Large()) if finding.bad]
+    assert found
+    assert all("end what else uses the device" in finding.why for finding in found)

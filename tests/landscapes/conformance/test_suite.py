@@ -1,6 +1,7 @@
 """The conformance suite: what is sound passes, and each defect makes its own check fail, and no other."""
 
 import math
+from functools import partial
 
 import pytest
 import torch
@@ -54,92 +55,56 @@ class Sound(Objective):
         return found
 
 
-def with_loss(found, loss):
-    return Evaluation(loss, found.grad, found.status)
+class Spoiled(Sound):
+    """Sound but for what becomes of its slopes, and of its losses at points `x` asked for with `grad` or without."""
+
+    def __init__(self, slope=lambda slope: slope, loss=lambda loss, x, grad: loss):
+        self.slope, self.spoil_loss = slope, loss
+
+    def spoil(self, x, found, grad):
+        return Evaluation(self.spoil_loss(found.loss, x, grad), found.grad, found.status)
 
 
-class TwiceTheGradient(Sound):
-    def slope(self, slope):
-        return 2 * slope
+def failing(where):
+    """Return what gives no loss at some points, without a status that says so."""
+    return partial(Spoiled, loss=lambda loss, x, grad: loss.masked_fill(where(x), NAN))
 
 
-class WrongWhereOneIsZero(Sound):
-    """As of a contact that does not slide: right everywhere else."""
+def leaking(loss, x, grad):
+    return loss + 1e-3 * (x.mean(dim=0) - x[0]).sum() if len(x) else loss
+
+
+def ordered(loss, x, grad):
+    """Let what a row gets depend on its place in a batch of four."""
+    return loss + 1e-3 * torch.tensor([0, 1, 1, 0]) * x.sum(dim=1) if len(x) == 4 else loss
+
+
+def unsteady():
+    generator = torch.Generator().manual_seed(0)
+    return Spoiled(loss=lambda loss, x, grad: loss + 1e-3 * torch.randn(len(x), generator=generator))
+
+
+TwiceTheGradient = partial(Spoiled, slope=lambda slope: 2 * slope)
+OneWrongSign = partial(Spoiled, slope=lambda slope: slope * torch.tensor([1.0, -1.0, 1.0], dtype=torch.float64))
+WrongShape = partial(Spoiled, loss=lambda loss, x, grad: loss[:, None])
+SilentNan = failing(lambda x: (x == SPACE.uniform(4, seed=0)[2]).all(dim=1))  # not at an extreme, which has its own say
+
+
+class WrongWhere(Sound):
+    """Its gradient is another one at some components: as of a contact that does not slide, right everywhere else."""
+
+    def __init__(self, where=lambda x: x == 0, wrong=lambda slope: 40 * slope + 1):
+        self.where, self.wrong = where, wrong
 
     def evaluate(self, x, *, grad=True):
         found = super().evaluate(x, grad=grad)
         if found.grad is None:
             return found
-        return Evaluation(found.loss, torch.where(x == 0, 40 * found.grad + 1, found.grad), found.status)
+        return Evaluation(found.loss, torch.where(self.where(x), self.wrong(found.grad), found.grad), found.status)
 
 
-class WrongAtTheCentre(Sound):
-    def evaluate(self, x, *, grad=True):
-        found = super().evaluate(x, grad=grad)
-        if found.grad is None:
-            return found
-        still = (x == self.space.center).all(dim=1, keepdim=True)
-        return Evaluation(found.loss, torch.where(still, torch.zeros_like(found.grad), found.grad), found.status)
-
-
-class OneWrongSign(Sound):
-    def slope(self, slope):
-        return slope * torch.tensor([1.0, -1.0, 1.0], dtype=torch.float64)
-
-
-class NoGradient(Sound):
-    def slope(self, slope):
-        return 0 * slope
-
-
-class LeakingRows(Sound):
-    def spoil(self, x, found, grad):
-        return with_loss(found, found.loss + 1e-3 * (x.mean(dim=0) - x[0]).sum()) if len(x) else found
-
-
-class OrderMatters(Sound):
-    """What a row gets depends on its place in a batch of four."""
-
-    def spoil(self, x, found, grad):
-        extra = torch.zeros_like(found.loss)
-        extra[1:3] = 1e-3 * x[1:3].sum(dim=1)
-        return with_loss(found, found.loss + extra) if len(x) == 4 else found
-
-
-class SilentNan(Sound):
-    """At one point of the sample only, so that the extremes have their say."""
-
-    def spoil(self, x, found, grad):
-        here = (x == SPACE.uniform(4, seed=0)[2]).all(dim=1)
-        return with_loss(found, found.loss.masked_fill(here, NAN))
-
-
-class Unsteady(Sound):
-    def __init__(self):
-        self.generator = torch.Generator().manual_seed(0)
-
-    def spoil(self, x, found, grad):
-        return with_loss(found, found.loss + 1e-3 * torch.randn(len(x), generator=self.generator))
-
-
-class AnotherLossWithGradient(Sound):
-    def spoil(self, x, found, grad):
-        return with_loss(found, found.loss + 1e-3) if grad else found
-
-
-class WrongShape(Sound):
-    def spoil(self, x, found, grad):
-        return with_loss(found, found.loss[:, None])
-
-
-class SinglePrecision(Sound):
-    def spoil(self, x, found, grad):
-        return with_loss(found, found.loss.float())
-
-
-class NoEmptyBatch(Sound):
-    def spoil(self, x, found, grad):
-        return with_loss(found, found.loss + 0 * found.loss[0])
+def at_the_centre(x):
+    return (x == SPACE.center).all(dim=1, keepdim=True)
 
 
 class TakesAnyShape(Sound):
@@ -152,16 +117,6 @@ class TakesNan(Sound):
         return super().evaluate(x.nan_to_num(), grad=grad)
 
 
-class BadCorner(Sound):
-    def spoil(self, x, found, grad):
-        return with_loss(found, found.loss.masked_fill((x == SPACE.upper).all(dim=1), NAN))
-
-
-class BadCentre(Sound):
-    def spoil(self, x, found, grad):
-        return with_loss(found, found.loss.masked_fill((x == SPACE.center).all(dim=1), NAN))
-
-
 class NanGradientWhere(Sound):
     """The loss is finite everywhere, its gradient NaN at some points."""
 
@@ -172,11 +127,6 @@ class NanGradientWhere(Sound):
         return Evaluation.from_results(
             found.loss, found.grad.masked_fill(self.where(x)[:, None], NAN) if grad else None
         )
-
-
-class OverTheEdge(Sound):
-    def spoil(self, x, found, grad):
-        return with_loss(found, found.loss.masked_fill((x > SPACE.upper + 0.1).any(dim=1), NAN))
 
 
 class Tape(torch.autograd.Function):
@@ -219,23 +169,23 @@ def test_a_sound_objective_passes(objective):
     ("defect", "checks"),
     [
         (TwiceTheGradient, GRADIENT),
-        (WrongWhereOneIsZero, {"special places"}),
-        (WrongAtTheCentre, {"special places"}),
         (OneWrongSign, GRADIENT),
-        (NoGradient, GRADIENT),
-        (LeakingRows, {"rows alone"}),
-        (OrderMatters, {"rows in another order"}),
+        (partial(Spoiled, slope=torch.zeros_like), GRADIENT),
+        (WrongWhere, {"special places"}),
+        (partial(WrongWhere, at_the_centre, torch.zeros_like), {"special places"}),
+        (partial(Spoiled, loss=leaking), {"rows alone"}),
+        (partial(Spoiled, loss=ordered), {"rows in another order"}),
         (SilentNan, {"status"}),
-        (Unsteady, {"determinism"}),
-        (AnotherLossWithGradient, {"loss without gradient"}),
+        (unsteady, {"determinism"}),
+        (partial(Spoiled, loss=lambda loss, x, grad: loss + 1e-3 * grad), {"loss without gradient"}),
         (WrongShape, {"shapes"}),
-        (SinglePrecision, {"shapes"}),
-        (NoEmptyBatch, {"empty batch"}),
+        (partial(Spoiled, loss=lambda loss, x, grad: loss.float()), {"shapes"}),
+        (partial(Spoiled, loss=lambda loss, x, grad: loss + 0 * loss[0]), {"empty batch"}),
         (TakesAnyShape, {"refusal of a wrong shape"}),
         (TakesNan, {"refusal of nan"}),
-        (BadCorner, {"corners"}),
-        (BadCentre, {"centre"}),
-        (OverTheEdge, {"10% outside the box"}),
+        (failing(lambda x: (x == SPACE.upper).all(dim=1)), {"corners"}),
+        (failing(lambda x: at_the_centre(x)[:, 0]), {"centre"}),
+        (failing(lambda x: (x > SPACE.upper + 0.1).any(dim=1)), {"10% outside the box"}),
         (SpentTape, {"second backward"}),
     ],
 )
@@ -244,7 +194,7 @@ def test_a_defect_makes_its_own_check_fail(defect, checks):
 
 
 def test_a_nan_gradient_beside_a_finite_loss_fails_by_its_name_and_no_other():
-    found = outcomes(NanGradientWhere(lambda x: (x == SPACE.center).all(dim=1)))
+    found = outcomes(NanGradientWhere(lambda x: at_the_centre(x)[:, 0]))
     assert {name for name, finding in found.items() if finding.bad} == {"special places", "centre"}
     loss = float(Sound().evaluate(SPACE.center[None]).loss)
     at = f"the gradient is NaN at the centre (a = 0.5, b = 0.5, c = 0.5), where the loss is {loss:.4g}"

@@ -2,16 +2,12 @@
 
 import math
 from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 import torch
 
 from gradscape import ParameterSpace, Plane, from_torch, sample
 from gradscape.landscapes.convert import to_json
-from gradscape.landscapes.draw.figures.page import save
-from gradscape.landscapes.draw.figures.quality import quality_figure
-from gradscape.landscapes.measures import gradient_quality as gradients
 from gradscape.landscapes.measures.classify import WORDS, QuotedWord
 from gradscape.landscapes.measures.profile import Profile, effort, measure_profile
 from gradscape.landscapes.objective import Evaluation, Objective, Status
@@ -151,21 +147,3 @@ def test_no_more_is_evaluated_than_is_announced() -> None:
     blocks = 3  # of each of which one gradient is the slice's own
     assert counts[True] == effort(2, 3, (10, 10))[1] - blocks
     assert effort(2, 3)[0] < counts[False] <= effort(2, 3, (10, 10))[0]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("dims", [(0, 1), (0,)])
-@pytest.mark.drawn
-def test_the_picture_of_gradient_quality_is_written(tmp_path: Path, dims: tuple[int, ...]) -> None:
-    space = ParameterSpace.box(("x", "y"), -1.0, 1.0, "m")
-    objective = from_torch(lambda x: torch.where(x[:, 0] > 0.8, torch.nan, rastrigin(x)), space, name="half [a] $x$")
-    dataset = sample(objective, Plane.through(space, space.center, dims, resolution=12))
-    plane, points = Plane.through(space, space.center, dims, resolution=12), 3 if len(dims) == 2 else 9
-    places = gradients.subgrid(plane, points)
-    steps, smooth = (of(objective, plane, places) for of in (gradients.compare_differences, gradients.smoothed_slopes))
-    figure = quality_figure(dataset, gradients.GradientQuality(steps, gradients.compare_samples(dataset), smooth))
-    save(figure, tmp_path / "quality.png")
-    assert (tmp_path / "quality.png").read_bytes().startswith(b"\x89PNG")
-    titles = [ax.get_title() for ax in figure.axes]
-    assert sum("of the box" in title for title in titles) == (5 if len(dims) == 2 else 2)
-    assert any(text.get_text().startswith("not finite") for text in figure.legends[0].get_texts())

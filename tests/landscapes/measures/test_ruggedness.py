@@ -8,7 +8,6 @@ import pytest
 import torch
 
 from gradscape import ParameterSpace, Plane, from_torch, sample
-from gradscape.landscapes import statistics as estimate
 from gradscape.landscapes.convert import to_json
 from gradscape.landscapes.measures import ruggedness
 from gradscape.landscapes.measures.profile import own_cost
@@ -183,25 +182,6 @@ def test_a_slice_that_failed_everywhere_has_no_numbers_and_no_error() -> None:
     found = ruggedness.ruggedness(dataset, floor=0.0)
     assert (found.failed, found.minima) == (36, 0)
     assert to_json(found.fitness_distance) == {"value": None, "low": None, "high": None}
-
-
-def test_jackknife_knows_the_error_of_a_mean() -> None:
-    rng = np.random.default_rng(1)
-    reaches, covered = [], 0
-    for _ in range(40):
-        noise = rng.normal(size=(24, 24))
-        found = estimate.jackknife(lambda part: float(np.nanmean(part)), noise)
-        reaches.append((found.high - found.low) / 2)
-        covered += found.low < 0 < found.high
-    assert np.mean(reaches) == pytest.approx(2.13 / 24, rel=0.1)  # Student's t with 15 degrees of freedom
-    assert covered >= 34
-
-
-def test_shares_have_the_exact_binomial_interval() -> None:
-    none = estimate.share(0, 30)
-    assert (none.value, none.low) == (0, 0)
-    assert none.high == pytest.approx(1 - 0.025 ** (1 / 30))
-    assert math.isnan(estimate.share(0, 0).value)
 
 
 @pytest.mark.parametrize("shape", [(40,), (9, 13), (12, 12)])

@@ -260,18 +260,6 @@ def test_a_slice_where_everything_failed_is_still_a_picture(tmp_path, grad):
     assert sum("lift" in axes.get_ylabel() for axes in figure.axes) == (2 if grad else 1)
 
 
-def test_nothing_drawn_leaves_the_page_or_covers_something_else():
-    FIGURE.draw_without_rendering()
-    texts = [*FIGURE.texts, TOP.title, *(t for legend in FIGURE.legends for t in legend.get_texts())]
-    texts += [axis.label for axes in FIGURE.axes for axis in (axes.xaxis, axes.yaxis)]
-    boxes = [text.get_window_extent() for text in texts if text.get_text()]
-    for number, box in enumerate(boxes):
-        assert min(box.x0, box.y0) >= 0
-        assert box.x1 <= FIGURE.bbox.x1
-        assert box.y1 <= FIGURE.bbox.y1
-        assert not any(box.overlaps(other) for other in boxes[:number])
-
-
 def test_losses_over_three_decades_are_on_a_logarithmic_scale_and_an_outlier_does_not_flatten_the_rest():
     assert isinstance(style.Scale.of_loss(np.geomspace(1e-2, 1e3, 50)).norm, LogNorm)
     rest = np.linspace(-1, 1, 999)

@@ -16,13 +16,12 @@ from matplotlib.text import Text
 
 from gradscape.landscapes import draw
 from gradscape.landscapes.draw.figures import page
+from gradscape.landscapes.draw.figures.accuracy import fidelity_figure, model_figure
 from gradscape.landscapes.draw.figures.comparison import comparison_figure
 from gradscape.landscapes.draw.figures.contact import Caption, episode_figure
 from gradscape.landscapes.draw.figures.contour import landscape_figure
 from gradscape.landscapes.draw.figures.convergence import convergence_figure
 from gradscape.landscapes.draw.figures.extremes import extremes_figure
-from gradscape.landscapes.draw.figures.fidelity import fidelity_figure
-from gradscape.landscapes.draw.figures.model import model_figure
 from gradscape.landscapes.draw.figures.multiples import (
     CompanionSlice,
     Landscape,
@@ -50,8 +49,7 @@ from ....made_studies import fidelities, study
 from ...test_overlay import LAID, SLICE
 from .records import card, census, convergence, extremes, league, mixed
 from .test_contour import BOUNCES, DATASET, LINE, Bowl, plane
-from .test_curve import table
-from .test_race import race
+from .test_search import race, table
 from .test_sweep import SWEEP
 
 pytestmark = pytest.mark.slow
@@ -104,6 +102,7 @@ CUTS = [CompanionSlice("center", np.full((4, 4), np.nan)), CompanionSlice("rando
 HUNG = [
     Landscape("swing-velocity", "smooth with local minima 100 %, discontinuous 100 %, large flat regions 100 %", PLANE)
 ]
+RACE = race(tuple(methods()), provenance=json.dumps({"created": "2026-11-21", "command": COMMAND}))
 MIXED = mixed()
 CHOSEN = {"draft": MIXED.variants[-1].name, "standard": MIXED.variants[10].name}
 FIGURES: dict[str, list[Callable[[float | None], page.Picture]]] = {
@@ -126,7 +125,10 @@ FIGURES: dict[str, list[Callable[[float | None], page.Picture]]] = {
         lambda width: overlay_figure(dated(SLICE), LAID, width=width),
         lambda width: overlay_figure(dated(SLICE), LAID[:1] * 12, width=width),
     ],
-    "race_figure": [lambda width: race_figure(race(tuple(methods())), width=width)],
+    "race_figure": [
+        lambda width: race_figure(RACE, width=width),
+        lambda width: race_figure(RACE.assign(unsuccessful=RACE["unsuccessful"] + 2), width=width),
+    ],
     "comparison_figure": [
         lambda width: comparison_figure(compared(DATASET, SHIFTED), width=width),
         lambda width: comparison_figure(compared(LINE, LINE.assign(loss=1.2 * LINE["loss"])), width=width),
@@ -143,14 +145,8 @@ FIGURES: dict[str, list[Callable[[float | None], page.Picture]]] = {
     "convergence_figure": [lambda width: convergence_figure(convergence(), width=width)],
     "model_figure": [lambda width: model_figure(study(PARTS, failing=True), width=width)],
     "companions_figure": [
-        lambda width: companions_figure(
-            [CompanionSlice("example:aim", PLANE["loss"].to_numpy()), *CUTS], PLANE, width=width
-        ),
-        lambda width: companions_figure(
-            [CompanionSlice("center", LONG["loss"].to_numpy()), CompanionSlice("random:3", LONG["loss"].to_numpy())],
-            LONG,
-            width=width,
-        ),
+        lambda width: companions_figure([AIM, *CUTS], PLANE, width=width),
+        lambda width: companions_figure([CENTER, RANDOM], LONG, width=width),
     ],
     "card_figure": [lambda width: card_figure(card(), width=width)],
     "census_figure": [lambda width: census_figure(census(), width=width)],

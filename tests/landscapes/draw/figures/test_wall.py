@@ -28,19 +28,6 @@ def test_every_landscape_has_its_own_scale_its_name_and_its_words() -> None:
     }
 
 
-@pytest.mark.parametrize("count", [1, 7, 20])
-def test_no_words_leave_the_page(count: int) -> None:
-    picture = wall_figure([Landscape("a name", "smooth with local minima 55 %, discontinuous 30 %", DATASET)] * count)
-    picture.draw_without_rendering()
-    wide, tall = picture.get_size_inches() * picture.dpi
-    for ax in picture.axes:
-        box = ax.xaxis.label.get_window_extent()
-        assert box.x0 >= 0
-        assert box.x1 <= wide
-        assert box.y0 >= 0
-        assert box.y1 <= tall
-
-
 def test_a_wall_of_nothing_is_refused() -> None:
     with pytest.raises(ValueError, match="got none"):
         wall_figure([])

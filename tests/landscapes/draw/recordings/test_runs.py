@@ -12,46 +12,35 @@ from urllib.parse import parse_qs
 import numpy as np
 import pytest
 import torch
-import xarray as xr
 from rerun.chunk import RrdReader
 
+from gradscape.envs.adapters import from_torch
 from gradscape.landscapes.draw.recordings import viewer
 from gradscape.landscapes.draw.recordings.runs import HEIGHT, SIDE, save_stream
-from gradscape.landscapes.objective import Evaluation, Objective
 from gradscape.landscapes.overlay import overlay
 from gradscape.landscapes.plane import Plane
 from gradscape.landscapes.sampling.fill import sample
 from gradscape.landscapes.space import ParameterSpace
 
 from ....processes import alone
+from ...made_runs import run_table
 
 pytestmark = pytest.mark.slow
 
 SPACE = ParameterSpace.box(("a", "b", "c"), -1.0, 1.0, "m")
 
 
-class Bowl(Objective):
-    space = SPACE
-    name = "bowl"
-
-    def evaluate(self, x, *, grad=True):
-        loss = x.square().sum(dim=1)
-        loss[(x[:, :2] > 0.6).all(dim=1)] = torch.nan
-        return Evaluation.from_results(loss, 2 * x if grad else None)
+def bowl(x):
+    return torch.where((x[:, :2] > 0.6).all(dim=1), torch.nan, x.square().sum(dim=1))
 
 
-def run(x, kind, *, seed=0) -> xr.Dataset:
-    done = Bowl().evaluate(torch.tensor(np.asarray(x)))
-    columns = {"loss": done.loss.numpy(), "status": done.status.numpy(), "kind": kind}
-    table = xr.Dataset({name: ("evaluation", values) for name, values in columns.items()}, {"dim": list(SPACE.names)})
-    table["x"], table["grad"] = (("evaluation", "dim"), np.asarray(x)), (("evaluation", "dim"), done.grad.numpy())
-    table["kind"].attrs = {"flag_values": [1, 2, 3], "flag_meanings": "population descent acquisition"}
-    return table.assign_attrs(method="bo-leap", seed=seed, lower=[-1.0] * 3, upper=[1.0] * 3)
+BOWL = from_torch(bowl, SPACE, name="bowl")
+run = partial(run_table, BOWL, method="bo-leap", seed=0)
 
 
 DESCENT = np.array([0.8, -0.5, 0.4]) * 0.8 ** np.arange(5)[:, None]
 POINTS = np.concatenate([np.random.default_rng(0).uniform(-0.5, 0.5, (6, 3)), DESCENT, [[0.9, 0.8, 0.0]]])
-SLICE = sample(Bowl(), Plane.through(SPACE, SPACE.center, ("a", "b"), resolution=9))
+SLICE = sample(BOWL, Plane.through(SPACE, SPACE.center, ("a", "b"), resolution=9))
 LAID = overlay(SLICE, [run(POINTS, [3] + [1] * 5 + [2] * 5 + [1]), run(POINTS[:3], [1] * 3, seed=1)])
 
 

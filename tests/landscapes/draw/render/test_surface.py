@@ -10,9 +10,9 @@ import torch
 import xarray as xr
 from matplotlib.colors import to_rgb
 
+from gradscape.envs.adapters import from_torch
 from gradscape.landscapes.draw import style
 from gradscape.landscapes.draw.render import relief, solids, surface
-from gradscape.landscapes.objective import Evaluation, Objective
 from gradscape.landscapes.plane import Plane
 from gradscape.landscapes.sampling.fill import sample
 from gradscape.landscapes.space import ParameterSpace
@@ -23,22 +23,14 @@ SPACE = ParameterSpace.box(["a", "b"], -1.0, 1.0, "m")
 PEAK = (0.5, -0.5)
 
 
-class Hill(Objective):
-    """A hill, a loss that is not finite where a and b are both above a half."""
-
-    space = SPACE
-    name = "hill"
-
-    def evaluate(self, x: torch.Tensor, *, grad: bool = True) -> Evaluation:
-        loss = 0.1 + torch.exp(-8 * (x - x.new_tensor(PEAK)).square().sum(dim=1))
-        loss[(x > 0.5).all(dim=1)] = torch.nan
-        return Evaluation.from_results(
-            loss, torch.zeros_like(x) if grad else None, torch.ones(len(x), dtype=torch.int8)
-        )
+def hill(x: torch.Tensor) -> torch.Tensor:
+    """Return a hill, not finite where a and b are both above a half."""
+    loss = 0.1 + torch.exp(-8 * (x - x.new_tensor(PEAK)).square().sum(dim=1))
+    return torch.where((x > 0.5).all(dim=1), torch.nan, loss)
 
 
 def cut(dims: tuple[str, ...] = ("a", "b")) -> xr.Dataset:
-    return sample(Hill(), Plane.through(SPACE, SPACE.center, dims, resolution=(24,) * len(dims)))
+    return sample(from_torch(hill, SPACE), Plane.through(SPACE, SPACE.center, dims, resolution=(24,) * len(dims)))
 
 
 DATASET = cut()
@@ -117,7 +109,7 @@ def behind_a_plateau(angle: float) -> tuple[relief.Relief, xr.Dataset]:
     u, v = np.meshgrid(DATASET["u"], DATASET["v"])
     towards = u * np.cos(np.radians(angle)) + v * np.sin(np.radians(angle))
     dataset = DATASET.assign(loss=(("v", "u"), np.where(towards > 0, 1.0, 0.0)))
-    return relief.Relief(RELIEF.plane, style.Scale.linear(0.0, 1.0)), dataset
+    return relief.Relief(RELIEF.plane, style.Scale.between(0.0, 1.0)), dataset
 
 
 @pytest.mark.parametrize("angle", [0.0, 90.0, 180.0, 270.0])
