@@ -10,7 +10,7 @@ from functools import wraps
 from importlib import import_module
 from inspect import signature
 from pathlib import Path
-from typing import Any, ParamSpec, TypeVar, get_args
+from typing import Any, ParamSpec, TypeVar, cast, get_args
 
 from cyclopts import Parameter
 from cyclopts.validators import Number
@@ -97,8 +97,9 @@ def _check_numbers(function: Callable[..., object], given: tuple[object, ...], n
         kinds = get_args(getattr(hint, "__origin__", hint)) or (getattr(hint, "__origin__", hint),)
         if int in kinds and isinstance(value, float) and not value.is_integer():
             raise ValueError(f"{function.__name__} takes a whole number as {name}; got {value}")
-        limits = (one for one in getattr(hint, "__metadata__", ()) if isinstance(one, Parameter))
-        for limit in (check for one in limits for check in one.validator if isinstance(check, Number)):
+        marks = (one for one in getattr(hint, "__metadata__", ()) if isinstance(one, Parameter))
+        checks = (check for mark in marks for check in cast("tuple[object, ...]", mark.validator))
+        for limit in (check for check in checks if isinstance(check, Number)):
             try:
                 limit(type(value), value)
             except ValueError as error:

@@ -64,20 +64,33 @@ def test_four_kills_change_no_bit(job: str, tmp_path: Path) -> None:
     assert not [path for path in killed.rglob(".*") if path.suffix in (".making", ".partial")]
 
 
-STOPPED = {  # the command, the instant of Ctrl-C, and how many points or episodes it has in all
-    "slice": ("slice bounce --dims 0 1 --resolution 16 --fidelity standard --out made", Instant(9, "pieces", SIGINT), 256),
-    "sweep": ("sweep bounce --dims 0 1 --over 2 --frames 4 --resolution 8 --device cpu --out made", Instant(40, "pieces", SIGINT), 256),
-    "optimize": ("optimize rastrigin --set dim=5 --method cma-es --budget 70 --out made", Instant(9, "status/c", SIGINT), 70),
+STOPPED = {  # the command, how many points or episodes it has in all, and the instant of Ctrl-C
+    "slice": (
+        "slice bounce --dims 0 1 --resolution 16 --fidelity standard --out made",
+        256,
+        Instant(9, "pieces", SIGINT),
+    ),
+    "sweep": (
+        "sweep bounce --dims 0 1 --over 2 --frames 4 --resolution 8 --device cpu --out made",
+        256,
+        Instant(40, "pieces", SIGINT),
+    ),
+    "optimize": (
+        "optimize rastrigin --set dim=5 --method cma-es --budget 70 --out made",
+        70,
+        Instant(9, "status/c", SIGINT),
+    ),
     "race": (
         "race bounce --methods random,descents --fidelity draft --budget 40 --seeds 2 --workers 2 --out made",
-        Instant(9, "status/c", SIGINT), 160,
+        160,
+        Instant(9, "status/c", SIGINT),
     ),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("job", STOPPED)
 def test_ctrl_c_says_what_is_kept_and_how_to_go_on_and_changes_no_bit(job: str, tmp_path: Path) -> None:
-    command, instant, count = STOPPED[job]
+    command, count, instant = STOPPED[job]
     work, stopped, whole = partial(landscape, *command.split(), "--json"), tmp_path / "stopped", tmp_path / "whole"
     for folder in (stopped, whole):
         folder.mkdir()
