@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import asdict
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, TypeVar, cast
 
 from platformdirs import user_data_path
 
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from .fidelity import FidelityRecord
     from .variants import StudyRecord
 
+Record = TypeVar("Record", bound="StudyRecord")
 DEVICES = ("cpu", "cuda")
 FOLDER = "studies"
 
@@ -53,11 +54,11 @@ def file_name(env: str, device: str, kind: str, of: str = "") -> str:
     return f"{env}-{device}{f'-{of}' if of else ''}.{kind}.json"
 
 
-def read_study(path: Path, kind: str, data: Mapping[str, Any] | None = None) -> StudyRecord:
-    """Return the study of a kind in a file, whose `data` may be read already. Raises DamagedError for what is none."""
+def read_study(path: Path, kind: str) -> StudyRecord:
+    """Return the study of a kind in a file. Raises DamagedError for what is none."""
     env = re.split(r"-(?:cpu|cuda)\b", path.name)[0]
     with reading(path, f"delete it, and `landscape study {kind} {env}` measures it again"):
-        found = read_json(path) if data is None else data
+        found = read_json(path)
         identity = current_identity(found["identity"])
         number(identity[MODEL_VERSION])
         for name in ("engine", "device"):
@@ -66,12 +67,12 @@ def read_study(path: Path, kind: str, data: Mapping[str, Any] | None = None) -> 
         return from_json(record_class(kind), {**found, "identity": identity})
 
 
-def kept_studies(kind: str, env: str) -> Iterator[tuple[Path, StudyRecord]]:
+def kept_studies(kind: type[Record], env: str) -> Iterator[tuple[Path, Record]]:
     """Yield the studies of a kind that are kept of a scene, the user's own before the gallery's."""
     for folder in (own_folder(), Path(str(resources.files("gradscape.gallery"))) / "data" / FOLDER):
         for device in DEVICES:
-            for path in sorted(folder.glob(f"{env}-{device}*.{kind}.json")):
-                yield path, read_study(path, kind)
+            for path in sorted(folder.glob(f"{env}-{device}*.{kind.kind}.json")):
+                yield path, cast("Record", read_study(path, kind.kind))
 
 
 def find_fidelity(env: Environment, device: str) -> tuple[FidelityRecord, Path] | None:
@@ -84,8 +85,8 @@ def find_fidelity(env: Environment, device: str) -> tuple[FidelityRecord, Path] 
     options, own = asdict(env.options), own_folder()
     found = [
         (path, record)
-        for path, record in kept_studies("fidelity", env.name)
-        if isinstance(record, FidelityRecord) and record.identity["options"] == options
+        for path, record in kept_studies(FidelityRecord, env.name)
+        if record.identity["options"] == options
     ]
     found.sort(key=lambda one: (own not in one[0].parents, one[1].device != device))
     return (found[0][1], found[0][0]) if found else None
@@ -98,8 +99,8 @@ def find_convergence(of: FidelityRecord) -> ConvergenceRecord | None:
     same = ("engine", "options", MODEL_VERSION)
     found = [
         record
-        for _, record in kept_studies("convergence", of.env)
-        if isinstance(record, ConvergenceRecord) and all(record.identity[key] == of.identity[key] for key in same)
+        for _, record in kept_studies(ConvergenceRecord, of.env)
+        if all(record.identity[key] == of.identity[key] for key in same)
     ]
     return min(found, key=lambda record: record.device != of.device, default=None)
 
@@ -109,8 +110,7 @@ def describe_margins(env: Environment) -> list[str]:
     from .extremes import ExtremesRecord
 
     said, seen = list[str](), set[str]()
-    for _, record in kept_studies("extremes", env.name):
-        assert isinstance(record, ExtremesRecord)
+    for _, record in kept_studies(ExtremesRecord, env.name):
         known = record.identity
         key = digest([known["settings"], known["options"], known["engine"], known["device"]])
         if key not in seen and known["options"] == asdict(env.options):

@@ -25,6 +25,11 @@ class Said:
     stdout: str
     stderr: str
 
+    @property
+    def json(self) -> Any:
+        """What was printed as JSON."""
+        return json.loads(self.stdout)
+
 
 @dataclass(frozen=True)
 class Run:
@@ -44,7 +49,7 @@ class Run:
     def json(self, *words: str, cwd: Path | None = None) -> Any:
         """Run what must succeed with --json, and return what it prints."""
         split = words[0].split() if len(words) == 1 else words
-        return json.loads(self.ok(*split, *(() if "--json" in split else ("--json",)), cwd=cwd).stdout)
+        return self.ok(*split, *(() if "--json" in split else ("--json",)), cwd=cwd).json
 
     def refuse(self, *words: str, said: str, cwd: Path | None = None) -> Said:
         """Run what must be refused with exit code 2 and these words, whose lines a terminal may have folded."""

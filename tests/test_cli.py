@@ -29,7 +29,7 @@ def test_a_word_too_few_or_too_many_says_where_to_read_on(run: Run) -> None:
 @pytest.mark.drawn
 def test_slice_leaves_store_picture_and_summary(run: Run, tmp_path: Path) -> None:
     done = run.ok("slice branin --dims x0 1 --resolution 9 --json --out cut")
-    summary = json.loads(done.stdout)
+    summary = done.json
     assert summary == {**json.loads((tmp_path / "cut/summary.json").read_text()), "folder": "cut"}
     assert summary["env"] == "branin"
     assert summary["dims"] == ["x0", "x1"]
@@ -45,7 +45,7 @@ def test_slice_says_where_the_gradient_is_exactly_zero(run: Run, tmp_path: Path)
     done = run.ok("slice pinball-2 --dims 0 1 --resolution 9 --json --out cut")
     dataset = gradscape.open_slice(tmp_path / "cut/slice.zarr").data
     flat = int((dataset["grad"] == 0).all("dim").sum())
-    assert json.loads(done.stdout)["flat"] == flat
+    assert done.json["flat"] == flat
     assert 0 < flat < 81
     assert f"gradient exactly zero at {flat / 81:.1%} of points" in done.stderr
 
@@ -54,7 +54,7 @@ def test_same_command_computes_nothing_twice_and_force_begins_anew(run: Run) -> 
     command = ["slice", "branin", "--dims", "0", "1", "--resolution", "5", "--json"]
     assert run.json(*command)["episodes"] == 25
     again = run(*command)
-    assert json.loads(again.stdout)["episodes"] == 0
+    assert again.json["episodes"] == 0
     assert "there already" in again.stderr
     assert run.json(*command, "--force")["episodes"] == 25
 

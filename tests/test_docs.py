@@ -10,7 +10,6 @@ import subprocess
 import sys
 import tomllib
 from collections.abc import Iterator
-from contextlib import chdir
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -175,11 +174,11 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def address(desk: Path) -> Iterator[str]:
+def address() -> Iterator[str]:
     """Give the address of a scheduler with a worker, whose keys Dask's configuration has: one for all commands."""
     import dask
 
-    with chdir(desk), workers("local:1", "cpu") as executor:  # in a folder that is there as long as the worker is
+    with workers("local:1", "cpu") as executor:
         client = executor._client  # type: ignore[union-attr]
         keys = client.security
         named = {"ca-file": keys.tls_ca_file, "client.cert": keys.tls_client_cert, "client.key": keys.tls_client_key}
@@ -197,6 +196,7 @@ def test_every_command_runs(
     def stop(*_: object) -> None:
         raise KeyboardInterrupt
 
+    monkeypatch.chdir(desk)  # where workers start, too: it is there as long as they are
     monkeypatch.setenv("XDG_DATA_HOME", str(desk / "data"))
     monkeypatch.setattr("http.server.ThreadingHTTPServer.serve_forever", stop)
     monkeypatch.setattr(view, "show_recording", lambda path, *, serve: opened.append(path))

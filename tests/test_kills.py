@@ -1,6 +1,5 @@
 """Jobs of all kinds that are stopped end in the bits of undisturbed ones, and what a kill leaves is in nobody's way."""
 
-import json
 import re
 from functools import partial
 from pathlib import Path
@@ -106,7 +105,7 @@ def test_ctrl_c_says_what_is_kept_and_how_to_go_on_and_changes_no_bit(job: str, 
     assert again.returncode == alone(work, whole).returncode == 0, again.stderr
     assert "are there already" in again.stderr
     assert f"all {count}" not in again.stderr
-    summary = json.loads(again.stdout)
+    summary = again.json
     if job == "race":
         assert "The paper compares no optimisers here" in summary["silence"]
         assert summary["loss_unit"] == "m²"

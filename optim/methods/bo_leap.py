@@ -15,7 +15,7 @@ from ..base import Kind, Optimizer, Points, Proposal
 from ..lockstep import Asking
 from ..memory import SearchSize
 from ..options import MANY, number
-from .cmaes import Normal, population_memory
+from .cmaes import population_memory, quiet_options
 from .descent import Descent, DescentOptions
 from .surrogate import Surrogate, SurrogateOptions, surrogate_memory
 
@@ -119,7 +119,8 @@ class SemiLocal:
         self.es = cma.CMAEvolutionStrategy(
             mu,
             options.sigma,
-            {
+            quiet_options(random)
+            | {
                 "popsize": self.count,
                 "CMA_recombination_weights": [1.0 / self.best] * self.best + [0.0] * (self.count - self.best),
                 "CMA_rankmu": 0,
@@ -127,9 +128,6 @@ class SemiLocal:
                 "CMA_diagonal_decoding": 0,
                 "CMA_mirrors": 0,  # which the library draws of populations below six
                 "AdaptSigma": PathLength,
-                "randn": Normal(random),
-                "seed": np.nan,  # leave numpy's own generator alone
-                "verbose": -10,  # no text, no files written or read
             },
         )
         # Hansen & Ostermeier 2001, table 1: c_c, c_cov, c_sigma; d_sigma = 1 / c_sigma + 1 is pycma's damps / c_sigma

@@ -69,13 +69,9 @@ class CMAES(Optimizer):
     def _start(self) -> None:
         self._began = self.random.bit_generator.state
         self._told: list[tuple[Points, Points]] = []  # populations and their losses since then
-        options: dict[str, Any] = {
+        options = quiet_options(self.random) | {
             "bounds": [-1.0, 1.0],
             "AdaptSigma": CMAAdaptSigmaCSA,  # in every dimension, as published
-            "randn": Normal(self.random),
-            "seed": np.nan,  # leave numpy's global generator alone
-            "verbose": -10,  # no text, no files written or read
-            "verb_log": 0,
         }
         if self.options.population:
             options["popsize"] = self.options.population
@@ -130,6 +126,16 @@ class Normal:
     def __call__(self, *shape: int) -> Points:
         """Return numbers of shape `shape`."""
         return self.random.standard_normal(shape)
+
+
+def quiet_options(random: np.random.Generator) -> dict[str, Any]:
+    """Return the library's options by which it draws from one's own generator, prints nothing and writes no file."""
+    return {
+        "randn": Normal(random),
+        "seed": np.nan,  # leave numpy's global generator alone
+        "verbose": -10,  # no text, no files written or read
+        "verb_log": 0,
+    }
 
 
 @dataclass(frozen=True)

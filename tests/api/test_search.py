@@ -19,7 +19,7 @@ from ..command import Run
 def test_a_run_of_python_is_the_command_s(run: Run, tmp_path: Path) -> None:
     command = "optimize branin --method cma-es --budget 20 --seed 3 --option population=5 --json"
     done = run(command)
-    folder = tmp_path / json.loads(done.stdout)["folder"]
+    folder = tmp_path / done.json["folder"]
     theirs = gs.open_run(folder)
     ours = gs.optimize("branin", "cma-es", budget=20, seed=3, method_options={"population": 5})
     assert ours.folder is not None

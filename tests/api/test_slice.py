@@ -26,7 +26,7 @@ def bowl() -> gs.Objective:
 
 def test_a_slice_of_python_is_the_command_s(run: Run, tmp_path: Path) -> None:
     done = run("slice branin --dims 0 1 --resolution 6 --json")
-    folder = tmp_path / json.loads(done.stdout)["folder"]
+    folder = tmp_path / done.json["folder"]
     theirs = gs.open_slice(folder)
     ours = gs.slice("branin", (0, 1), resolution=6)  # finds it there, as the folder's name is the same
     assert ours.folder is not None

@@ -1,6 +1,5 @@
 """`landscape check`: ours and anyone's, what it prints, how it leaves."""
 
-import json
 import sys
 from collections.abc import Iterator
 from itertools import takewhile
@@ -58,7 +57,7 @@ def bowl(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 def test_bounce_passes_at_draft(run: Run, tmp_path: Path) -> None:
     done = run.ok("check bounce --device cpu --json")
-    report = json.loads(done.stdout)
+    report = done.json
     assert (report["env"], report["fidelity"], report["passed"]) == ("bounce", "draft", True)
     checks = {found["check"]: found for found in report["checks"]}
     said = {name: found["outcome"] for name, found in checks.items() if found["outcome"] != "pass"}
@@ -78,7 +77,7 @@ def test_bounce_passes_at_draft(run: Run, tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", [*FUNCTIONS, "pinball-2", "pinball-16"])
 def test_quick_environments_pass_at_draft(name: str, run: Run) -> None:
     done = run("check", name, "--points", "2", "--device", "cpu", "--json")
-    said = {found["check"]: found["outcome"] for found in json.loads(done.stdout)["checks"]}
+    said = {found["check"]: found["outcome"] for found in done.json["checks"]}
     step = said.pop("an optimiser's step")
     assert set(said.values()) <= {"pass", "skip"}
     assert step == ("warn" if name in RUGGED else "pass")
@@ -132,7 +131,7 @@ def test_a_failure_is_exit_code_1_and_names_itself(run: Run, bowl: None) -> None
     assert len(failed) == 3
     assert "sign right 0%" in done.stdout
     assert done.stdout.splitlines()[-1].startswith("fails: ")
-    report = json.loads(run("check bowl --set wrong=true --json").stdout)
+    report = run("check bowl --set wrong=true --json").json
     assert not report["passed"]
     assert report["options"] == {"wrong": True, "drifting": False}
 
@@ -141,7 +140,7 @@ def test_json_knows_no_infinity(run: Run, bowl: None) -> None:
     done = run("check bowl --set drifting=true --json")
     assert done.returncode == 1
     assert "Infinity" not in done.stdout
-    found = {found["check"]: found for found in json.loads(done.stdout)["checks"]}["determinism"]
+    found = {found["check"]: found for found in done.json["checks"]}["determinism"]
     assert (found["outcome"], found["numbers"]["loss"]) == ("fail", None)
 
 

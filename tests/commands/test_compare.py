@@ -31,7 +31,7 @@ def desk(both: Path, tmp_path: Path) -> Path:
 def test_two_slices_are_compared_and_nothing_is_sampled(run: Run, desk: Path) -> None:
     done = run.ok("compare a b --out both --json")
     assert sorted(file.name for file in (desk / "both").iterdir()) == ["compare.json", "compare.png"]
-    said = json.loads(done.stdout)
+    said = done.json
     kept = json.loads((desk / "both/compare.json").read_text())
     assert {name: kept[name] for name in ("a", "loss", "differing")} == {
         name: said[name] for name in ("a", "loss", "differing")
@@ -50,10 +50,10 @@ def test_an_environment_is_sampled_on_the_slices_own_plane_as_it_would_be_by_its
     (folder,) = (path for path in (desk / "made").iterdir() if path.is_dir())
     np.testing.assert_array_equal(open_slice(folder)["loss"], open_slice(desk / "b")["loss"])
     given = run.json("compare a b --out both")
-    assert json.loads(done.stdout)["loss"] == given["loss"]
+    assert done.json["loss"] == given["loss"]
     again = run(*command)
     assert "all 25 episodes with gradients are there already" in again.stderr
-    assert json.loads(again.stdout) == json.loads(done.stdout)
+    assert again.json == done.json
 
 
 def test_options_are_those_of_b(run: Run, desk: Path) -> None:
@@ -66,7 +66,7 @@ def test_what_lies_off_the_box_is_left_out_of_b_where_it_is_of_a(run: Run) -> No
     cut = "slice bounce --along random:3 --through random:1 --resolution 5 --window 1.5 --device cpu --out a"
     run.ok(cut)
     done = run(*STANDARD.split(), "--json")
-    said = json.loads(done.stdout)
+    said = done.json
     assert said["statuses"] == []
     assert 0 < said["compared"] < said["points"] == 25
     assert not {"cut", "boxed"} & set(said["differing"])

@@ -1,6 +1,5 @@
 """`landscape study extremes` and what `landscape envs NAME` says of it: what they leave, say and refuse."""
 
-import json
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -54,7 +53,7 @@ def own_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_a_study_leaves_a_record_a_picture_and_the_margin(run: Run, tmp_path: Path) -> None:
     assert "stability: not measured; `landscape study extremes stepping` measures it" in run("envs stepping").stdout
     done = run.ok(*TURN, "--grid", "3", "--json", "--figure-width-mm", "85")
-    report = json.loads(done.stdout)
+    report = done.json
     assert {**read_json(tmp_path / "turned/extremes.json"), "folder": "turned"} == report
     assert (tmp_path / "turned/extremes.png").read_bytes().startswith(b"\x89PNG")
     assert (tmp_path / "turned/extremes-85mm.pdf").read_bytes().startswith(b"%PDF")

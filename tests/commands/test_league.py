@@ -16,7 +16,7 @@ LEAGUE = ["league", "branin", "bounce@draft", "--methods", "random,cma-es", "--b
 
 def test_a_league_of_the_command_is_that_of_python(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     done = run.ok(*LEAGUE, "--device", "cpu", "--json", "--out", "l")
-    said, kept = json.loads(done.stdout), json.loads((tmp_path / "l/league.json").read_text())
+    said, kept = done.json, json.loads((tmp_path / "l/league.json").read_text())
     del kept["checksum"]
     assert said == kept | {"folder": "l"}
     assert "branin@exact · cpu: 0 of 24 episodes are there" in done.stderr
@@ -39,7 +39,7 @@ def test_the_best_point_of_a_league_is_known_to_slices(
     monkeypatch.setattr("gradscape.jobs.scene.best_of_league", lambda env: None)  # the gallery keeps a better one
     short = ["--methods", "random", "--budget", "6", "--seeds", "1", "--device", "cpu", "--json"]
     league = run("league", "bounce@draft", *short)
-    best = json.loads(league.stdout)["scenes"][0]["best"]
+    best = league.json["scenes"][0]["best"]
     cut = ["--resolution", "2", "--through", "best", "--fidelity", "draft", "--device", "cpu", "--out", "s"]
     run.ok("slice", "bounce", "--dims", "0", "1", *cut)
     plane = json.loads(gs.open_slice(tmp_path / "s").data.attrs["identity"])["plane"]

@@ -19,7 +19,7 @@ QUICK = ["optimize", "branin", "--method", "cma-es", "--budget", "50"]
 @pytest.mark.drawn
 def test_optimize_leaves_run_picture_and_summary(run: Run, tmp_path: Path) -> None:
     done = run.ok(*QUICK, "--option", "population=7", "--json", "--out", "run")
-    summary = json.loads(done.stdout)
+    summary = done.json
     assert summary == {**json.loads((tmp_path / "run/summary.json").read_text()), "folder": "run"}
     assert (summary["env"], summary["method"], summary["seed"]) == ("branin", "cma-es", 0)
     assert summary["method_options"] == {"sigma": 0.5, "population": 7}
@@ -45,7 +45,7 @@ def test_a_method_with_gradients_says_what_they_cost(run: Run, monkeypatch: pyte
     monkeypatch.setattr(Environment, "evaluate", slow)
     command = ["optimize", "bounce", "--method", "descents", "--budget", "8", "--out", "run", "--json"]
     done = run.ok(*command)
-    summary = json.loads(done.stdout)
+    summary = done.json
     assert summary["kinds"]["descent"] == 8
     assert (summary["gradient_cost"], summary["forwards"]) == (3.0, 24.0)
     assert "8 episodes to compute: one by one 8.0 s without gradients, 24 s with" in done.stderr
@@ -56,7 +56,7 @@ def test_same_command_computes_nothing_twice_a_larger_budget_goes_on_and_force_b
 ) -> None:
     first = run.json(*QUICK)
     again = run(*QUICK, "--json")
-    assert (json.loads(again.stdout)["episodes"], json.loads(again.stdout)["resumed"]) == (0, 50)
+    assert (again.json["episodes"], again.json["resumed"]) == (0, 50)
     assert "all 50 episodes are there already" in again.stderr
     more = run.json(*QUICK, "--budget", "80")
     assert (more["folder"], more["budget"]) == (first["folder"], 80)

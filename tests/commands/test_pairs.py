@@ -9,7 +9,7 @@ from ..command import Run
 def test_pairs_prints_the_command_that_slices_the_first(run: Run, tmp_path: Path) -> None:
     how = ["pairs", "rastrigin", "--set", "dim=3", "--samples", "8", "--top", "2"]
     done = run.ok(*how, "--json")
-    report = json.loads(done.stdout)
+    report = done.json
     assert len(report["pairs"]) == 3  # of which two are shown
     assert report["episodes"] == 8 * (1 + 5 * 3 + 3)
     first = " ".join(map(str, report["pairs"][0]["dims"]))

@@ -1,6 +1,5 @@
 """`landscape race`: what it computes, keeps, draws, says and refuses."""
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +17,7 @@ RACE = ["race", "branin", "--methods", "random,cma-es", "--methods", "descents",
 @pytest.mark.drawn
 def test_race_leaves_runs_picture_and_figures(run: Run, tmp_path: Path) -> None:
     done = run.ok(*RACE, "--json", "--out", "r")
-    said, kept = json.loads(done.stdout), read_json(tmp_path / "r/race.json")
+    said, kept = done.json, read_json(tmp_path / "r/race.json")
     assert said == {key: kept[key] for key in kept if key not in ("curves", "ecdf")} | {"folder": "r"}
     assert kept["methods"] == ["random", "cma-es", "descents"]
     assert "360 episodes to compute" in done.stderr
@@ -42,11 +41,9 @@ def test_more_seeds_methods_and_episodes_go_on_where_the_race_ended(run: Run, tm
     more = run("race branin --methods random,cma-es --budget 30 --seeds 3 --json")
     assert "140 episodes to compute, 40 are there already" in more.stderr
     less = run("race branin --methods random --budget 20 --seeds 2 --json")
-    assert json.loads(less.stdout)["folder"] == json.loads(more.stdout)["folder"]
+    assert less.json["folder"] == more.json["folder"]
     assert len(list(tmp_path.glob("out/race-branin-exact-*/*/run.zarr"))) == 6
-    both = [
-        next(rank for rank in json.loads(said.stdout)["ranks"] if rank["method"] == "random") for said in (less, more)
-    ]
+    both = [next(rank for rank in said.json["ranks"] if rank["method"] == "random") for said in (less, more)]
     assert both[0]["final"][0] >= both[1]["final"][0]
     assert both[0]["forwards"] == 20
     anew = run("race branin --methods random --budget 20 --seeds 2 --force")

@@ -30,7 +30,7 @@ def foot(figure: object) -> str:
 
 def test_a_refined_slice_says_what_was_sampled_and_is_there_the_second_time(run: Run, tmp_path: Path) -> None:
     first = run.ok(*REFINED.split(), "made")
-    said = json.loads(first.stdout)
+    said = first.json
     assert said["status"]["ok"] + said["status"]["interpolated"] == 33 * 33
     assert said["refinement"]["sampled"] == said["status"]["ok"] == said["episodes"]
     assert "up to 1089 episodes with gradients to compute" in first.stderr
@@ -42,7 +42,7 @@ def test_a_refined_slice_says_what_was_sampled_and_is_there_the_second_time(run:
     }
     run.refuse(*REFINED.replace("5%", "4%").split(), "made", said="refinement.share: wanted 0.04, found 0.05")
     plain = run(*REFINED.replace("--refine 5%", "--force").split(), "made")
-    assert json.loads(plain.stdout)["refinement"] is None
+    assert plain.json["refinement"] is None
     assert sorted(path.name for path in (tmp_path / "made").iterdir()) == [
         "landscape.png", "slice.zarr", "summary.json",
     ]  # fmt: skip

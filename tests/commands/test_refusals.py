@@ -126,7 +126,7 @@ def test_words_that_cannot_be_are_refused_and_nothing_is_left(run: Run, tmp_path
     assert not list(tmp_path.iterdir())
 
 
-RESULTS = {  # beside what `desk` holds
+RESULTS = {  # in a folder that holds the results of `made`
     "compare cut fine --fidelity draft": "fine is there already: leave them out",
     "compare cut fine --set drag=1": "fine is there already: leave them out",
     "compare cut cartpole": "A has velocity x where B has t0 cart velocity",

@@ -37,7 +37,7 @@ def cut(sampled: Path, tmp_path: Path) -> Path:
 @pytest.mark.drawn
 def test_a_slice_is_reported_in_numbers_and_words(run: Run, cut: Path, tmp_path: Path) -> None:
     done = run.ok("report cut --points-per-axis 2 --out told --json")
-    record = json.loads(done.stdout)
+    record = done.json
     assert record == {**read_json(tmp_path / "told/report.json"), "folder": "told"}
     assert record["profile"]["losses"]["notable"] == 3  # Branin's minima
     assert record["profile"]["verdict"]["words"] == ["smooth with local minima", "gradients good"]
@@ -56,7 +56,7 @@ def test_a_slice_is_reported_in_numbers_and_words(run: Run, cut: Path, tmp_path:
 
 def test_an_environment_without_figures_is_sampled_first(run: Run, tmp_path: Path) -> None:
     done = run.ok("report beale --points-per-axis 2 --json")
-    record = json.loads(done.stdout)
+    record = done.json
     assert record["env"] == "beale"
     assert (tmp_path / record["folder"] / "report.json").exists()
     assert "576 episodes with gradients to compute" in done.stderr
@@ -100,7 +100,7 @@ def test_one_slice_that_fails_does_not_lose_the_others(run: Run, monkeypatch: py
     done = run(*command, "--json")
     assert done.returncode == 1
     assert "not reported: bounce-x: RuntimeError: out of memory" in done.stderr.splitlines()
-    summary = json.loads(done.stdout)
+    summary = done.json
     assert [record["name"] for record in summary["reports"]] == ["bounce-y"]
     assert list(summary["failed"]) == ["bounce-x"]
     monkeypatch.setattr(job, "measure", measure)

@@ -1,6 +1,5 @@
 """`landscape study`: what a kind of study takes, prints and refuses."""
 
-import json
 from pathlib import Path
 
 import pytest
@@ -32,7 +31,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.drawn
 def test_the_parts_of_a_model_are_printed_drawn_and_kept(run: Run, tmp_path: Path) -> None:
     done = run.ok(*TRADE, "--json", "--figure-width-mm", "85")
-    report = json.loads(done.stdout)
+    report = done.json
     assert {**read_json(tmp_path / "parts/model.json"), "folder": "parts"} == report
     for file, begins in (("model.png", b"\x89PNG"), ("model-85mm.pdf", b"%PDF")):
         assert (tmp_path / "parts" / file).read_bytes().startswith(begins)

@@ -39,7 +39,7 @@ def test_through_several_points_there_is_a_sweep_for_each(run: Run, tmp_path: Pa
 def test_each_frame_is_the_slice_at_its_value(run: Run, tmp_path: Path) -> None:
     done = run.ok(f"{SWEEP} --json")
     assert names(tmp_path / "moved") == FILES
-    summary = json.loads(done.stdout)
+    summary = done.json
     assert summary == {**json.loads((tmp_path / "moved/summary.json").read_text()), "folder": "moved"}
     space, aim = gradscape.make("bounce", device="cpu").space, gradscape.make("bounce", device="cpu").example("aim")
     low, high = float(space.lower[2]), float(space.upper[2])
@@ -63,7 +63,7 @@ def test_gradients_may_be_at_some_of_the_samples(run: Run) -> None:
     some = run(f"{SWEEP} --gradients 2 --json")
     assert (every.returncode, some.returncode) == (0, 0), some.stderr
     assert "75 episodes (gradients at every 2 samples along each axis) of 3 slices to compute" in some.stderr
-    assert json.loads(some.stdout)["gradients_every"] == 2
+    assert some.json["gradients_every"] == 2
     for number in range(3):
         dense, strided = (open_slice(f"{name}/frames/{number:03d}.zarr") for name in ("every", "moved"))
         np.testing.assert_array_equal(strided["loss"], dense["loss"])
@@ -77,7 +77,7 @@ def test_nothing_is_computed_twice(run: Run, monkeypatch: pytest.MonkeyPatch) ->
     first = [open_slice(f"moved/frames/{number:03d}.zarr") for number in range(3)]
     shutil.rmtree("moved/frames/001.zarr")
     again = run(f"{SWEEP} --json")
-    assert (json.loads(again.stdout)["episodes"], json.loads(again.stdout)["resumed"]) == (25, 50)
+    assert (again.json["episodes"], again.json["resumed"]) == (25, 50)
     assert "25 episodes with gradients of 3 slices to compute, 50 are there already" in again.stderr
     for number, before in enumerate(first):
         xr.testing.assert_equal(open_slice(f"moved/frames/{number:03d}.zarr"), before)
@@ -96,7 +96,7 @@ def test_force_begins_anew_and_another_sweep_is_not_overwritten(run: Run) -> Non
     run.refuse(SWEEP.replace("--frames 3", "--frames 4"), said="plane")
     assert before == {path: path.read_bytes() for path in Path("moved").rglob("*") if path.is_file()}
     done = run(SWEEP.replace("--frames 3", "--frames 2") + " --force --json")
-    assert json.loads(done.stdout)["episodes"] == 50
+    assert done.json["episodes"] == 50
     assert names(Path("moved/frames")) == ["000.zarr", "001.zarr"]
 
 

@@ -1,6 +1,5 @@
 """`landscape study convergence`: what it finds of scenes whose convergence is known, keeps and refuses."""
 
-import json
 from pathlib import Path
 from typing import ClassVar
 
@@ -77,7 +76,7 @@ def study(scene: str, *more: str) -> list[str]:
 
 def measured(run: Run, folder: Path, scene: str) -> tuple[ConvergenceRecord, Said]:
     done = run.ok(*study(scene, "--json"), cwd=folder)
-    return from_json(ConvergenceRecord, json.loads(done.stdout)), done
+    return from_json(ConvergenceRecord, done.json), done
 
 
 @pytest.mark.drawn

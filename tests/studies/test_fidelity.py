@@ -124,7 +124,7 @@ def test_a_study_is_printed_without_being_measured_again(
 
 def test_variants_that_are_refused_are_listed_and_those_that_diverge_are_counted(run: Run) -> None:
     done = run(*TRADE, "--json")
-    report = json.loads(done.stdout)
+    report = done.json
     assert report["refused"] == [{"name": "draft-dt-x4", "why": "converging takes dt below 0.4; got 0.4"}]
     assert "refused: draft-dt-x4: converging takes dt below 0.4; got 0.4" in done.stderr
     coarse = by_name(report)["draft-dt-x2"]
@@ -339,7 +339,7 @@ def test_seconds_are_those_of_the_device_that_will_run(
         for row in report["variants"]
     }
     done = run(*how, "--tolerance", "2%")
-    chosen = json.loads(done.stdout)["fidelity"]
+    chosen = done.json["fidelity"]
     assert work[chosen] == min(work[name] for name in within)
     assert chosen not in ("reference", "standard")
     likely = {name for name in within if work[name] <= 2 * min(work[other] for other in within)}

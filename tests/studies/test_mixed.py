@@ -181,7 +181,7 @@ def test_the_verb_prints_both_names_draws_and_goes_on_after_a_stop(
     assert kept
     count = -10_000
     resumed = run.json(*words, "--out", "half")
-    ours, theirs = resumed, json.loads(whole.stdout)
+    ours, theirs = resumed, whole.json
     names = [[one["name"] for one in record["measured"]["variants"]] for record in (ours, theirs)]
     assert names[0] == names[1]
     assert [one["variant"] for one in ours["choices"]] == [one["variant"] for one in theirs["choices"]]
