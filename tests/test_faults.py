@@ -90,6 +90,7 @@ class Disturbed(RuleBasedStateMachine):
         self.judge(command, done, self.folder, complete=True)
         if done.returncode and "--force" in done.stderr:
             done = say(f"{command} --force", self.folder)
+            assert done.returncode == 0 or "is a directory" in done.stderr, done.stderr
             self.judge(f"{command} --force", done, self.folder, complete=True)
         if done.returncode:
             shutil.rmtree(self.result)
