@@ -165,10 +165,9 @@ def _slice(
     gradients: bool | int | None = True,
     scheduler: str | None = None,
 ) -> Slice:
-    from ..jobs.cut import cut, describe_cut, refuse_cut
+    from ..jobs.cut import PlaneSpec
 
-    refuse_cut(dims, along)
-    call = current()
+    spec, call = PlaneSpec(dims, along, through, window, resolution), current()
     env = environment(scene, keywords, dims=dims if policy is None else None)
     from ..landscapes.objective import BoxedObjective
     from ..landscapes.sampling.refine import Refinement
@@ -178,8 +177,7 @@ def _slice(
 
     fine, in_memory = Refinement.of(refine, budget), is_in_memory(env, out)
     begun: dict[str, Any] = {"out": out, "gradients": stride, "refinement": fine}
-    where: dict[str, Any] = {"through": through, "extent": window, "resolution": resolution}
-    plane = cut(objective, dims, along, **where, kept=None if force or in_memory else begun)
+    plane = spec.make(objective, None if force or in_memory else begun)
     if in_memory:
         return _sample_in_memory(BoxedObjective(objective) if along else objective, plane, fine, stride)
     from ..jobs.slice import SliceJob
@@ -187,7 +185,7 @@ def _slice(
 
     with workers(scheduler, env.device) as executor:
         job = SliceJob.of(
-            objective, plane, command=call.command, cut=describe_cut(along, through, window), force=force,
+            objective, plane, command=call.command, cut=spec.cut, force=force,
             executor=executor, prints=widths, **begun,
         )  # fmt: skip
         job.run(call.watch)
