@@ -13,7 +13,7 @@ import numpy as np
 from ..landscapes.capacity import Need, require
 from ..landscapes.convert import from_json
 from ..landscapes.cost import duration
-from ..landscapes.sampling.distribution import PortableObjective, RemoteObjective, run_tasks, workers_of
+from ..landscapes.sampling.distribution import PortableObjective, run_tasks, workers_of
 from ..landscapes.sampling.memory import MemoryBound
 from ..landscapes.storage.files import replacing
 from ..landscapes.storage.records import read_json, reading
@@ -214,7 +214,7 @@ class CensusJob(CheckpointedJob["Census"]):
                 for group in groups:
                     yield from _survey(env, group, how)
                 continue
-            sent = PortableObjective(MemoryBound(env), recipe(env))
+            sent = PortableObjective.of(env, recipe(env))
             for found in run_tasks(self.executor, _survey_there, [(sent, group, how) for group in groups]):
                 yield from found
 
@@ -267,8 +267,6 @@ def _survey(env: Any, group: Sequence[tuple[str, Plane]], how: Mapping[str, Any]
     return [(piece, one.arrays()) for (piece, _), one in zip(group, found, strict=True)]
 
 
-def _survey_there(
-    sent: PortableObjective | RemoteObjective, group: Sequence[tuple[str, Plane]], how: Mapping[str, Any]
-) -> list[Piece]:
+def _survey_there(sent: PortableObjective, group: Sequence[tuple[str, Plane]], how: Mapping[str, Any]) -> list[Piece]:
     """Survey slices on a worker, which keeps the environment that it has made."""
-    return _survey(sent.here().objective, group, how)
+    return _survey(sent.objective.objective, group, how)

@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..landscapes.convert import to_json
 from ..landscapes.cost import EpisodeCost, duration, episode_cost
-from ..landscapes.sampling.distribution import PortableObjective, RemoteObjective, run_tasks, workers_of
-from ..landscapes.sampling.memory import MemoryBound
+from ..landscapes.sampling.distribution import PortableObjective, run_tasks, workers_of
 from ..landscapes.space import as_whole
 from ..landscapes.storage.files import check_free, clear, refuse_others, visible_files
 from ..landscapes.threads import one_torch_thread
@@ -233,7 +232,7 @@ class RaceJob(Job[Race]):
 
     @property
     def _sent(self) -> PortableObjective:
-        return PortableObjective(MemoryBound(self.env), recipe(self.env))
+        return PortableObjective.of(self.env, recipe(self.env))
 
     def _count_left(self, one: Competitor) -> int:
         return max(0, self.budget - one.run.count)
@@ -300,14 +299,14 @@ def _competitor(env: Environment, method: str, seed: int, options: Mapping[str, 
 
 
 def _race_there(
-    sent: PortableObjective | RemoteObjective,
+    sent: PortableObjective,
     numbered: Sequence[tuple[int, str, int, str]],
     options: Options,
     budget: int,
     gradient_cost: float | None,
 ) -> dict[int, SearchProgress]:
     """Fill a worker's share of the runs (number, method, seed, path); return how far each came, by its number."""
-    env: Any = sent.here().objective
+    env: Any = sent.objective.objective
     share = {
         number: _competitor(env, method, seed, options.get(method, {}), RunStore.open(path))
         for number, method, seed, path in numbered
@@ -323,8 +322,8 @@ def _race_there(
     return seen
 
 
-def _cost_there(sent: PortableObjective | RemoteObjective, grad: bool) -> EpisodeCost:
-    return episode_cost(sent.here().objective, grad=grad)
+def _cost_there(sent: PortableObjective, grad: bool) -> EpisodeCost:
+    return episode_cost(sent.objective.objective, grad=grad)
 
 
 def _least(losses: Sequence[float]) -> float:
