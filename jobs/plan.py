@@ -114,7 +114,7 @@ def simulation_seconds(objective: Objective, losses: int, gradients: int, rows: 
     objective.prepare()
     x = objective.space.uniform(max(1, min(rows, objective.preferred_batch)), seed=0)
     counts = {False: losses, True: gradients}
-    return sum(count * seconds_per_episode(objective, x, grad=grad) for grad, count in counts.items() if count)
+    return sum(n * seconds_per_episode(objective, x, grad=grad, count=n) for grad, n in counts.items() if n)
 
 
 def _plan_part(work: Work, device: str | None) -> PlannedWork:
