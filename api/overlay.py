@@ -102,10 +102,10 @@ def overlay(
 
         refuse_unknown(env)
     from ..jobs.foreign import tables_over
-    from ..jobs.overlay import STREAM, OverlayJob, PlaneSpec
+    from ..jobs.overlay import STREAM, OverlayJob, OverlayPlane
     from .view import check_display, show_recording
 
-    call, new = current(), PlaneSpec.of(through, plane, resolution)  # type: ignore[arg-type] # one number for both axes
+    call, new = current(), OverlayPlane.of(through, plane, resolution)  # type: ignore[arg-type] # one number for both axes
     beneath = as_slice(slice, env=env)
     job = OverlayJob.of(
         beneath, tables_over(beneath, several, call.watch), command=call.command, plane=new, device=device,

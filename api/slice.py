@@ -92,10 +92,10 @@ def slice(
         Sample over the weights of a neural policy instead of the parameters of the environment: mlp:32x32 has two
         hidden layers of 32. It has losses only.
     """
-    from ..jobs.cut import cut, describe_cut, refuse_cut
+    from ..jobs.cut import PlaneSpec
 
-    refuse_cut(dims, along)
-    call, fine, window = current(), as_share(refine, "--refine"), as_window(window)
+    call, fine = current(), as_share(refine, "--refine")
+    spec = PlaneSpec(dims, along, through, as_window(window), resolution)
     env = environment(scene, keywords, dims=dims if policy is None else None)
     from ..landscapes.objective import BoxedObjective
     from ..landscapes.sampling.refine import Refinement
@@ -104,8 +104,7 @@ def slice(
     objective, stride = with_policy(env, policy), as_stride(gradients or 0) if policy is None else 0
     in_memory = is_in_memory(env, out)
     begun: dict[str, Any] = {"out": as_path(out), "gradients": stride, "refinement": Refinement.of(fine, budget)}
-    where: dict[str, Any] = {"through": through, "extent": window, "resolution": resolution}
-    plane = cut(objective, dims, along, **where, kept=None if force or in_memory else begun)
+    plane = spec.make(objective, None if force or in_memory else begun)
     if in_memory:
         return _sample_in_memory(BoxedObjective(objective) if along else objective, plane, begun["refinement"], stride)
     from ..jobs.slice import SliceJob
@@ -113,7 +112,7 @@ def slice(
 
     with workers(scheduler, env.device) as executor:
         job = SliceJob.of(
-            objective, plane, command=call.command, cut=describe_cut(along, through, window), force=force,
+            objective, plane, command=call.command, cut=spec.cut, force=force,
             executor=executor, prints=as_widths(figure_width_mm), **begun,
         )  # fmt: skip
         job.run(call.watch)

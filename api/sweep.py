@@ -75,12 +75,11 @@ def sweep(
     """
     if over is None:
         raise ValueError("a sweep takes over: a third parameter, horizon or smoothing; got none")
-    from ..jobs.cut import cut, describe_cut, refuse_cut
+    from ..jobs.cut import PlaneSpec
 
-    refuse_cut(dims, along)
-    call, ends = current(), as_window(window)
+    spec, call = PlaneSpec(dims, along, through, as_window(window), resolution), current()
     env = environment(scene, keywords, dims=[*(dims or ()), over])
-    plane = cut(env, dims, along, through=through, extent=ends, resolution=resolution)
+    plane = spec.make(env)
     from ..jobs.sweep import SweepJob
     from ..jobs.workers import workers
     from ..landscapes.space import as_stride
@@ -89,7 +88,7 @@ def sweep(
         with call.watch.busy(f"opening {frames} slices"):
             job = SweepJob.of(
                 env, plane, over, frames, command=call.command, gradients=as_stride(gradients or 0), force=force,
-                out=as_path(out), cut=describe_cut(along, through, ends),
+                out=as_path(out), cut=spec.cut,
             )  # fmt: skip
         replace(job, executor=executor).run(call.watch)
     return job.sample()

@@ -17,8 +17,9 @@ import torch
 from ..envs.base import Environment
 from ..envs.points import point
 from ..envs.registry import entries, environment_class, make
-from ..jobs.race import RaceJob, lockstep_seconds
-from ..jobs.report import ReportedSlice, ReportJob, digest_of, estimate_seconds
+from ..jobs.plan import simulation_seconds
+from ..jobs.race import RaceJob
+from ..jobs.report import ReportedSlice, ReportJob, digest_of
 from ..jobs.scene import SceneSpec
 from ..jobs.slice import SliceJob
 from ..jobs.study import StudyJob
@@ -411,8 +412,8 @@ class SearchPart(FigurePart):
     def seconds_each(self) -> float:
         """Share what simulating all of them in lockstep takes; what methods take themselves comes on top."""
         asking = sum(optimizer_class(method).needs_grad for method in METHODS)
-        left = {0: BUDGET * (len(METHODS) - asking), 1: BUDGET * asking}
-        return lockstep_seconds(self.scene().make(), left, len(METHODS)) / len(METHODS)
+        counts = BUDGET * (len(METHODS) - asking), BUDGET * asking
+        return simulation_seconds(self.scene().make(), *counts, len(METHODS)) / len(METHODS)
 
     def make(self, watch: Watch) -> str:
         """Race the methods, in a folder under out/, and keep the runs that are missing."""
@@ -462,8 +463,8 @@ class ReportPart(FigurePart):
     def seconds_each(self) -> float:
         """Estimate a report by the first episodes."""
         rank = len(self.figure.dims)
-        shape = (self.figure.resolution,) * rank
-        return estimate_seconds(self.scene().make(), *effort(rank, REPORT_POINTS, shape))
+        losses, gradients = effort(rank, REPORT_POINTS, (self.figure.resolution,) * rank)
+        return simulation_seconds(self.scene().make(), losses, gradients, losses + gradients)
 
     def make(self, watch: Watch) -> str:
         """Measure the slice, and replace a report of another one."""

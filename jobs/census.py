@@ -8,17 +8,18 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import cloudpickle
 import numpy as np
 
 from ..landscapes.capacity import Need, require
 from ..landscapes.convert import from_json
-from ..landscapes.cost import duration, seconds_per_episode
-from ..landscapes.sampling.distribution import make_objective, run_tasks, workers_of
+from ..landscapes.cost import duration
+from ..landscapes.sampling.distribution import PortableObjective, run_tasks, workers_of
+from ..landscapes.sampling.memory import MemoryBound
 from ..landscapes.storage.files import replacing
 from ..landscapes.storage.records import read_json, reading
 from .folder import CENSUS, ROOT, folder_named
 from .job import CheckpointedJob
+from .plan import simulation_seconds
 from .scene import SceneSpec, provenance
 from .watch import PREPARING, Watch, Work
 from .workers import recipe
@@ -180,9 +181,7 @@ class CensusJob(CheckpointedJob["Census"]):
         kept = f"; {len(self.tasks) - len(left)} are there already" if len(left) < len(self.tasks) else ""
         watch.note(f"{what}{kept}")
         if left:
-            x = self.env.space.uniform(min(self.env.preferred_batch, samples), seed=0)
-            each = having * seconds_per_episode(self.env, x, grad=True)
-            each += without * seconds_per_episode(self.env, x, grad=False) if without else 0.0
+            each = simulation_seconds(self.env, without, having, samples)
             lower = "--slices, --resolution and --gradients"
             watch.note(f"about {duration(len(left) * each)} here; {lower} change it")
 
@@ -215,8 +214,8 @@ class CensusJob(CheckpointedJob["Census"]):
                 for group in groups:
                     yield from _survey(env, group, how)
                 continue
-            there = cloudpickle.dumps(recipe(env))
-            for found in run_tasks(self.executor, _survey_there, [(there, group, how) for group in groups]):
+            sent = PortableObjective.of(env, recipe(env))
+            for found in run_tasks(self.executor, _survey_there, [(sent, group, how) for group in groups]):
                 yield from found
 
     def _conclude(self, found: Mapping[str, SurveyedSlice]) -> Census:
@@ -263,12 +262,11 @@ def _abreast(env: Environment) -> int:
 def _survey(env: Any, group: Sequence[tuple[str, Plane]], how: Mapping[str, Any]) -> list[Piece]:
     """Survey slices, their points simulated in one batch, and return what their pieces hold."""
     from ..landscapes.measures.census import survey
-    from ..landscapes.sampling.memory import MemoryBound
 
     found = survey(MemoryBound(env), [plane for _, plane in group], **how)
     return [(piece, one.arrays()) for (piece, _), one in zip(group, found, strict=True)]
 
 
-def _survey_there(there: bytes, group: Sequence[tuple[str, Plane]], how: Mapping[str, Any]) -> list[Piece]:
+def _survey_there(sent: PortableObjective, group: Sequence[tuple[str, Plane]], how: Mapping[str, Any]) -> list[Piece]:
     """Survey slices on a worker, which keeps the environment that it has made."""
-    return _survey(make_objective(there).objective, group, how)
+    return _survey(sent.objective.objective, group, how)

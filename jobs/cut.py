@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,65 +23,79 @@ REACH, MIN_WIDTH = 0.5, 1e-3  # of a width of the box: how far a slice reaches, 
 REACH_PER_ROOT = 1 / 8  # the same by the root of how many parameters there are: each moves by that share of its width
 
 
-def refuse_cut(dims: Sequence[int | str] | None, along: str | None) -> None:
-    """Raise ValueError for parameters beside directions, and for a word that names no directions."""
-    if dims and along is not None:
-        raise ValueError(ONE_OF)
-    if along is not None and not joined_points(along):
-        _check_directions(along)
+@dataclass(frozen=True)
+class PlaneSpec:
+    """Say where a landscape is cut: along one or two parameters, `dims`, or `along` directions that are named.
 
+    Directions are random:SEED, gradient, hessian, pca:RUN, A:B or A:B:C, in widths of the box. Points of a line or a
+    plane are named as those it goes `through`. By default a cut along parameters covers the box; one along directions
+    reaches half a width to each side of the point, and farther where there are more than sixteen parameters. Where
+    there are no more than two parameters and neither is given, it varies all.
 
-def cut(
-    objective: Objective,
-    dims: Sequence[int | str] | None,
-    along: str | None,
-    *,
-    through: str | Tensor,
-    extent: float | tuple[float, float] | None,
-    resolution: int | Sequence[int],
-    kept: Mapping[str, Any] | None = None,
-) -> Plane:
-    """Return the line or plane along parameters, or along directions that are named.
-
-    Where there are no more than two parameters and neither is given, it varies all. `kept` says where a slice may have
-    been begun, as for `kept_plane`: it goes on along its own directions. Raises ValueError where both are given, or
-    neither with more parameters, and as `plane_through` and `plane_along` do.
+    Raises ValueError for parameters beside directions, and for a word that names no directions.
     """
-    if not isinstance(through, str) and any(isinstance(one, str) for one in through):
-        raise ValueError(f"a slice goes through one point here; got {len(through)} names, so ask for each by itself")
-    chosen = list(dims) if dims is not None else []
-    if not chosen and along is None and objective.space.dim <= 2:
-        chosen = list(range(objective.space.dim))
-    if bool(chosen) == (along is not None):
-        raise ValueError(ONE_OF)
-    if along is None:
-        return plane_through(objective, chosen, through=through, extent=extent, resolution=resolution)
-    if not isinstance(resolution, int):
-        raise ValueError(f"a slice along {along} takes one resolution for its axes; got {list(resolution)}")
-    where: dict[str, Any] = {"through": through, "extent": extent}
-    if kept is not None and (named := describe_cut(along, **where)):
-        from .slice import kept_plane
 
-        rank = len(joined_points(along)) - 1 if joined_points(along) else 2
-        if (found := kept_plane(objective, named, (resolution,) * rank, **kept)) is not None:
-            return found
-    return plane_along(objective, along, **where, resolution=resolution)
+    dims: Sequence[int | str] | None
+    along: str | None
+    through: str | Tensor
+    extent: float | tuple[float, float] | None
+    resolution: int | Sequence[int]
+
+    def __post_init__(self) -> None:
+        if self.dims and self.along is not None:
+            raise ValueError(ONE_OF)
+        if self.along is not None and not joined_points(self.along):
+            _check_directions(self.along)
+
+    @property
+    def cut(self) -> dict[str, Any] | None:
+        """What a slice along directions is known by; None for one along parameters."""
+        if self.along is None:
+            return None
+        from .slice import JOINED
+
+        names = joined_points(self.along)
+        point = self.through if isinstance(self.through, str) else self.through.tolist()
+        return {"along": self.along, "through": point, "extent": self.extent, **({JOINED: names} if names else {})}
+
+    def make(self, objective: Objective, kept: Mapping[str, Any] | None = None) -> Plane:
+        """Return the line or plane in an objective's space.
+
+        `kept` says where a slice may have been begun, as for `kept_plane`: it continues along its own directions.
+        Raises ValueError for parameters, points and extents that the space does not have.
+        """
+        through, extent = self.through, self.extent
+        if not isinstance(through, str) and any(isinstance(one, str) for one in through):
+            raise ValueError(
+                f"a slice goes through one point here; got {len(through)} names, so ask for each by itself"
+            )
+        chosen = list(self.dims) if self.dims is not None else []
+        if not chosen and self.along is None and objective.space.dim <= 2:
+            chosen = list(range(objective.space.dim))
+        if bool(chosen) == (self.along is not None):
+            raise ValueError(ONE_OF)
+        if self.along is None:
+            return plane_through(objective, chosen, through=through, extent=extent, resolution=self.resolution)
+        if not isinstance(self.resolution, int):
+            raise ValueError(
+                f"a slice along {self.along} takes one resolution for its axes; got {list(self.resolution)}"
+            )
+        if kept is not None and self.cut is not None:
+            from .slice import kept_plane
+
+            rank = len(joined_points(self.along)) - 1 if joined_points(self.along) else 2
+            if (found := kept_plane(objective, self.cut, (self.resolution,) * rank, **kept)) is not None:
+                return found
+        return _plane_along(objective, self.along, through, extent, self.resolution)
 
 
-def plane_along(
+def _plane_along(
     objective: Objective,
     along: str,
-    *,
     through: str | Tensor,
     extent: float | tuple[float, float] | None,
     resolution: int,
 ) -> Plane:
-    """Return the line or plane along directions that are named: random:SEED, gradient, hessian, pca:RUN, A:B, A:B:C.
-
-    Directions are in widths of the box. By default they reach half a width to each side of the point, and farther where
-    there are more than sixteen parameters. Points of a line or a plane are named as those it goes through. Raises
-    ValueError for what is none of these.
-    """
     import torch
 
     from ..landscapes.directions import gradient_directions, hessian_directions, joining, random_directions
@@ -137,19 +152,6 @@ def _reach(space: ParameterSpace, point: Tensor, spans: Tensor) -> tuple[list[fl
 
 def _ends(extent: float | tuple[float, float]) -> tuple[float, float]:
     return extent if isinstance(extent, tuple) else (-extent / 2, extent / 2)
-
-
-def describe_cut(
-    along: str | None, through: str | Tensor, extent: float | tuple[float, float] | None
-) -> dict[str, Any] | None:
-    """Return what a slice along directions is known by; None for one along parameters."""
-    if along is None:
-        return None
-    from .slice import JOINED
-
-    names = joined_points(along)
-    point = through if isinstance(through, str) else through.tolist()
-    return {"along": along, "through": point, "extent": extent, **({JOINED: names} if names else {})}
 
 
 def split_points(through: str) -> list[str]:

@@ -23,7 +23,8 @@ from ..optim.registry import methods as all_methods
 from ..optim.runs.store import Journal
 from .folder import LEAGUE, RUN_STORE, folder_named
 from .job import Job
-from .race import RaceJob, lockstep_seconds, refuse_other_folder
+from .plan import simulation_seconds
+from .race import RaceJob, refuse_other_folder
 from .scene import AT, SceneSpec
 from .search import divide_methods
 from .watch import PREPARING, Watch, Work
@@ -201,7 +202,8 @@ class LeagueJob(Job[League]):
             return 0.0
         with watch.busy(f"{scene}: {PREPARING}"):
             episode_cost(env, grad=left[1] > 0)  # compiles, which is not to count
-            seconds = lockstep_seconds(env, left, sum(count < whole for count in kept.values()) * self.seeds)
+            runs = sum(count < whole for count in kept.values()) * self.seeds
+            seconds = simulation_seconds(env, left[0], left[1], runs)
         watch.note(f"{said}, the others take {duration(seconds)} to simulate{without}")
         return seconds
 

@@ -39,7 +39,7 @@ SHOULD = ("fidelity", "settings", "engine", MODEL_VERSION)  # as well
 
 
 @dataclass(frozen=True)
-class PlaneSpec:
+class OverlayPlane:
     """The plane of a new slice: through a point of runs, along their principal directions, with another resolution.
 
     `through` is the best point of all runs (best) or of one run's folder, or any other that a slice can go through;
@@ -52,7 +52,7 @@ class PlaneSpec:
     resolution: int | None = None
 
     @classmethod
-    def of(cls, through: str | None, plane: str | None, resolution: int | None) -> PlaneSpec | None:
+    def of(cls, through: str | None, plane: str | None, resolution: int | None) -> OverlayPlane | None:
         """Return the plane to sample, None where nothing asks for one. Raises ValueError for what makes no plane."""
         if plane not in (None, PCA):
             raise ValueError(f"--plane takes pca, the runs' principal plane; got {plane!r}")
@@ -153,7 +153,7 @@ class OverlayJob(Job[Overlay]):
     results = OVERLAY
     slice: Slice
     runs: Sequence[xr.Dataset]
-    plane: PlaneSpec | None = None
+    plane: OverlayPlane | None = None
     device: str = "auto"
 
     @classmethod
@@ -163,7 +163,7 @@ class OverlayJob(Job[Overlay]):
         runs: Sequence[xr.Dataset],
         *,
         command: str,
-        plane: PlaneSpec | None = None,
+        plane: OverlayPlane | None = None,
         device: str = "auto",
         out: Path | None = None,
         prints: Sequence[float] = (),
@@ -204,7 +204,7 @@ class OverlayJob(Job[Overlay]):
         """Say in a line what it shows."""
         return found.summary.outcome()
 
-    def _sample(self, watch: Watch, spec: PlaneSpec) -> Slice:
+    def _sample(self, watch: Watch, spec: OverlayPlane) -> Slice:
         """Sample the new slice."""
         env = self._objective()
         if self.slice.folder is not None:
@@ -255,7 +255,9 @@ def _name(run: xr.Dataset) -> str:
     return f"{known.get('objective')}, {known.get('method')}, seed {known.get('seed')}"
 
 
-def overlay_folder(dataset: xr.Dataset, runs: Sequence[xr.Dataset], plane: PlaneSpec | None, root: Path = ROOT) -> Path:
+def overlay_folder(
+    dataset: xr.Dataset, runs: Sequence[xr.Dataset], plane: OverlayPlane | None, root: Path = ROOT
+) -> Path:
     """Return a folder of its own for every different overlay, the same for the same one."""
     ours = stored_identity(dataset)
     how = [plane.through, PCA if plane.principal else None, plane.resolution] if plane else [None, None, None]

@@ -109,6 +109,14 @@ def plan_work(works: Sequence[Work], command: str, watch: Watch, *, device: str 
     return Plan(command, tuple(parts))
 
 
+def simulation_seconds(objective: Objective, losses: int, gradients: int, rows: int) -> float:
+    """Measure what so many episodes without and with gradient take, so many `rows` in a batch [s]."""
+    objective.prepare()
+    x = objective.space.uniform(max(1, min(rows, objective.preferred_batch)), seed=0)
+    counts = {False: losses, True: gradients}
+    return sum(n * seconds_per_episode(objective, x, grad=grad, count=n) for grad, n in counts.items() if n)
+
+
 def _plan_part(work: Work, device: str | None) -> PlannedWork:
     objective, identity = work.objective, work.objective.identity()
     counts, rate = {False: work.losses, True: work.gradients}, MEASURED

@@ -10,12 +10,9 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import cloudpickle
-
 from ..landscapes.convert import to_json
-from ..landscapes.cost import EpisodeCost, duration, episode_cost, seconds_per_episode
-from ..landscapes.sampling.distribution import make_objective as objective_of
-from ..landscapes.sampling.distribution import run_tasks, workers_of
+from ..landscapes.cost import EpisodeCost, duration, episode_cost
+from ..landscapes.sampling.distribution import PortableObjective, run_tasks, workers_of
 from ..landscapes.space import as_whole
 from ..landscapes.storage.files import check_free, clear, refuse_others, visible_files
 from ..landscapes.threads import one_torch_thread
@@ -28,6 +25,7 @@ from ..optim.runs.store import RunStore
 from ..optim.search import SearchProgress
 from .folder import RACE, ROOT, RUN_STORE, folder_named
 from .job import Job, filling
+from .plan import simulation_seconds
 from .scene import provenance
 from .search import divide_methods, make_optimizer, open_run_store
 from .watch import PREPARING, Watch, Work
@@ -189,9 +187,9 @@ class RaceJob(Job[Race]):
     ) -> None:
         """Let workers search, a share of the runs each, and read what they wrote."""
         left = [one for one in self.competitors if self._count_left(one)]
-        there, many = cloudpickle.dumps(recipe(self.env)), min(workers_of(executor), len(left))
+        many = min(workers_of(executor), len(left))
         numbered = [(number, one.method, one.seed, str(one.run.path)) for number, one in enumerate(left)]
-        tasks = [(there, numbered[start::many], dict(self.options), self.budget, ratio) for start in range(many)]
+        tasks = [(self._sent, numbered[start::many], dict(self.options), self.budget, ratio) for start in range(many)]
         for found in run_tasks(executor, _race_there, tasks):
             for number, now in found.items():
                 with left[number].run.lock():  # reads it
@@ -224,13 +222,17 @@ class RaceJob(Job[Race]):
         """
         grad = left[1] > 0
         if self.executor is not None:
-            (alone,) = run_tasks(self.executor, _cost_there, [(cloudpickle.dumps(recipe(self.env)), grad)])
+            (alone,) = run_tasks(self.executor, _cost_there, [(self._sent, grad)])
             whole = left[0] * alone.forward + (left[1] * alone.gradient if grad else 0.0)
             by = workers_of(self.executor)
             return alone, f"{duration(whole)} one by one, by {by} workers, and what the methods take"
         concurrent = sum(self._count_left(one) > 0 for one in self.competitors)
-        seconds = lockstep_seconds(self.env, left, concurrent)
+        seconds = simulation_seconds(self.env, left[0], left[1], concurrent)
         return episode_cost(self.env, grad=grad), f"{duration(seconds)} to simulate, and what the methods take"
+
+    @property
+    def _sent(self) -> PortableObjective:
+        return PortableObjective.of(self.env, recipe(self.env))
 
     def _count_left(self, one: Competitor) -> int:
         return max(0, self.budget - one.run.count)
@@ -260,12 +262,6 @@ class Lines:
         failed = sum(count for _, count, _ in mine)
         best = "no loss yet" if math.isnan(least) else f"best loss {least:.4g}"
         return f"{method}: {best}{f', {failed} failed' if failed else ''}"
-
-
-def lockstep_seconds(env: Environment, left: Mapping[int, int], abreast: int) -> float:
-    """Measure what so many episodes take to simulate, without gradients (0) and with (1), so many in a batch [s]."""
-    x = env.space.uniform(max(1, min(abreast, env.preferred_batch)), seed=0)
-    return sum(count * seconds_per_episode(env, x, grad=bool(way)) for way, count in left.items() if count)
 
 
 def race_folder(env: Environment, options: Options, root: Path = ROOT) -> Path:
@@ -303,14 +299,14 @@ def _competitor(env: Environment, method: str, seed: int, options: Mapping[str, 
 
 
 def _race_there(
-    there: bytes,
+    sent: PortableObjective,
     numbered: Sequence[tuple[int, str, int, str]],
     options: Options,
     budget: int,
     gradient_cost: float | None,
 ) -> dict[int, SearchProgress]:
     """Fill a worker's share of the runs (number, method, seed, path); return how far each came, by its number."""
-    env: Any = objective_of(there).objective
+    env: Any = sent.objective.objective
     share = {
         number: _competitor(env, method, seed, options.get(method, {}), RunStore.open(path))
         for number, method, seed, path in numbered
@@ -326,8 +322,8 @@ def _race_there(
     return seen
 
 
-def _cost_there(there: bytes, grad: bool) -> EpisodeCost:
-    return episode_cost(objective_of(there).objective, grad=grad)
+def _cost_there(sent: PortableObjective, grad: bool) -> EpisodeCost:
+    return episode_cost(sent.objective.objective, grad=grad)
 
 
 def _least(losses: Sequence[float]) -> float:

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from ..landscapes.capacity import Need, require, size
 from ..landscapes.convert import NOT_JSON, from_json, to_json
-from ..landscapes.cost import duration, seconds_per_episode
+from ..landscapes.cost import duration
 from ..landscapes.identity import MODEL_VERSION, plane_of, stored_identity
 from ..landscapes.measures.classify import QuotedWord
 from ..landscapes.measures.doubled_resolution import DoubledResolution
@@ -32,6 +32,7 @@ from ..landscapes.storage.files import is_full, make_folder, other_files, replac
 from ..landscapes.storage.records import read_json, reading, write_record
 from ..landscapes.verification import RESAMPLE, verify_dataset
 from .folder import REPORT, REPORTS, ROOT, SLICE_STORE, folder_named, store_in
+from .plan import simulation_seconds
 from .scene import environment_of
 from .watch import PREPARING, Watch, Work, resumable
 
@@ -286,13 +287,6 @@ def refuse_too_many(points: int, rank: int, dim: int) -> None:
     require("points", points, lambda count: need_of(rank, dim, count))
 
 
-def estimate_seconds(env: Environment, losses: int, gradients: int) -> float:
-    """Estimate what so many episodes without and with gradient take [s]."""
-    env.prepare()
-    x = env.space.uniform(min(env.preferred_batch, losses + gradients), seed=0)
-    return sum(count * seconds_per_episode(env, x, grad=grad) for grad, count in ((False, losses), (True, gradients)))
-
-
 def _announce(env: Environment, dataset: xr.Dataset, points: int, watch: Watch) -> None:
     """Say what a report takes: its episodes, and what is measured of the slice itself."""
     from ..landscapes.capacity import peak_memory
@@ -303,7 +297,7 @@ def _announce(env: Environment, dataset: xr.Dataset, points: int, watch: Watch) 
     losses, gradients = work.losses, work.gradients
     own_seconds, own_bytes = own_cost(dataset["loss"].size)
     with watch.busy(f"{env.name}: {PREPARING}"):
-        seconds = estimate_seconds(env, losses, gradients)
+        seconds = simulation_seconds(env, losses, gradients, losses + gradients)
     episodes = env.memory() * env.preferred_batch
     device = f", {size(episodes)} of the GPU's" if env.device == "cuda" else ""
     memory = peak_memory() + own_bytes + need_of(rank, env.space.dim, points).memory + (0 if device else episodes)

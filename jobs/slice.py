@@ -29,15 +29,8 @@ from ..landscapes.measures.undersampled import Undersampled, find_undersampled, 
 from ..landscapes.objective import BoxedObjective, Objective, Status, describe_errors, failed
 from ..landscapes.plain import plain_name
 from ..landscapes.plane import Plane
-from ..landscapes.sampling.distribution import (
-    PortableObjective,
-    RemoteObjective,
-    evaluator,
-    run_tasks,
-    workers_of,
-)
+from ..landscapes.sampling.distribution import PortableObjective, evaluator, run_tasks, workers_of
 from ..landscapes.sampling.fill import Progress, sample
-from ..landscapes.sampling.memory import MemoryBound
 from ..landscapes.sampling.refine import Refined, Refinement, partly_refined, refine
 from ..landscapes.storage.arrays import Tile, need_of
 from ..landscapes.storage.files import clear
@@ -382,7 +375,7 @@ def estimate_cost(
     if executor is None:
         timed = [_time(objective, batch, counts)]
     else:
-        sent = PortableObjective(MemoryBound(objective), remake)
+        sent = PortableObjective.of(objective, remake)
         timed = list(run_tasks(executor, _time_there, [(sent, batch, counts)] * workers_of(executor)))
     shares = [1 / seconds for seconds, _ in timed if seconds]
     arrays = need_of(store.shape, store.plane.dim, grad=store.grad)
@@ -397,9 +390,9 @@ def _time(objective: Objective, batch: Float[Tensor, "point dim"], counts: Mappi
 
 
 def _time_there(
-    sent: PortableObjective | RemoteObjective, batch: Float[Tensor, "point dim"], counts: Mapping[bool, int]
+    sent: PortableObjective, batch: Float[Tensor, "point dim"], counts: Mapping[bool, int]
 ) -> tuple[float, int]:
-    return _time(sent.here().objective, batch, counts)
+    return _time(sent.objective.objective, batch, counts)
 
 
 def first_points(store: SliceStore, tiles: Sequence[Tile], count: int) -> Float[Tensor, "point dim"]:

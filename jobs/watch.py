@@ -85,26 +85,14 @@ class Watch:
     @contextmanager
     def busy(self, text: str) -> Iterator[Say]:
         """Take what a job does that nothing can be counted of, as long as it does it; give what says it otherwise."""
-        yield _ignore_text
+        yield lambda text: None
 
     @contextmanager
     def progress(self, total: int, what: str = "episodes") -> Iterator[Advance]:
         """Give a function that takes how many of `total` are done, and in words what to say beside that."""
-        yield _ignore
+        yield lambda done, said="": None
 
     @contextmanager
     def progress_of(self, totals: Mapping[str, int]) -> Iterator[AdvanceOne]:
         """Give a function that takes of which of several things how many of its total are done, and what to say."""
-        yield _ignore_one
-
-
-def _ignore(done: int, said: str = "") -> None:
-    """Take no notice."""
-
-
-def _ignore_one(name: str, done: int, said: str) -> None:
-    """Take no notice."""
-
-
-def _ignore_text(text: str) -> None:
-    """Take no notice."""
+        yield lambda name, done, said: None

@@ -49,36 +49,32 @@ class FilledTile:
 class PortableObjective:
     """An objective that can be sent to another process: there it is made by `made`, once, and kept.
 
-    Without `made` the objective itself is pickled.
+    Without `made` the objective itself is pickled. `recipe` is what was sent, where this is another process.
     """
 
-    objective: MemoryBound
+    own: MemoryBound | None
     made: Callable[[], Objective] | None = None
+    recipe: bytes = b""
 
-    def here(self) -> MemoryBound:
-        """Return the objective as it is in this process."""
-        return self.objective
+    @classmethod
+    def of(cls, objective: Objective, made: Callable[[], Objective] | None) -> PortableObjective:
+        """Return an objective as it is sent."""
+        return cls(MemoryBound(objective), made)
+
+    @property
+    def objective(self) -> MemoryBound:
+        """The objective in this process, made where that has not made it yet."""
+        return make_objective(self.recipe) if self.own is None else self.own
 
     def __reduce__(self) -> tuple[Any, ...]:
         try:
-            recipe = cloudpickle.dumps(self.made or partial(_itself, self.objective.objective))
+            recipe = self.recipe or cloudpickle.dumps(self.made or partial(_itself, self.objective.objective))
         except Exception as error:  # whatever part of it cannot travel
             raise ValueError(
                 f"{self.objective.name} cannot be sent to another process ({error}); give sample made=, a function "
                 "that makes it there"
             ) from error
-        return RemoteObjective, (recipe,)
-
-
-@dataclass(frozen=True)
-class RemoteObjective:
-    """An objective in a process that it was sent to."""
-
-    recipe: bytes
-
-    def here(self) -> MemoryBound:
-        """Return the objective, made where this process has not made it yet."""
-        return make_objective(self.recipe)
+        return PortableObjective, (None, None, recipe)
 
 
 def _itself(objective: Objective) -> Objective:
@@ -141,7 +137,7 @@ class Distributed(ObjectiveWrapper):
 
 def evaluator(objective: Objective, executor: Executor | None, made: Callable[[], Objective] | None) -> Objective:
     """Return an objective as it is to be evaluated: here, or by an executor's workers."""
-    sent = PortableObjective(MemoryBound(objective), made)
+    sent = PortableObjective.of(objective, made)
     return sent.objective if executor is None else Distributed(sent, executor)
 
 
@@ -204,19 +200,19 @@ def _has_workers(executor: Executor) -> bool:
 
 
 def _evaluate(
-    sent: PortableObjective | RemoteObjective, number: int, x: Float[Tensor, "batch dim"], grad: bool
+    sent: PortableObjective, number: int, x: Float[Tensor, "batch dim"], grad: bool
 ) -> tuple[int, Evaluation]:
-    return number, sent.here().evaluate(x, grad=grad)
+    return number, sent.objective.evaluate(x, grad=grad)
 
 
 def _fill(
-    sent: PortableObjective | RemoteObjective,
+    sent: PortableObjective,
     tiling: Tiling,
     tiles: Sequence[Tile],
     batch: int,
     pending: Collection[Tile],
 ) -> Iterator[FilledTile]:
-    objective = sent.here()
+    objective = sent.objective
     for tile, found in evaluate_tiles(objective, tiling, tiles, batch, set(pending)):
         yield FilledTile(tile, found, objective.take_notes())
 

@@ -22,7 +22,6 @@ from ..storage.files import full, is_full
 from ..storage.store import SliceStore
 from ..verification import verify_store
 from .distribution import PortableObjective, WorkersLostError, fill_tiles
-from .memory import MemoryBound
 
 
 @dataclass(frozen=True)
@@ -99,7 +98,7 @@ def sample(
             progress(Progress(counts.total(), status.size, resumed, dict(counts), levels, levels > before))
 
     report()
-    sent = PortableObjective(MemoryBound(objective), made)
+    sent = PortableObjective.of(objective, made)
     with resumable(store, counts), closing(fill_tiles(sent, tiling, pending, batch, executor)) as tiles:
         for filled in tiles:
             store.write(filled.tile, filled.found)

@@ -357,14 +357,13 @@ class Chunks:
 
         Raises DamagedError where its layout or its axes are not what was written.
         """
+        check_layouts(path)
         try:
             group = open_group(path, "r+")
-            empty = _read_blank(path, group)
-            return empty, path, cls(group)
+            return _read_blank(path, group), path, cls(group)
         except DamagedError:
             raise
-        except Exception as error:  # a damaged axis or layout raises whatever reads it; no chunk is read here
-            check_layouts(path)
+        except Exception as error:  # a damaged axis raises whatever reads it; no chunk is read here
             raise damage(path, f"{type(error).__name__}: {error}") from error
 
     def read(self, tile: Tile) -> Arrays | None:
@@ -398,7 +397,7 @@ def _read_blank(path: Path, group: zarr.Group) -> xr.Dataset:
         raise damage(path / "unit", "it is not what was written")
     empty = blank(identity, provenance, units)
     axes = {str(name): one.to_numpy() for name, one in empty.coords.items()}
-    check_integrity(path, group, axes, list(map(str, empty.data_vars)))
+    check_axes(path, group, axes, list(map(str, empty.data_vars)))
     for name, one in empty.variables.items():
         one.attrs = attributes_of(arrays[str(name)])
     if INTERPOLATED in arrays:
@@ -437,41 +436,27 @@ def write_sums(group: zarr.Group, dataset: xr.Dataset) -> None:
 ANEW = "restore it, or sample the slice anew in another folder"
 
 
-def check_integrity(path: Path, group: zarr.Group, axes: Mapping[str, NDArray[Any]], values: Sequence[str]) -> None:
-    """Raise DamagedError, naming the file, where a slice store's layout or axes are not what they were made.
-
-    `axes` hold what its coordinates must be, in stored order; `values` name the other arrays. Chunks of those have
-    checksums, and are looked at when they are read.
-    """
-    wanted, found = {*axes, *values}, set(group.array_keys())
-    known = _index(path)
-    if not wanted <= found or known.keys() not in (set(), found):
-        raise damage(path, f"it needs the arrays {', '.join(sorted(wanted))} and an index of them")
-    for name, layout in known.items():
-        if _read(path / name) != layout:
+def check_layouts(path: Path) -> None:
+    """Raise DamagedError, naming the file, where how an array is stored is not readable or not what the index says."""
+    root = _read(path)
+    index = root.get("consolidated_metadata", {"metadata": {}})  # copies that xarray wrote may have none
+    known = index.get("metadata") if isinstance(index, dict) else None
+    if not isinstance(known, dict) or not (known or "consolidated_metadata" not in root):
+        raise damage(path, "the index of its arrays is not what it was made")
+    for name in known or [name for name in (*SAMPLES, *AXES, "dim", "unit") if (path / name).is_dir()]:
+        layout = _read(path / name)
+        if layout.get("node_type") != "array" or known.get(name, layout) != layout:
             raise damage(path / name, "its layout is not what the store's index says")
+
+
+def check_axes(path: Path, group: zarr.Group, axes: Mapping[str, NDArray[Any]], values: Sequence[str]) -> None:
+    """Raise DamagedError where a slice lacks arrays, `axes` or other `values`, or where an axis is not what it was."""
+    wanted = {*axes, *values}
+    if not wanted <= set(group.array_keys()):
+        raise damage(path, f"it needs the arrays {', '.join(sorted(wanted))}")
     for name, axis in axes.items():
         if not np.array_equal(_values(path / name, group[name]), axis):
             raise damage(path / name, "it is not what the store's identity says")
-
-
-def check_layouts(path: Path) -> None:
-    """Raise DamagedError, naming the file, where what says how an array is stored cannot be read."""
-    for folder in sorted(one for one in path.iterdir() if one.is_dir()):
-        if _read(folder).get("node_type") != "array":
-            raise damage(folder / "zarr.json", "it does not say how an array is stored")
-
-
-def _index(path: Path) -> dict[str, Any]:
-    """Return the layout of every array as the store's index has it, nothing where it has no index."""
-    root = _read(path)
-    if "consolidated_metadata" not in root:
-        return {}
-    index = root["consolidated_metadata"]
-    known = index.get("metadata") if isinstance(index, dict) else None
-    if not isinstance(known, dict) or not known:
-        raise damage(path, "the index of its arrays is not what it was made")
-    return known
 
 
 def _values(path: Path, array: Any) -> NDArray[Any]:

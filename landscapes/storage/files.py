@@ -284,7 +284,7 @@ def holding(folder: Path, say: Callable[[str], object] = lambda text: None) -> I
 
 
 def check_free(folder: Path) -> None:
-    """Raise StoreError where another process fills a folder that is to be begun anew."""
+    """Raise StoreError where another process fills a folder that is to be begun again."""
     if not folder.is_dir():
         return
     lock = _open(folder)
@@ -325,18 +325,19 @@ CODES = (errno.ENOSPC, errno.EDQUOT)
 FULL_DISK_WORDS = "No space left on device"  # of a program that writes for us, such as ffmpeg
 
 
-class DiskFullError(OSError):
+class _SaidError(OSError):
+    """An error of the system whose message is its own."""
+
+    def __str__(self) -> str:
+        return str(self.strerror)
+
+
+class DiskFullError(_SaidError):
     """A disk is full; the message says what is kept of the job."""
 
-    def __str__(self) -> str:
-        return str(self.strerror)
 
-
-class UnwritableError(OSError):
+class UnwritableError(_SaidError):
     """A folder that the system chose cannot be written to; the message says how it is moved."""
-
-    def __str__(self) -> str:
-        return str(self.strerror)
 
 
 @contextmanager

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import gradscape as gs
-from gradscape.jobs.cut import joined_points, plane_along
+from gradscape.jobs.cut import PlaneSpec, joined_points
 from gradscape.jobs.scene import point_of
 from gradscape.landscapes.objective import Status
 from gradscape.landscapes.plane import Plane
@@ -24,7 +24,6 @@ def wells(x):
 
 
 WELLS = gs.from_torch(wells, SPACE)
-HOW = {"through": "center", "extent": None, "resolution": 9}
 
 
 class Wells(gs.Environment):
@@ -58,7 +57,7 @@ def test_points_of_lines_and_planes_are_told_from_directions(text, names):
 @pytest.mark.parametrize("along", ["random:4", "gradient", "hessian"])
 def test_a_slice_along_directions_reaches_as_far_as_the_box_does_along_each(along):
     for seed in range(4):
-        plane = plane_along(WELLS, along, **{**HOW, "through": f"random:{seed}"})
+        plane = PlaneSpec(None, along, f"random:{seed}", None, 9).make(WELLS)
         for axis in range(2):
             for end in (plane.lower[axis], plane.upper[axis]):
                 u = torch.zeros(2, dtype=torch.float64)
@@ -72,7 +71,7 @@ def test_a_slice_along_directions_reaches_as_far_as_the_box_does_along_each(alon
 
 def test_from_a_corner_that_a_direction_points_out_of_it_covers_half_a_width():
     corner = torch.stack([SPACE.lower[0], SPACE.upper[1], SPACE.upper[2], SPACE.lower[3]])
-    plane = plane_along(WELLS, "random:0", **{**HOW, "through": corner})
+    plane = PlaneSpec(None, "random:0", corner, None, 9).make(WELLS)
     assert (plane.upper > plane.lower).all()
 
 
@@ -101,10 +100,10 @@ def test_a_slice_that_was_begun_goes_on_along_its_own_directions(tmp_path, monke
     first = gs.slice("bounce", along="gradient", resolution=5, out=tmp_path / "cut", device="cpu")
     from gradscape.jobs import cut as module
 
-    exact = module.plane_along
-    monkeypatch.setattr(module, "plane_along", lambda *_, **__: pytest.fail("directions were computed again"))
+    exact = module._plane_along
+    monkeypatch.setattr(module, "_plane_along", lambda *_, **__: pytest.fail("directions were computed again"))
     again = gs.slice("bounce", along="gradient", resolution=5, out=tmp_path / "cut", device="cpu")
-    monkeypatch.setattr(module, "plane_along", exact)
+    monkeypatch.setattr(module, "_plane_along", exact)
     assert again.data.loss.to_numpy().tobytes() == first.data.loss.to_numpy().tobytes()
     assert json.loads((tmp_path / "cut/summary.json").read_text())["episodes"] == 0
     with pytest.raises(ValueError, match=r"another slice|differ|other"):

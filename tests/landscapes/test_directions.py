@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from gradscape.envs.adapters import from_torch
-from gradscape.jobs.cut import cut, points_in
+from gradscape.jobs.cut import PlaneSpec, points_in
 from gradscape.landscapes.directions import (
     barrier,
     gradient_directions,
@@ -75,7 +75,6 @@ def test_refusals():
     for make in (gradient_directions, hessian_directions):
         with pytest.raises(ValueError, match="at this point"):
             make(flat, POINT)
-    how = {"through": "center", "extent": None, "resolution": 5}
     for dims, along in ((None, None), ((0, 1), "hessian"), (None, "nowhere")):
         with pytest.raises(ValueError, match="--along"):
-            cut(flat, dims, along, **how)
+            PlaneSpec(dims, along, "center", None, 5).make(flat)

@@ -19,29 +19,16 @@ from gradscape.landscapes.plane import Plane
 from gradscape.landscapes.sampling import distribution as spread
 from gradscape.landscapes.sampling.distribution import WorkersLostError, equal_groups
 from gradscape.landscapes.sampling.fill import sample
-from gradscape.landscapes.space import ParameterSpace
 from gradscape.landscapes.storage.arrays import Tiling
-from gradscape.landscapes.storage.store import SliceStore, open_slice
+from gradscape.landscapes.storage.store import open_slice
 
 from ...clock import Clock
 from ...processes import FORK
+from . import waves
+from .waves import PLANE, SPACE, same, store_at, wave
 
-cloudpickle.register_pickle_by_value(sys.modules[__name__])  # workers need not find the tests
-SPACE = ParameterSpace.box(("x", "y", "z"), -2.0, 2.0, "m")
-PLANE = Plane.through(SPACE, SPACE.center, ["x", "z"], resolution=(18, 16))
-
-
-def wave(x: torch.Tensor) -> torch.Tensor:
-    return (3 * x).sin().prod(dim=1) + x.exp().sum(dim=1)
-
-
-def store_at(path: Path) -> SliceStore:
-    return SliceStore.open_or_create(path, PLANE, SPACE, identity={"objective": "wave"})
-
-
-def same(one: SliceStore, other: SliceStore) -> bool:
-    a, b = one.dataset(), other.dataset()
-    return all(a[name].to_numpy().tobytes() == b[name].to_numpy().tobytes() for name in ("loss", "grad", "status"))
+for module in (sys.modules[__name__], waves):
+    cloudpickle.register_pickle_by_value(module)  # workers need not find the tests
 
 
 @pytest.fixture(scope="module")

@@ -17,26 +17,20 @@ from gradscape.landscapes.objective import Evaluation, Objective, Status
 from gradscape.landscapes.plane import Plane
 from gradscape.landscapes.sampling.fill import sample
 from gradscape.landscapes.sampling.memory import MemoryBound, is_out_of_memory
-from gradscape.landscapes.space import ParameterSpace
 from gradscape.landscapes.storage.paths import filling_path
 from gradscape.landscapes.storage.store import SliceStore
 from gradscape.landscapes.verification import POINTS
 from gradscape.studies.stability import ask, is_stable
 
 from ...processes import FORK
+from .waves import PLANE, SPACE, same, store_at, wave
 
-SPACE = ParameterSpace.box(("x", "y", "z"), -2.0, 2.0, "m")
-PLANE = Plane.through(SPACE, SPACE.center, ["x", "z"], resolution=(18, 16))
 MESSAGES = [
     "CUDA out of memory. Tried to allocate 2.00 GiB",
     "Failed to allocate 123456 bytes on device 'cuda:0'",
     "DefaultCPUAllocator: can't allocate memory: you tried to allocate 8000000000000 bytes",
     "Out of CUDA pre-allocated memory",
 ]
-
-
-def wave(x: torch.Tensor) -> torch.Tensor:
-    return (3 * x).sin().prod(dim=1) + x.exp().sum(dim=1)
 
 
 class Small(Objective):
@@ -53,16 +47,6 @@ class Small(Objective):
         if len(x) > self.room:
             raise self.error
         return from_torch(wave, SPACE).evaluate(x, grad=grad)
-
-
-def store_at(path: Path) -> SliceStore:
-    return SliceStore.open_or_create(path, PLANE, SPACE, identity={"objective": "wave"})
-
-
-def same(one, other) -> bool:
-    return all(
-        one[name].to_numpy().tobytes() == other[name].to_numpy().tobytes() for name in ("loss", "grad", "status")
-    )
 
 
 @pytest.fixture
@@ -223,4 +207,4 @@ def test_two_processes_fill_the_same_store_and_harm_nothing(tmp_path, whole):
     assert [process.exitcode for process in both] == [0, 0]
     store = store_at(tmp_path / "s.zarr")
     assert not store.pending()
-    assert same(store.dataset(), whole)
+    assert same(store, whole)

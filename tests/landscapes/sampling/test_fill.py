@@ -14,14 +14,12 @@ from gradscape.landscapes.identity import StoreError
 from gradscape.landscapes.objective import Evaluation, Objective, Status
 from gradscape.landscapes.plane import Plane
 from gradscape.landscapes.sampling.fill import sample
-from gradscape.landscapes.space import ParameterSpace
 from gradscape.landscapes.storage.store import SliceStore
 from gradscape.landscapes.verification import POINTS
 
 from ...processes import Instant, alone
+from .waves import PLANE, SPACE, same, store_at
 
-SPACE = ParameterSpace.box(("x", "y", "z"), -2.0, 2.0, "m")
-PLANE = Plane.through(SPACE, SPACE.center, ["x", "z"], resolution=(18, 16))
 SAID = "RuntimeError: too much work"
 
 
@@ -49,10 +47,6 @@ class Wave(Objective):
         failed[raised := (x[:, 0] > 1) & (x[:, 2] < -1)] = Status.ERROR
         slope = (3 * (3 * x).cos()).masked_fill((x[:, [0, 2]].abs() < 0.5).all(dim=1, keepdim=True), torch.nan)
         return Evaluation.from_results(loss, slope if grad else None, failed, SAID if bool(raised.any()) else "")
-
-
-def store_at(path: Path, *, grad: bool = True) -> SliceStore:
-    return SliceStore.open_or_create(path, PLANE, SPACE, identity={"objective": "wave"}, grad=grad)
 
 
 def test_a_slice_holds_the_objective_at_its_own_points():
@@ -86,9 +80,7 @@ def test_interruptions_change_no_bit_and_cost_no_finished_tile(tmp_path_factory,
     asked += last.asked
     assert len(set(asked)) == 18 * 16
     assert len(asked) <= 18 * 16 + POINTS * len(stops)  # those that are verified where it goes on
-    whole = sample(Wave(), PLANE, batch=batch)
-    for name in ("loss", "grad", "status"):
-        assert resumed[name].values.tobytes() == whole[name].values.tobytes()
+    assert same(resumed, sample(Wave(), PLANE, batch=batch))
 
 
 def test_an_interruption_between_two_tiles_of_a_batch_keeps_the_first(tmp_path):
@@ -126,8 +118,7 @@ def test_sigkill_at_any_instant_changes_no_bit(tmp_path):
         verified = len(pending) < len(left.tiles())
         assert len(objective.batches) == verified + len(pending)
         xr.testing.assert_equal(resumed, whole)
-        for name in ("loss", "grad", "status"):
-            assert resumed[name].values.tobytes() == whole[name].values.tobytes()
+        assert same(resumed, whole)
         assert resumed.attrs["error"] == SliceStore.open(path).dataset().attrs["error"] == SAID
         for name, file in files.items():
             assert (path / name).read_bytes() == file.read_bytes()
