@@ -173,7 +173,7 @@ def _measure(one: Entrant, resolution: int, device: str) -> tuple[Environment, d
 
     job = CheckJob.open(one.spec(device), points=POINTS)
     report, env = job.run(Watch()).record(), job.env
-    plane = plane_through(env, one.dims, through="center", extent=None, resolution=resolution)
+    plane = plane_through(env, one.dims, through="center", window=None, resolution=resolution)
     about = {name: report[name] for name in ("checks", "fidelity", "device")}
     about |= {"labels": plane.labels, "loss_unit": env.loss_unit}
     if report["checks"][0]["outcome"] == FAIL:

@@ -38,7 +38,7 @@ class PlaneSpec:
     dims: Sequence[int | str] | None
     along: str | None
     through: str | Tensor
-    extent: float | tuple[float, float] | None
+    window: float | tuple[float, float] | None
     resolution: int | Sequence[int]
 
     def __post_init__(self) -> None:
@@ -56,15 +56,15 @@ class PlaneSpec:
 
         names = joined_points(self.along)
         point = self.through if isinstance(self.through, str) else self.through.tolist()
-        return {"along": self.along, "through": point, "extent": self.extent, **({JOINED: names} if names else {})}
+        return {"along": self.along, "through": point, "extent": self.window, **({JOINED: names} if names else {})}
 
     def make(self, objective: Objective, kept: Mapping[str, Any] | None = None) -> Plane:
         """Return the line or plane in an objective's space.
 
         `kept` says where a slice may have been begun, as for `kept_plane`: it continues along its own directions.
-        Raises ValueError for parameters, points and extents that the space does not have.
+        Raises ValueError for parameters, points and windows that the space does not have.
         """
-        through, extent = self.through, self.extent
+        through, window = self.through, self.window
         if not isinstance(through, str) and any(isinstance(one, str) for one in through):
             raise ValueError(
                 f"a slice goes through one point here; got {len(through)} names, so ask for each by itself"
@@ -75,7 +75,7 @@ class PlaneSpec:
         if bool(chosen) == (self.along is not None):
             raise ValueError(ONE_OF)
         if self.along is None:
-            return plane_through(objective, chosen, through=through, extent=extent, resolution=self.resolution)
+            return plane_through(objective, chosen, through=through, window=window, resolution=self.resolution)
         if not isinstance(self.resolution, int):
             raise ValueError(
                 f"a slice along {self.along} takes one resolution for its axes; got {list(self.resolution)}"
@@ -86,14 +86,14 @@ class PlaneSpec:
             rank = len(joined_points(self.along)) - 1 if joined_points(self.along) else 2
             if (found := kept_plane(objective, self.cut, (self.resolution,) * rank, **kept)) is not None:
                 return found
-        return _plane_along(objective, self.along, through, extent, self.resolution)
+        return _plane_along(objective, self.along, through, window, self.resolution)
 
 
 def _plane_along(
     objective: Objective,
     along: str,
     through: str | Tensor,
-    extent: float | tuple[float, float] | None,
+    window: float | tuple[float, float] | None,
     resolution: int,
 ) -> Plane:
     import torch
@@ -103,9 +103,9 @@ def _plane_along(
 
     names = joined_points(along)
     kind, value = ("", "") if names else _check_directions(along)
-    elsewhere = extent is not None or not isinstance(through, str) or through != "center"
+    elsewhere = window is not None or not isinstance(through, str) or through != "center"
     if (names or kind == "pca") and elsewhere:
-        raise ValueError(f"--along {along} says where it goes; leave out --through and --extent")
+        raise ValueError(f"--along {along} says where it goes; leave out --through and --window")
     if names:
         return joining(objective.space, [named_point(objective, name) for name in names], names, resolution)
     if kind == "pca":
@@ -120,8 +120,8 @@ def _plane_along(
     else:
         directions, labels = hessian_directions(objective, point)
     spans = torch.from_numpy(directions) * (objective.space.upper - objective.space.lower)
-    lower, upper = _reach(objective.space, point, spans) if extent is None else _ends(extent)
-    return Plane.span(point, spans, resolution=resolution, extent=(lower, upper), labels=labels)
+    lower, upper = _reach(objective.space, point, spans) if window is None else _ends(window)
+    return Plane.span(point, spans, resolution=resolution, window=(lower, upper), labels=labels)
 
 
 def _check_directions(along: str) -> tuple[str, str]:
@@ -150,8 +150,8 @@ def _reach(space: ParameterSpace, point: Tensor, spans: Tensor) -> tuple[list[fl
     return [low for low, _ in pairs], [high for _, high in pairs]
 
 
-def _ends(extent: float | tuple[float, float]) -> tuple[float, float]:
-    return extent if isinstance(extent, tuple) else (-extent / 2, extent / 2)
+def _ends(window: float | tuple[float, float]) -> tuple[float, float]:
+    return window if isinstance(window, tuple) else (-window / 2, window / 2)
 
 
 def split_points(through: str) -> list[str]:

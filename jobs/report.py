@@ -84,7 +84,7 @@ def sample_subject(env: Environment, points: int, command: str, watch: Watch) ->
 
     dims = list(range(min(2, env.space.dim)))
     refuse_too_many(points, len(dims), env.space.dim)
-    plane = plane_through(env, dims, through="center", extent=None, resolution=RESOLUTION)
+    plane = plane_through(env, dims, through="center", window=None, resolution=RESOLUTION)
     watch.plan([slice_work(env, plane.resolution, 1), report_work(env, plane.resolution, points)])
     job = SliceJob.of(env, plane, command=command)
     job.run(watch)

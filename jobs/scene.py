@@ -201,17 +201,17 @@ def plane_through(
     dims: Sequence[int | str],
     *,
     through: str | Tensor,
-    extent: float | tuple[float, float] | None,
+    window: float | tuple[float, float] | None,
     resolution: int | Sequence[int],
 ) -> Plane:
     """Return the line or plane along one or two parameters through a point, which an environment may name.
 
-    Raises ValueError for parameters, points and extents that the objective's space does not have.
+    Raises ValueError for parameters, points and windows that the objective's space does not have.
     """
     from ..landscapes.plane import Plane
 
     point = named_point(objective, through) if isinstance(through, str) else through
-    return Plane.through(objective.space, point, dims, resolution=resolution, extent=extent)
+    return Plane.through(objective.space, point, dims, resolution=resolution, window=window)
 
 
 def runs_in(objective: Objective, run: str) -> list[xr.Dataset]:

@@ -247,7 +247,7 @@ class SliceJob(SummaryJob[SliceSummary]):
             return
         kept = f", {total - cost.episodes} are there already" if cost.episodes < total else ""
         most, losses = "up to " if self.refinement else "", probes(total, grad=whole)
-        between = f"; then up to {losses} losses between them" if losses else ""
+        between = f"; plus at most {losses} between samples" if losses else ""
         watch.note(
             f"{most}{cost.episodes} {kind} to compute{kept}: about {duration(cost.seconds)}, "
             f"{size(cost.memory)} of memory{_gpu_memory(self.objective)}{between}"
@@ -269,7 +269,7 @@ class SliceJob(SummaryJob[SliceSummary]):
                     pause = pause_after(drawn - began)
 
             def conclude(dataset: xr.Dataset) -> dict[str, Any]:
-                advance(dataset["status"].size, "looking between them")
+                advance(dataset["status"].size, "checks between samples")
                 return look_between(evaluator(self.objective, self.executor, self.remake), dataset)
 
             how: dict[str, Any] = {"executor": self.executor, "made": self.remake}

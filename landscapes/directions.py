@@ -135,14 +135,14 @@ def joining(
     along = torch.stack([point - points[0] for point in points[1:]])
     labels = [f"from {names[0]} to {name}" for name in names[1:]]
     if len(along) == 2:
-        return Plane.span(points[0], along, resolution=resolution, extent=(-0.25, 1.25), labels=labels)
+        return Plane.span(points[0], along, resolution=resolution, window=(-0.25, 1.25), labels=labels)
     past = int(BEYOND * resolution)
     step = 1 / max(resolution - 1 - 2 * past, 1)
     ends = [(points[0] - past * step * along[0]), (points[1] + past * step * along[0])]
     before, after = (past if bool(((end >= space.lower) & (end <= space.upper)).all()) else 0 for end in ends)
     step = 1 / (resolution - 1 - before - after)
-    extent = (-before * step, 1 + after * step)
-    return Plane.span(points[0], along, resolution=resolution, extent=extent, labels=labels)
+    window = (-before * step, 1 + after * step)
+    return Plane.span(points[0], along, resolution=resolution, window=window, labels=labels)
 
 
 def barrier(u: Array, loss: Array) -> float:

@@ -75,16 +75,16 @@ class Plane:
         dims: Sequence[str | int],
         *,
         resolution: int | Sequence[int],
-        extent: float | tuple[Bound, Bound] | None = None,
+        window: float | tuple[Bound, Bound] | None = None,
     ) -> Plane:
         """Vary one or two parameters, named or numbered, and hold the others as they are at `origin`.
 
-        The plane coordinate is the parameter's own value, or its decimal logarithm as `space` has it. `extent` is None
+        The plane coordinate is the parameter's own value, or its decimal logarithm as `space` has it. `window` is None
         for the parameters' bounds, a fraction of them for a window of that size around `origin` (moved to stay inside
         the bounds if it fits), or a pair (lower, upper) of values in the parameters' units, each one number or one per
         axis.
 
-        Raises ValueError where parameters, point, resolution or extent are none of this space's.
+        Raises ValueError where parameters, point, resolution or window are none of this space's.
         """
         numbers = [space.index(dim) for dim in dims]
         if len(numbers) not in (1, 2) or len(set(numbers)) != len(numbers):
@@ -95,7 +95,7 @@ class Plane:
         if origin.shape != (space.dim,):
             raise ValueError(f"a slice goes through a point of shape ({space.dim},); got shape {tuple(origin.shape)}")
         scales = tuple(space.scales[number] for number in numbers)
-        lower, upper = _bounds(space.lower[numbers], space.upper[numbers], origin[numbers], extent, scales)
+        lower, upper = _bounds(space.lower[numbers], space.upper[numbers], origin[numbers], window, scales)
         start = origin.clone()
         start[numbers] = 0
         basis = torch.eye(space.dim, dtype=torch.float64)[numbers]
@@ -109,7 +109,7 @@ class Plane:
         directions: Float[Tensor, "rank dim"],
         *,
         resolution: int | Sequence[int],
-        extent: tuple[Bound, Bound] = (-1.0, 1.0),
+        window: tuple[Bound, Bound] = (-1.0, 1.0),
         labels: Sequence[str] | None = None,
     ) -> Plane:
         """Span a plane by any directions, kept as given: coordinate 1 is one whole `directions[i]` from `origin`.
@@ -118,7 +118,7 @@ class Plane:
         """
         origin, directions = (as_tensor(t, "a slice's point and directions") for t in (origin, directions))
         rank = len(directions)
-        lower, upper = _ends(extent, rank)
+        lower, upper = _ends(window, rank)
         named = labels or [f"along direction {axis + 1}" for axis in range(rank)]
         return cls(origin, directions, lower, upper, _per_axis(resolution, rank), tuple(named))
 
@@ -259,9 +259,9 @@ def _split_label(label: str) -> tuple[str, str]:
 
 
 def _as_bound(bound: Bound, rank: int) -> Float[Tensor, " rank"]:
-    values = as_tensor(bound, "extent")
+    values = as_tensor(bound, "window")
     if values.ndim > 1 or (values.ndim == 1 and len(values) != rank):
-        raise ValueError(f"extent needs one number per axis, {rank} in all; got {bound}")
+        raise ValueError(f"window needs one number per axis, {rank} in all; got {bound}")
     return values.expand(rank).clone()
 
 
@@ -269,16 +269,16 @@ def _is_sequence(values: object) -> TypeGuard[Sequence[Any]]:
     return isinstance(values, list | tuple) or getattr(values, "ndim", 0) > 0
 
 
-def _ends(extent: Sequence[Bound], rank: int) -> tuple[Float[Tensor, " rank"], Float[Tensor, " rank"]]:
-    if len(extent) != 2:
-        raise ValueError(f"extent takes a pair (lower, upper); got {len(extent)} values")
-    return _as_bound(extent[0], rank), _as_bound(extent[1], rank)
+def _ends(window: Sequence[Bound], rank: int) -> tuple[Float[Tensor, " rank"], Float[Tensor, " rank"]]:
+    if len(window) != 2:
+        raise ValueError(f"window takes a pair (lower, upper); got {len(window)} values")
+    return _as_bound(window[0], rank), _as_bound(window[1], rank)
 
 
 def _scaled(end: Float[Tensor, " rank"], scales: tuple[str, ...]) -> Float[Tensor, " rank"]:
     for scale, value in zip(scales, end.tolist(), strict=True):
         if scale == LOG10 and not value > 0:
-            raise ValueError(f"extent takes positive values along a logarithmic parameter; got {value:g}")
+            raise ValueError(f"window takes positive values along a logarithmic parameter; got {value:g}")
     return from_values(end, scales)
 
 
@@ -286,17 +286,17 @@ def _bounds(
     lower: Float[Tensor, " rank"],
     upper: Float[Tensor, " rank"],
     center: Float[Tensor, " rank"],
-    extent: float | tuple[Bound, Bound] | None,
+    window: float | tuple[Bound, Bound] | None,
     scales: tuple[str, ...],
 ) -> tuple[Float[Tensor, " rank"], Float[Tensor, " rank"]]:
-    if extent is None:
+    if window is None:
         return lower.clone(), upper.clone()
-    if _is_sequence(extent):
-        start, end = _ends(extent, len(lower))
+    if _is_sequence(window):
+        start, end = _ends(window, len(lower))
         return _scaled(start, scales), _scaled(end, scales)
-    fraction = float(as_tensor(extent, "extent"))
+    fraction = float(as_tensor(window, "window"))
     if not 0 < fraction < np.inf:
-        raise ValueError(f"extent as a fraction of the bounds must be positive and finite; got {fraction}")
+        raise ValueError(f"window as a fraction of the bounds must be positive and finite; got {fraction}")
     width = fraction * (upper - lower)
     start = (center - width / 2).clamp(torch.minimum(lower, upper - width), torch.maximum(lower, upper - width))
     return start, start + width

@@ -79,7 +79,7 @@ class PlaneSpec:
         width = space.upper - space.lower
         along = torch.tensor(self.directions, dtype=torch.float64) * width
         labels = [f"random direction {axis + 1}" for axis in range(len(along))]
-        return Plane.span(base, along, resolution=resolution, extent=(-0.5, 0.5), labels=labels)
+        return Plane.span(base, along, resolution=resolution, window=(-0.5, 0.5), labels=labels)
 
 
 @dataclass(frozen=True, eq=False)

@@ -172,12 +172,12 @@ def test_points_in_files_and_tables_are_values(here: Path) -> None:
 
 def test_an_extent_is_of_values_and_a_share_of_decades() -> None:
     center, how = Spring.space.center, {"resolution": 3}
-    plane = Plane.through(Spring.space, center, ("k", "c"), extent=([1e-1, 0.0], [1e3, 1.0]), **how)
+    plane = Plane.through(Spring.space, center, ("k", "c"), window=([1e-1, 0.0], [1e3, 1.0]), **how)
     assert torch.stack([plane.lower, plane.upper]).tolist() == [[-1, 0], [3, 1]]
     assert plane.to_values(plane.upper).tolist() == [1e3, 1]
-    assert Plane.through(Spring.space, center, ("k",), extent=0.5, **how).upper.tolist() == [4]
+    assert Plane.through(Spring.space, center, ("k",), window=0.5, **how).upper.tolist() == [4]
     with pytest.raises(ValueError, match="positive values along a logarithmic parameter; got -1"):
-        Plane.through(Spring.space, center, ("k",), extent=(-1, 1), **how)
+        Plane.through(Spring.space, center, ("k",), window=(-1, 1), **how)
 
 
 def test_a_sweep_over_a_logarithmic_parameter_moves_by_equal_ratios(here: Path) -> None:

@@ -54,7 +54,7 @@ def test_a_job_that_is_stopped_keeps_what_it_has_and_draws_it(tmp_path: Path) ->
     from gradscape.landscapes.sampling.refine import Refinement
 
     env = make("pinball-2", fidelity="draft", device="cpu")
-    plane = plane_through(env, (0, 1), through="center", extent=None, resolution=33)
+    plane = plane_through(env, (0, 1), through="center", window=None, resolution=33)
 
     def job(name: str) -> SliceJob:
         return SliceJob.of(env, plane, command="", out=tmp_path / name, refinement=Refinement(0.05))

@@ -114,14 +114,14 @@ REFUSED: dict[str, tuple[Callable[[], Any], str]] = {
         for n in (-5, 1, 2.5, NAN, None, "3", True, 10**30, [3, 0])
     },
     **{
-        f"extent {e}": (lambda e=e: Plane.through(SPACE, SPACE.center, [0, 1], resolution=3, extent=e), said)
-        for said, extents in {
+        f"window {e}": (lambda e=e: Plane.through(SPACE, SPACE.center, [0, 1], resolution=3, window=e), said)
+        for said, windows in {
             "positive and finite": (-1, 0, INF, NAN),
             "finite lower < upper": (1e-300, (0, INF), (-INF, INF), (0, NAN), (1, 0), (-1e308, 1e308)),
-            "extent takes numbers": ("1", True, 1j, ("0", "1")),
-            "extent takes a pair": ((0, 1, 2), [1], ()),
+            "window takes numbers": ("1", True, 1j, ("0", "1")),
+            "window takes a pair": ((0, 1, 2), [1], ()),
         }.items()
-        for e in extents
+        for e in windows
     },
     **{
         f"bounds {low} to {high}": (lambda low=low, high=high: ParameterSpace({"a": (low, high)}), said)
@@ -205,7 +205,7 @@ def test_arrays_of_every_kind_are_numbers(kind: str) -> None:
         PLANE.distance(as_kind),
         PLANE.slope(as_kind) - X,
         Plane.through(SPACE, as_kind[0], [0], resolution=3).origin[1:] - X[0, 1:],
-        Plane.through(SPACE, [0, 0], [0, 1], resolution=3, extent=(as_kind[0], [9, 9])).lower - X[0],
+        Plane.through(SPACE, [0, 0], [0, 1], resolution=3, window=(as_kind[0], [9, 9])).lower - X[0],
         Plane.span(as_kind[0], as_kind[:2], resolution=3).basis - X[:2],
         Plane.principal(as_kind, resolution=3).origin - X.mean(dim=0),
         Plane(as_kind[0], as_kind[:2], [0, 0], [1, 1], [3, 3], ["a", "b"]).basis - X[:2],

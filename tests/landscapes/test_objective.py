@@ -56,7 +56,7 @@ def test_points_beyond_have_left_the_domain_and_the_others_their_losses():
 
 
 def test_a_window_beyond_the_box_shows_what_lies_in_it():
-    cut = sample(Strict(), plane(extent=((-1.0, 0.1), (2.0, 1.3))))
+    cut = sample(Strict(), plane(window=((-1.0, 0.1), (2.0, 1.3))))
     assert (cut["status"].sel(v=slice(0.75, None)) == Status.ESCAPED).all()
     assert (cut["status"].sel(v=slice(None, 0.7)) == Status.OK).all()
 

@@ -72,7 +72,7 @@ def test_the_loss_beneath_is_that_of_the_cell_the_point_is_drawn_in():
 
 
 def test_points_beyond_the_window_are_marked_and_have_nothing_beneath():
-    small = Plane.through(SPACE, SPACE.center, ("speed", "force"), resolution=5, extent=0.5)
+    small = Plane.through(SPACE, SPACE.center, ("speed", "force"), resolution=5, window=0.5)
     (laid,) = overlay(sample(BOWL, small), [run([[0.55, 0, 0], [0.6, 0, 0], [0, -0.99, 0]], [0, 0, 0])])
     np.testing.assert_array_equal(laid["outside"], [False, False, True])  # a sample is 0.25 wide
     np.testing.assert_array_equal(np.isnan(laid["beneath"]), laid["outside"])
@@ -198,7 +198,7 @@ def test_failures_are_crosses_and_neither_points_nor_best():
 
 @pytest.mark.drawn
 def test_points_beyond_the_map_are_hollow_at_its_border_and_counted():
-    small = Plane.through(SPACE, SPACE.center, ("speed", "force"), resolution=5, extent=0.5)
+    small = Plane.through(SPACE, SPACE.center, ("speed", "force"), resolution=5, window=0.5)
     dataset = sample(BOWL, small)
     laid = overlay(dataset, [run([[0.0, 0, 0], [0.9, 0, 0], [0, -0.99, 0]], [0, 0, 0])])
     figure = overlay_figure(dataset, laid)

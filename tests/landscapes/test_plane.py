@@ -75,7 +75,7 @@ def test_axis_labels_come_apart_into_name_and_unit():
 
 
 @pytest.mark.parametrize(
-    ("extent", "lower", "upper"),
+    ("window", "lower", "upper"),
     [
         (None, [-1, 0], [1, 10]),
         (1.0, [-1, 0], [1, 10]),
@@ -85,9 +85,9 @@ def test_axis_labels_come_apart_into_name_and_unit():
         (([0, 1], 2), [0, 1], [2, 2]),
     ],
 )
-def test_extent_is_the_bounds_a_window_inside_them_or_a_range(extent, lower, upper):
+def test_extent_is_the_bounds_a_window_inside_them_or_a_range(window, lower, upper):
     origin = torch.tensor([1.0, 5.0, 2.0, 0.0]).double()
-    plane = Plane.through(SPACE, origin, ["x", "y"], resolution=3, extent=extent)
+    plane = Plane.through(SPACE, origin, ["x", "y"], resolution=3, window=window)
     torch.testing.assert_close(plane.lower, torch.tensor(lower).double())
     torch.testing.assert_close(plane.upper, torch.tensor(upper).double())
 
@@ -137,11 +137,11 @@ def test_a_record_rebuilds_the_plane_to_the_bit(seed):
         ([], {}, "got none"),
         (["q"], {}, "no parameter is called 'q'"),
         (["x"], {"resolution": 1}, "at least 2; got 1"),
-        (["x"], {"extent": 0.0}, "positive and finite; got 0.0"),
-        (["x"], {"extent": (2, 1)}, "lower < upper"),
-        (["x"], {"extent": (0, float("inf"))}, "finite"),
+        (["x"], {"window": 0.0}, "positive and finite; got 0.0"),
+        (["x"], {"window": (2, 1)}, "lower < upper"),
+        (["x"], {"window": (0, float("inf"))}, "finite"),
         (["x", "y"], {"resolution": (3,)}, "2 values of resolution; got 1"),
-        (["x", "y"], {"extent": ([0, 0, 0], 1)}, "one number per axis, 2 in all"),
+        (["x", "y"], {"window": ([0, 0, 0], 1)}, "one number per axis, 2 in all"),
     ],
 )
 def test_a_slice_that_makes_no_sense_is_refused(dims, options, said):

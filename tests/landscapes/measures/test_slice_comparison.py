@@ -22,9 +22,9 @@ SPACE = ParameterSpace(("x", "y"), torch.tensor([-1.0, -1.0]).double(), torch.te
 Function = Callable[[torch.Tensor], torch.Tensor]
 
 
-def cut(function: Function, *, dims=("x", "y"), resolution: int = 21, space=SPACE, extent=None, grad=True, at=None):
+def cut(function: Function, *, dims=("x", "y"), resolution: int = 21, space=SPACE, window=None, grad=True, at=None):
     point = SPACE.center if at is None else torch.tensor(at).double()
-    plane = Plane.through(space, point, dims, resolution=resolution, extent=extent)
+    plane = Plane.through(space, point, dims, resolution=resolution, window=window)
     return sample(from_torch(lambda x: function(x.T), space), plane, gradients=int(grad))
 
 
@@ -94,7 +94,7 @@ def test_two_valleys_disagree_between_their_bottoms() -> None:
 
 def test_sides_of_the_plane_count_as_one() -> None:
     wide = ParameterSpace(("x", "y"), SPACE.lower, torch.tensor([1.0, 199.0]).double(), ("m", "m"))
-    found = compare(lambda x: x[0] + x[1] / 100, lambda x: x[0] - x[1] / 100, space=wide, extent=None)
+    found = compare(lambda x: x[0] + x[1] / 100, lambda x: x[0] - x[1] / 100, space=wide, window=None)
     np.testing.assert_allclose(found.cosine, 0.0, atol=1e-12)
 
 
@@ -215,7 +215,7 @@ def test_a_table_has_a_row_for_each_number() -> None:
     ("how", "said"),
     [
         ({"resolution": 20}, "A has 21 x 21 and B 20 x 20"),
-        ({"extent": (-0.5, 1.0)}, "lower ends differ: number 0 is -1 in A and -0.5 in B"),
+        ({"window": (-0.5, 1.0)}, "lower ends differ: number 0 is -1 in A and -0.5 in B"),
         ({"dims": ("y", "x")}, "directions differ: A is along x, y and B is along y, x"),
         ({"dims": ("x",)}, "A has 21 x 21 and B 21"),
     ],
