@@ -324,23 +324,22 @@ def _run(words: list[str]) -> Any:
     if DIMS not in words:
         return app(words, **how)
     try:
-        return app(_dims_first(words, len(named.split()), 2), **how)
+        return app(_dims_last(words, 2), **how)
     except MissingArgumentError:
-        return app(_dims_first(words, len(named.split()), 1), **how)
+        return app(_dims_last(words, 1), **how)
 
 
-def _dims_first(words: Sequence[str], at: int, most: int) -> list[str]:
-    """Return a command's words with at most so many behind --dims; others that follow there are arguments."""
-    found, moved, left = list[str](), list[str](), list(words)
+def _dims_last(words: Sequence[str], most: int) -> list[str]:
+    """Return a command's words with at most so many behind --dims; others that follow there are arguments, before it."""
+    found, left = list[str](), list(words)
     while left:
         found.append(left.pop(0))
         if found[-1] == DIMS:
             values = list[str]()
             while left and not left[0].startswith("-"):
                 values.append(left.pop(0))
-            found += values[:most]
-            moved += values[most:]
-    return [*found[:at], *moved, *found[at:]]
+            found[-1:] = [*values[most:], DIMS, *values[:most]]
+    return found
 
 
 def _stop(stop: BaseException) -> int:
