@@ -299,23 +299,23 @@ def contact_kernel(name: str, stop: Any, Data: Any) -> Any:
     read by vertex. The adjoint sets those of poses, `x` and `pulled`, whatever they were, or leaves out what is None.
     """
     types = precision(name)
-    real, vec3 = types.real, types.vec3
+    real, vec3, Vectors = types.real, types.vec3, types.rows[1]
 
     # An element is read once, so that its adjoint can be set, where Warp would add to it atomically.
     @cpp.func_native(called="read_strided", adjoint="set_adj_read_strided")
-    def read(values: wp.array2d[vec3], row: int, i: int) -> vec3: ...
+    def read(values: Vectors, row: int, i: int) -> vec3: ...
 
     @wp.kernel(module=cpp.module(f"gradscape.contact.{stop.key}"), grid_stride=False)
     def touch(
         dt: real,
         data: Data,
         held: wp.array[bool],
-        pose: wp.array2d[vec3],
-        following: wp.array2d[vec3],
-        x: wp.array2d[vec3],
-        pulled: wp.array2d[vec3],
-        x_next: wp.array2d[vec3],
-        v_next: wp.array2d[vec3],
+        pose: Vectors,
+        following: Vectors,
+        x: Vectors,
+        pulled: Vectors,
+        x_next: Vectors,
+        v_next: Vectors,
     ):
         row, i = wp.tid()
         p = read(x, row, i)
@@ -336,11 +336,10 @@ def sum_kernels(name: str) -> tuple[Any, Any]:
     The first takes [row, part] to the sum of every vertex whose number is `part` by the count of parts, the second adds
     a row's parts to what is there. A row's sum does not depend on other rows.
     """
-    vec3 = precision(name).vec3
-    module = f"gradscape.contact.sums.{name}"
+    vec3, Vectors, module = precision(name).vec3, precision(name).rows[1], f"gradscape.contact.sums.{name}"
 
     @wp.kernel(module=module, enable_backward=False)
-    def gather(by_vertex: wp.array2d[vec3], by_part: wp.array2d[vec3]):
+    def gather(by_vertex: Vectors, by_part: Vectors):
         row, part = wp.tid()
         total = vec3()
         for i in range(part, by_vertex.shape[1], by_part.shape[1]):
@@ -348,7 +347,7 @@ def sum_kernels(name: str) -> tuple[Any, Any]:
         by_part[row, part] = total
 
     @wp.kernel(module=module, enable_backward=False)
-    def add(by_part: wp.array2d[vec3], by_row: wp.array[vec3]):
+    def add(by_part: Vectors, by_row: wp.array[vec3]):
         row, _ = wp.tid()
         total = vec3()
         for part in range(by_part.shape[1]):

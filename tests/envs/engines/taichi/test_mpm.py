@@ -209,7 +209,7 @@ def test_materials_and_their_adjoints_agree_with_warps(material):
         array.grad = torch.zeros_like(array)
     S_.grad[1, 0], A_.grad[0, 0] = adj_new, adj_A
     each = [torch.full((len(S),), value, dtype=torch.float64) for value in (MASS, VOLUME)]
-    inputs = (0, 1, 0, DT, SCALE, *material.constants(), *each, C_, S_, A_)
+    inputs = (0, 1, 0, DT, SCALE, *material.constants().values(), *each, C_, S_, A_)
     update(*inputs)
     adjoint(*inputs)
     bench = MaterialBench(material)
