@@ -5,7 +5,7 @@ import torch
 
 from gradscape.envs.engines.mpm.boundaries import Kind, LadleInTank, Open, Tool, ToolsInRoom
 
-from ..bench import BoundaryBench, vectors
+from ..bench import BoundaryBench, draw, vectors
 
 TANK = LadleInTank(half_width=0.2, lid=0.6, radius=0.07, half_thickness=0.01, height=0.25, band=0.02, friction=0.25)
 RIM = torch.tensor([0.0, 0.15, 0.0], dtype=torch.float64)
@@ -37,7 +37,7 @@ def room():
 
 
 def random(count, size, seed):
-    return size * (2 * torch.rand((count, 3), generator=torch.Generator().manual_seed(seed), dtype=torch.float64) - 1)
+    return 2 * size * draw(count, 3, seed=seed)
 
 
 def test_empty_space_changes_nothing():

@@ -9,6 +9,8 @@ import warp as wp
 from gradscape.envs.engines.mpm.boundaries import bowl, capsule, cylinder, rod, sphere, torus
 from gradscape.envs.engines.runtime import precision
 
+from ..bench import draw
+
 RADIUS, THICKNESS, HEIGHT = 0.07, 0.01, 0.25
 SPACING = 6e-4  # of sampled points [m]
 
@@ -46,8 +48,7 @@ def hits(function, sizes, points, name="float64"):
 
 @pytest.fixture(scope="module")
 def points():
-    unit = torch.rand((400, 3), generator=torch.Generator().manual_seed(0), dtype=torch.float64) - 0.5
-    return unit * torch.tensor([0.3, 0.5, 0.3], dtype=torch.float64) + torch.tensor([0.0, 0.05, 0.0])
+    return draw(400, 3, seed=0) * torch.tensor([0.3, 0.5, 0.3], dtype=torch.float64) + torch.tensor([0.0, 0.05, 0.0])
 
 
 @pytest.mark.parametrize("shape", SHAPES)
@@ -139,8 +140,7 @@ SURFACES = {
 
 @pytest.fixture(scope="module")
 def around_tools():
-    unit = torch.rand((400, 3), generator=torch.Generator().manual_seed(1), dtype=torch.float64) - 0.5
-    return 0.28 * unit
+    return 0.28 * draw(400, 3, seed=1)
 
 
 @pytest.mark.parametrize("tool", TOOLS)
