@@ -10,11 +10,12 @@ import warp as wp
 from scipy.spatial import cKDTree
 
 from gradscape.envs.engines.runtime import precision, to_torch
-from gradscape.envs.engines.sheets.contact import Floor, Pan, PanOverFloor
+from gradscape.envs.engines.sheets.contact import Floor, PanOverFloor
 from gradscape.envs.engines.sheets.springs import Sheet, Solver
 
+from .cloths import PAN
+
 DT = 1e-3
-PAN = Pan(flat=0.14, bend=0.07, sweep=math.asin(6 / 7), thickness=0.03)
 ARC = PAN.bend * PAN.sweep  # the length of the edge from bottom to rim [m]
 SPACING = 1e-3  # of sampled points [m]
 POSES = [(0.0, 0.0, 0.0), (0.04, -0.03, 0.5), (-0.07, 0.1, -0.6)]
