@@ -6,7 +6,7 @@ import pytest
 import torch
 import warp as wp
 
-from gradscape.envs.engines.mpm.boundaries import bowl, capsule, cylinder, rod, sphere, torus
+from gradscape.envs.engines.mpm.boundaries import shapes
 from gradscape.envs.engines.runtime import precision
 
 from ..bench import draw
@@ -29,7 +29,7 @@ def axis():
     return torch.stack([torch.zeros_like(y), y, torch.zeros_like(y)], dim=-1)
 
 
-SHAPES = {"bowl": (bowl, hemisphere, RADIUS, THICKNESS), "rod": (rod, axis, HEIGHT, THICKNESS)}
+SHAPES = {"bowl": ("bowl", hemisphere, RADIUS, THICKNESS), "rod": ("rod", axis, HEIGHT, THICKNESS)}
 
 
 def measured(shape, points, name="float64"):
@@ -42,7 +42,7 @@ def hits(function, sizes, points, name="float64"):
     types = precision(name)
     sizes = [types.vec3(*size) if isinstance(size, tuple) else types.real(size) for size in sizes]
     array = wp.array(points.to(types.torch).contiguous().numpy(), dtype=types.vec3)
-    result = torch.from_numpy(wp.map(function(name), array, *sizes).numpy()).double()
+    result = torch.from_numpy(wp.map(getattr(shapes(name), function), array, *sizes).numpy()).double()
     return result[:, :3], result[:, 3]
 
 
@@ -79,10 +79,10 @@ def test_single_precision_is_close(shape, points):
 AXIS = (0.48, 0.6, -0.64)  # a unit vector
 BALL, REACH, RING, TUBE, HALF = 0.07, 0.08, 0.09, 0.04, 0.06
 TOOLS = {
-    "sphere": (sphere, (BALL,)),
-    "capsule": (capsule, (AXIS, REACH, TUBE)),
-    "torus": (torus, (RING, TUBE)),
-    "cylinder": (cylinder, (BALL, HALF)),
+    "sphere": ("sphere", (BALL,)),
+    "capsule": ("capsule", (AXIS, REACH, TUBE)),
+    "torus": ("torus", (RING, TUBE)),
+    "cylinder": ("cylinder", (BALL, HALF)),
 }
 
 

@@ -14,10 +14,7 @@ from gradscape.envs.engines.mpm.boundaries import (
     Kind,
     Tool,
     ToolsInRoom,
-    capsule,
-    cylinder,
-    sphere,
-    torus,
+    shapes,
 )
 from gradscape.envs.engines.runtime import precision
 
@@ -54,11 +51,11 @@ def slots(kind, start, travel=(0.0, 0.0, 0.0), spin=0.0, turn=0.0):
 def surface(kind, p):
     """Return (normal, distance) of points from a tool at PLACE."""
     types, size = precision("float64"), SIZES[kind]
-    shapes = {Kind.SPHERE: sphere, Kind.TORUS: torus, Kind.CYLINDER: cylinder}
-    axis = [] if kind in shapes else [(0, 1, 0) if kind is Kind.CAPSULE else (math.sin(YAW), 0, math.cos(YAW))]
+    functions = {Kind.SPHERE: "sphere", Kind.TORUS: "torus", Kind.CYLINDER: "cylinder"}
+    axis = [] if kind in functions else [(0, 1, 0) if kind is Kind.CAPSULE else (math.sin(YAW), 0, math.cos(YAW))]
     local = wp.array((p - PLACE).numpy(), dtype=types.vec3)
     given = [types.vec3(*a) for a in axis] + [types.real(length) for length in size]
-    hits = torch.from_numpy(wp.map(shapes.get(kind, capsule)("float64"), local, *given).numpy())
+    hits = torch.from_numpy(wp.map(getattr(shapes("float64"), functions.get(kind, "capsule")), local, *given).numpy())
     return hits[:, :3], hits[:, 3:]
 
 
