@@ -55,7 +55,6 @@ def build(scene: Cube, asked: argparse.Namespace) -> Simulation:
 
     return Simulation(
         version=f"difftaichi {COMMIT[:8]}, Taichi {'.'.join(map(str, ti.__version__))}",
-        precision="float32",
         material="neo-Hookean",
         grid=f"{scene.nodes}^3",
         loss=loss,

@@ -56,7 +56,6 @@ def build(scene: Cube, asked: argparse.Namespace) -> Simulation:
 
     return Simulation(
         version=f"genesis-world {version('genesis-world')}, quadrants {version('quadrants')}",
-        precision="float32",
         material="neo-Hookean",
         grid=f"{forward[0].sim.mpm_solver.grid_res[0]}^3",
         loss=loss,

@@ -39,7 +39,6 @@ def build(scene: Chain, asked: argparse.Namespace) -> Simulation:
 
     return Simulation(
         version=f"mujoco-mjx {version('mujoco-mjx')}, JAX {jax.__version__}",
-        precision="float32",
         material="rods",
         grid="none",
         loss=lambda parameters: float(np.asarray(forward(torques(parameters)), dtype=np.float64).mean()),

@@ -45,7 +45,6 @@ def build(scene: Cube, asked: argparse.Namespace) -> Simulation:
 
     return Simulation(
         version=f"newton {newton.__version__}, Warp {wp.config.version}",
-        precision="float32",
         material="its elastic one",
         grid="sparse, 64 cells a metre",
         loss=loss,

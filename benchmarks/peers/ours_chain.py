@@ -39,7 +39,6 @@ def build(scene: Chain, asked: argparse.Namespace) -> Simulation:
 
     return Simulation(
         version=f"gradscape {gradscape.__version__}",
-        precision="float32",
         material="rods",
         grid="none",
         loss=lambda parameters: float(distance(swing(parameters).detach())),

@@ -42,7 +42,6 @@ def build(scene: Cube, asked: argparse.Namespace) -> Simulation:
 
     return Simulation(
         version=f"gradscape {gradscape.__version__}",
-        precision=model.precision,
         material="neo-Hookean",
         grid=f"{scene.nodes}^3",
         loss=loss,

@@ -32,13 +32,13 @@ class Simulation:
     """
 
     version: str
-    precision: str
     material: str
     grid: str
     loss: Callable[[Array], float]
     gradient: Callable[[Array], Array] | None
     differs: tuple[str, ...] = ()
     why: str | None = None
+    precision: str = "float32"
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,6 @@ def build(scene: Cube, asked: argparse.Namespace) -> Simulation:
     episode = Episode(mpm, wp, scene, asked.device)
     return Simulation(
         version=f"rewarped 1.3.3, Warp {wp.config.version}",
-        precision="float32",
         material="neo-Hookean",
         grid=f"{scene.nodes}^3",
         loss=episode.loss,

@@ -1,12 +1,15 @@
-"""Files that simulators are taken from: what is refused before one is run, and how one ends that does not end well."""
+"""What is imported for a scene: files that simulators are taken from, and the extras that engines are of."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from gradscape.envs.registry import import_named, make, refuse_unknown
+from gradscape.envs import registry
+from gradscape.envs.registry import entries, import_named, make, refuse_unknown
 
 SPELLED = {  # files that hold a Bowl, or may
     "assigned": "Bowl = 1\n",
@@ -60,3 +63,31 @@ def test_a_file_that_is_stopped_while_it_is_imported_stops_the_program(tmp_path:
     file.write_text("raise KeyboardInterrupt\n")
     with pytest.raises(KeyboardInterrupt):
         import_named(str(file))
+
+
+@pytest.mark.parametrize(
+    ("extra", "package", "module", "scene"),
+    [("mjx", "mujoco-mjx", "mujoco", "mjx-push"), ("newton", "newton", "newton", "newton-ball")],
+)
+def test_without_an_extra_its_scenes_are_listed_and_naming_one_says_what_installs_it(
+    run: Callable[..., Any],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    extra: str,
+    package: str,
+    module: str,
+    scene: str,
+) -> None:
+    monkeypatch.setattr(registry, "is_installed", lambda name: name != package)
+    said = run("envs", cwd=tmp_path).stdout
+    names = ", ".join(entry.name for entry in entries().values() if entry.extra == extra)
+    assert f"not installed: {names}; pip install 'gradscape[{extra}]'\n" in said
+
+    def missing(name: str, package: str) -> None:
+        raise ImportError(f"No module named '{module}'")
+
+    monkeypatch.setattr("gradscape.envs.base.import_module", missing)
+    done = run("slice", scene, "--dims", "0", "1", cwd=tmp_path)
+    assert done.returncode == 2
+    assert done.stderr.strip().endswith(f"No module named '{module}'; pip install 'gradscape[{extra}]'")
+    assert not list(tmp_path.iterdir())

@@ -210,24 +210,6 @@ def test_a_model_without_sense_is_told_what_is_wrong(changed, said):
         kind(fidelity=STEP)
 
 
-def test_without_the_extra_they_are_listed_and_naming_one_says_what_installs_it(run, tmp_path, monkeypatch):
-    from gradscape.envs import registry
-
-    monkeypatch.setattr(registry, "is_installed", lambda package: package != "mujoco-mjx")
-    said = run("envs", cwd=tmp_path).stdout
-    names = ", ".join(entry.name for entry in entries().values() if entry.extra == "mjx")
-    assert f"not installed: {names}; pip install 'gradscape[mjx]'\n" in said
-
-    def missing(module: str, package: str) -> None:
-        raise ImportError("No module named 'mujoco'")
-
-    monkeypatch.setattr("gradscape.envs.base.import_module", missing)
-    done = run("slice", "mjx-push", "--dims", "0", "1", cwd=tmp_path)
-    assert done.returncode == 2
-    assert done.stderr.strip().endswith("No module named 'mujoco'; pip install 'gradscape[mjx]'")
-    assert not list(tmp_path.iterdir())
-
-
 def test_a_box_is_pushed_by_what_touches_it():
     push = Push(fidelity=gs.Fidelity("quick", dt=0.005, precision="float64"))
     episode = push.episode(push.example("straight"))

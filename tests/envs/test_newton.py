@@ -9,7 +9,6 @@ import warp as wp
 
 import gradscape as gs
 from gradscape.envs.newton.scene import BUDGET
-from gradscape.envs.registry import entries
 from gradscape.landscapes.objective import Status
 
 pytestmark = pytest.mark.slow
@@ -182,24 +181,6 @@ def test_what_newton_does_not_have_is_refused_in_a_line():
         gs.make("newton-cloth", solver="featherstone")
     with pytest.raises(ValueError, match="newton-flight is simulated by Newton, which computes in float32 only; got"):
         gs.make("newton-flight", fidelity=gs.Fidelity("double", dt=0.01, precision="float64"))
-
-
-def test_without_the_extra_they_are_listed_and_naming_one_says_what_installs_it(run, tmp_path, monkeypatch):
-    from gradscape.envs import registry
-
-    monkeypatch.setattr(registry, "is_installed", lambda package: package != "newton")
-    said = run("envs", cwd=tmp_path).stdout
-    names = ", ".join(entry.name for entry in entries().values() if entry.extra == "newton")
-    assert f"not installed: {names}; pip install 'gradscape[newton]'\n" in said
-
-    def missing(module: str, package: str) -> None:
-        raise ImportError("No module named 'newton'")
-
-    monkeypatch.setattr("gradscape.envs.base.import_module", missing)
-    done = run("slice", "newton-ball", "--dims", "0", "1", cwd=tmp_path)
-    assert done.returncode == 2
-    assert done.stderr.strip().endswith("No module named 'newton'; pip install 'gradscape[newton]'")
-    assert not list(tmp_path.iterdir())
 
 
 def test_results_say_which_version_of_an_engine_they_are_of_and_others_do_not(tmp_path):

@@ -81,13 +81,20 @@ HIGHEST = 1 << 30  # beyond all planes of nodes
 
 @cache
 @no_type_check
-def place_taker():
-    """Return the function that takes the next `count` places of an environment, and `parts` of another kind."""
+def takers() -> SimpleNamespace:
+    """Return the functions `places` and `number`.
+
+    The first takes the next `count` places of an environment, and `parts` of another kind; the second counts one more
+    at a place, and returns how many there were.
+    """
 
     @cpp.func_native()
     def take_places(used: Ints, e: int, count: int, parts: int) -> wp.vec2i: ...
 
-    return take_places
+    @cpp.func_native()
+    def take_number(counts: Ints, e: int, cell: int) -> int: ...
+
+    return SimpleNamespace(places=take_places, number=take_number)
 
 
 @cache
@@ -97,7 +104,7 @@ def node_placer(name: str):
 
     A warp's lanes call it together, for neighbouring columns.
     """
-    Lattice, Listed, take_places = lattice(name), list_struct(), place_taker()
+    Lattice, Listed, take_places = lattice(name), list_struct(), takers().places
 
     @cpp.func_native(template=[HIGHEST])
     def find_touched(lattice: Lattice, spans: Ints, e: int, column: int) -> wp.vec2i: ...
@@ -212,21 +219,10 @@ def most_walks(box: Box, stretch: int) -> int:
 
 @cache
 @no_type_check
-def number_taker():
-    """Return the function that counts one more at a place, and returns how many there were."""
-
-    @cpp.func_native()
-    def take_number(counts: Ints, e: int, cell: int) -> int: ...
-
-    return take_number
-
-
-@cache
-@no_type_check
 def counter(name: str):
     """Return the function that tells a particle at x its cell, and its number there in the order of arrival."""
     vec3, Counting = precision(name).vec3, count_struct()
-    Lattice, base_node, take_number = lattice(name), stencil(name).base_node, number_taker()
+    Lattice, base_node, take_number = lattice(name), stencil(name).base_node, takers().number
 
     @wp.func(module=f"gradscape.cells.{name}")
     def count_in_cell(lattice: Lattice, x: vec3, e: int, p: int, found: Counting):
@@ -253,7 +249,7 @@ def cell_kernels(name: str) -> SimpleNamespace:
     """
     Vectors, Lattice, Counting, Listed = precision(name).rows[1], lattice(name), count_struct(), list_struct()
     count_in_cell, module = counter(name), cpp.module(f"gradscape.cells.{name}")
-    take_number, take_places, place_nodes = number_taker(), place_taker(), node_placer(name)
+    take_number, take_places, place_nodes = takers().number, takers().places, node_placer(name)
 
     Counts = wp.types.vector(SEGMENT, wp.int32)
 

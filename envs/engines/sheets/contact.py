@@ -15,6 +15,7 @@ import abc
 import math
 from dataclasses import dataclass
 from functools import cache, partial
+from types import SimpleNamespace
 from typing import Any, ClassVar, Literal, no_type_check
 
 import warp as wp
@@ -56,8 +57,8 @@ class Floor(Surface):
 
     def function(self, name: str) -> tuple[Any, Any]:
         """Return the surface's Warp function and its struct."""
-        distance, Data = _floor(name)
-        return distance, Data
+        found = distances(name)
+        return found.floor, found.Level
 
     def stop(self, name: str, rule: Rule) -> Any:
         """Return the Warp function that takes velocities into the floor."""
@@ -87,8 +88,8 @@ class Pan(Surface):
 
     def function(self, name: str) -> tuple[Any, Any]:
         """Return the surface's Warp function and its struct."""
-        distance, Data = _pan(name)
-        return distance, Data
+        found = distances(name)
+        return found.pan, found.Dish
 
     def stop(self, name: str, rule: Rule) -> Any:
         """Return the Warp function that takes velocities into the pan."""
@@ -105,8 +106,8 @@ class PanOverFloor(Surface):
 
     def function(self, name: str) -> tuple[Any, Any]:
         """Return the function of the nearer surface, and the struct of both."""
-        distance, Data = _nearer(name)
-        return distance, Data
+        found = distances(name)
+        return found.nearer, found.Both
 
     def data(self, name: str) -> Any:
         """Return the function's data."""
@@ -121,10 +122,10 @@ class PanOverFloor(Surface):
 
 @cache
 @no_type_check
-def _floor(name: str) -> tuple[Any, Any]:
-    types = precision(name)
+def distances(name: str) -> SimpleNamespace:
+    """Return the functions `floor, pan, nearer` of one precision, and the structs `Level, Dish, Both` of their data."""
+    types, module = precision(name), f"gradscape.contact.{name}"
     real, vec3, vec4 = types.real, types.vec3, types.vec4
-    module = f"gradscape.contact.{name}"
 
     @partial(wp.struct, module=module)
     class Level:
@@ -134,18 +135,8 @@ def _floor(name: str) -> tuple[Any, Any]:
         friction: real
 
     @wp.func(module=module, name=f"floor_{name}")
-    def distance(floor: Level, p: vec3, pose: vec3) -> vec4:
+    def in_floor(floor: Level, p: vec3, pose: vec3) -> vec4:
         return vec4(real(0.0), real(1.0), real(0.0), p[1] - floor.height)
-
-    return distance, Level
-
-
-@cache
-@no_type_check
-def _pan(name: str) -> tuple[Any, Any]:
-    types = precision(name)
-    real, vec3, vec4 = types.real, types.vec3, types.vec4
-    module = f"gradscape.contact.{name}"
 
     @partial(wp.struct, module=module)
     class Dish:
@@ -167,7 +158,7 @@ def _pan(name: str) -> tuple[Any, Any]:
         return vec3(-out / reach, up / reach, pan.bend - reach)
 
     @wp.func(module=module, name=f"pan_{name}")
-    def distance(pan: Dish, p: vec3, pose: vec3) -> vec4:
+    def in_pan(pan: Dish, p: vec3, pose: vec3) -> vec4:
         c, s = wp.cos(pose[2]), wp.sin(pose[2])
         dx, dy = p[0] - pose[0], p[1] - pose[1]
         x, y = c * dx + s * dy, c * dy - s * dx
@@ -183,17 +174,6 @@ def _pan(name: str) -> tuple[Any, Any]:
             d = pan.thickness
         return vec4(c * n[0] - s * n[1], s * n[0] + c * n[1], n[2], d)
 
-    return distance, Dish
-
-
-@cache
-@no_type_check
-def _nearer(name: str) -> tuple[Any, Any]:
-    types = precision(name)
-    vec3, vec4 = types.vec3, types.vec4
-    module = f"gradscape.contact.{name}"
-    (in_pan, Dish), (in_floor, Level) = _pan(name), _floor(name)
-
     @partial(wp.struct, module=module)
     class Both:
         """The fields of PanOverFloor."""
@@ -202,13 +182,13 @@ def _nearer(name: str) -> tuple[Any, Any]:
         floor: Level
 
     @wp.func(module=module, name=f"nearer_{name}")
-    def distance(both: Both, p: vec3, pose: vec3) -> vec4:
+    def in_nearer(both: Both, p: vec3, pose: vec3) -> vec4:
         above, below = in_pan(both.pan, p, pose), in_floor(both.floor, p, vec3())
         if below[3] < above[3]:
             return below
         return above
 
-    return distance, Both
+    return SimpleNamespace(floor=in_floor, Level=Level, pan=in_pan, Dish=Dish, nearer=in_nearer, Both=Both)
 
 
 @cache
@@ -265,8 +245,8 @@ def _stop(name: str, rule: Rule, distance: Any, Data: Any) -> Any:
 def _stop_still(name: str, rule: Rule) -> Any:
     types = precision(name)
     real, vec3 = types.real, types.vec3
-    distance, Level = _floor(name)
-    at_floor = _stop(name, rule, distance, Level)
+    found = distances(name)
+    Level, at_floor = found.Level, _stop(name, rule, found.floor, found.Level)
 
     @wp.func(module=f"gradscape.contact.{name}", name=f"stop_{rule}_still_{name}")
     def stop(floor: Level, p: vec3, v: vec3, pose: vec3, following: vec3, dt: real) -> vec3:
@@ -280,8 +260,8 @@ def _stop_still(name: str, rule: Rule) -> Any:
 def _stop_twice(name: str, rule: Rule) -> Any:
     types = precision(name)
     real, vec3 = types.real, types.vec3
-    at_pan, at_floor = _stop(name, rule, *_pan(name)), _stop_still(name, rule)
-    _, Both = _nearer(name)
+    found, at_floor = distances(name), _stop_still(name, rule)
+    at_pan, Both = _stop(name, rule, found.pan, found.Dish), found.Both
 
     @wp.func(module=f"gradscape.contact.{name}", name=f"stop_{rule}_both_{name}")
     def stop(both: Both, p: vec3, v: vec3, pose: vec3, following: vec3, dt: real) -> vec3:
@@ -299,23 +279,23 @@ def contact_kernel(name: str, stop: Any, Data: Any) -> Any:
     read by vertex. The adjoint sets those of poses, `x` and `pulled`, whatever they were, or leaves out what is None.
     """
     types = precision(name)
-    real, vec3 = types.real, types.vec3
+    real, vec3, Vectors = types.real, types.vec3, types.rows[1]
 
     # An element is read once, so that its adjoint can be set, where Warp would add to it atomically.
     @cpp.func_native(called="read_strided", adjoint="set_adj_read_strided")
-    def read(values: wp.array2d[vec3], row: int, i: int) -> vec3: ...
+    def read(values: Vectors, row: int, i: int) -> vec3: ...
 
     @wp.kernel(module=cpp.module(f"gradscape.contact.{stop.key}"), grid_stride=False)
     def touch(
         dt: real,
         data: Data,
         held: wp.array[bool],
-        pose: wp.array2d[vec3],
-        following: wp.array2d[vec3],
-        x: wp.array2d[vec3],
-        pulled: wp.array2d[vec3],
-        x_next: wp.array2d[vec3],
-        v_next: wp.array2d[vec3],
+        pose: Vectors,
+        following: Vectors,
+        x: Vectors,
+        pulled: Vectors,
+        x_next: Vectors,
+        v_next: Vectors,
     ):
         row, i = wp.tid()
         p = read(x, row, i)
@@ -336,11 +316,10 @@ def sum_kernels(name: str) -> tuple[Any, Any]:
     The first takes [row, part] to the sum of every vertex whose number is `part` by the count of parts, the second adds
     a row's parts to what is there. A row's sum does not depend on other rows.
     """
-    vec3 = precision(name).vec3
-    module = f"gradscape.contact.sums.{name}"
+    vec3, Vectors, module = precision(name).vec3, precision(name).rows[1], f"gradscape.contact.sums.{name}"
 
     @wp.kernel(module=module, enable_backward=False)
-    def gather(by_vertex: wp.array2d[vec3], by_part: wp.array2d[vec3]):
+    def gather(by_vertex: Vectors, by_part: Vectors):
         row, part = wp.tid()
         total = vec3()
         for i in range(part, by_vertex.shape[1], by_part.shape[1]):
@@ -348,7 +327,7 @@ def sum_kernels(name: str) -> tuple[Any, Any]:
         by_part[row, part] = total
 
     @wp.kernel(module=module, enable_backward=False)
-    def add(by_part: wp.array2d[vec3], by_row: wp.array[vec3]):
+    def add(by_part: Vectors, by_row: wp.array[vec3]):
         row, _ = wp.tid()
         total = vec3()
         for part in range(by_part.shape[1]):

@@ -242,7 +242,7 @@ def _network(sheet: Sheet, Network: Any, types: Any, device: str) -> Any:
 def spring_kernels(name: str) -> SimpleNamespace:
     """Return the kernel `pull` of forces on velocities, its `adjoint`, and the struct `Network` of one precision."""
     types = precision(name)
-    real, vec3 = types.real, types.vec3
+    real, vec3, (Reals, Vectors, _, _) = types.real, types.vec3, types.rows
     module = cpp.module(f"gradscape.springs.{name}")
 
     @partial(wp.struct, module=module)
@@ -274,20 +274,13 @@ def spring_kernels(name: str) -> SimpleNamespace:
     def number_at(values: wp.array[int], i: int) -> int: ...
 
     @cpp.func_native(called="read_flat")
-    def stiffness_at(values: wp.array2d[real], i: int) -> real: ...
+    def stiffness_at(values: Reals, i: int) -> real: ...
 
     @cpp.func_native(called="read_flat")
-    def vector_at(values: wp.array2d[vec3], i: int) -> vec3: ...
+    def vector_at(values: Vectors, i: int) -> vec3: ...
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
-    def pull(
-        network: Network,
-        dt: real,
-        stiffness: wp.array2d[real],
-        x: wp.array2d[vec3],
-        v: wp.array2d[vec3],
-        pulled: wp.array2d[vec3],
-    ):
+    def pull(network: Network, dt: real, stiffness: Reals, x: Vectors, v: Vectors, pulled: Vectors):
         row, i = wp.tid()
         first = row * x.shape[1]
         x_i, v_i = vector_at(x, first + i), vector_at(v, first + i)
@@ -312,14 +305,14 @@ def spring_kernels(name: str) -> SimpleNamespace:
     def adjoint(
         network: Network,
         dt: real,
-        stiffness: wp.array2d[real],
-        x: wp.array2d[vec3],
-        v: wp.array2d[vec3],
-        adj_here: wp.array2d[vec3],
-        adj_pulled: wp.array2d[vec3],
-        adj_x: wp.array2d[vec3],
-        adj_v: wp.array2d[vec3],
-        adj_stiffness: wp.array2d[real],
+        stiffness: Reals,
+        x: Vectors,
+        v: Vectors,
+        adj_here: Vectors,
+        adj_pulled: Vectors,
+        adj_x: Vectors,
+        adj_v: Vectors,
+        adj_stiffness: Reals,
     ):
         row, i = wp.tid()
         first = row * x.shape[1]

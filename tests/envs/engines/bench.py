@@ -107,6 +107,19 @@ def placed(name, origin, dx, nodes, first=(0, 0, 0)):
     return grid
 
 
+def slope_errors(run, at, adj_end, gradient, steps, *, seed):
+    """Return for each step how far differences along a random direction are from a gradient's slope, relative to it.
+
+    `run` takes what it is differentiated by, shape (batch, ...), to ends whose adjoint is `adj_end`.
+    """
+    direction = draw(*at.shape, seed=seed)
+    slope, errors = each_sum(gradient * direction), []
+    for step in steps:
+        ends = [each_sum(run(at + sign * step * direction) * adj_end) for sign in (1, -1)]
+        errors.append(float((((ends[0] - ends[1]) / (2 * step) - slope) / slope).abs().max()))
+    return errors
+
+
 def each_sum(values):
     return values.flatten(1).sum(dim=1) if values.ndim > 1 else values
 

@@ -11,6 +11,8 @@ from gradscape.envs.engines.mpm.model import Body, Model
 from gradscape.envs.engines.mpm.solver import Solver
 from gradscape.envs.engines.runtime import to_torch
 
+from ..bench import draw
+
 DENSITY, SPEED, GRAVITY = 1330.0, 6.0, 9.81  # [kg/m^3], of sound [m/s], [m/s^2]
 SYRUP = Fluid(DENSITY, DENSITY * SPEED**2, viscosity=4.0)
 SPONGE = Elastic.with_wave_speed(DENSITY, SPEED, poisson=0.3)
@@ -125,8 +127,7 @@ def kneading(**changes):
 
 
 def weights(model, batch, seed):
-    generator = torch.Generator().manual_seed(seed)
-    return torch.rand((batch, model.particles, 3), generator=generator, dtype=torch.float64) - 0.5
+    return draw(batch, model.particles, 3, seed=seed)
 
 
 def kneaded(model, paths, adj_x, *, columns=False, pieces=1):

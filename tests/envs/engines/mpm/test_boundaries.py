@@ -3,9 +3,9 @@
 import pytest
 import torch
 
-from gradscape.envs.engines.mpm.boundaries import LadleInTank, Open
+from gradscape.envs.engines.mpm.boundaries import Kind, LadleInTank, Open, Tool, ToolsInRoom
 
-from ..bench import BoundaryBench, vectors
+from ..bench import BoundaryBench, draw, vectors
 
 TANK = LadleInTank(half_width=0.2, lid=0.6, radius=0.07, half_thickness=0.01, height=0.25, band=0.02, friction=0.25)
 RIM = torch.tensor([0.0, 0.15, 0.0], dtype=torch.float64)
@@ -29,8 +29,15 @@ def tank():
     return built(TANK)
 
 
+@pytest.fixture(scope="module")
+def room():
+    """Return a room as wide and as high as the tank, with a ball that touches where the bowl's lowest point does."""
+    width, ball = TANK.half_width, Tool(Kind.SPHERE, (TANK.radius + TANK.half_thickness,), 0.0)
+    return built(ToolsInRoom((ball,), (-width, 0.0, -width), (width, TANK.lid, width), 0.0, 0.0, 300.0))
+
+
 def random(count, size, seed):
-    return size * (2 * torch.rand((count, 3), generator=torch.Generator().manual_seed(seed), dtype=torch.float64) - 1)
+    return 2 * size * draw(count, 3, seed=seed)
 
 
 def test_empty_space_changes_nothing():
@@ -49,10 +56,12 @@ def test_empty_space_changes_nothing():
         ((0.03, 0.61, 0.03), (0, -1, 0)),
     ],
 )
-def test_walls_let_go_and_let_slide_but_let_nothing_in(tank, place, inward):
+@pytest.mark.parametrize("kind", ["tank", "room"])
+def test_walls_let_go_and_let_slide_but_let_nothing_in(tank, room, kind, place, inward):
     v, inward = random(50, 3.0, seed=2), vectors(inward)
     through = (v * inward).sum(dim=1, keepdim=True).clamp_max(0)
-    torch.testing.assert_close(tank(vectors(place).expand(50, 3), v), v - through * inward)
+    met = {"tank": tank, "room": room}[kind](vectors(place).expand(50, 3), v)
+    torch.testing.assert_close(met, v - through * inward)
 
 
 def test_inside_the_tank_velocities_are_free(tank):
@@ -89,11 +98,13 @@ def test_the_ladles_grip_fades_over_the_band(tank):
     torch.testing.assert_close(rise, 1 - s * s * (3 - 2 * s), rtol=0, atol=1e-6)
 
 
-def test_a_tool_is_where_its_step_has_taken_it(tank):
+@pytest.mark.parametrize("kind", ["tank", "room"])
+def test_a_tool_is_where_its_step_has_taken_it(tank, room, kind):
+    bench = {"tank": tank, "room": room}[kind]
     start, end = RIM + vectors((0, 0.1, 0))[0], RIM - vectors((0, 0.1, 0))[0]
     p, into = BELOW - vectors((0, TANK.half_thickness, 0)), vectors((0, 1, 0))
-    met = {f: float(tank(p, into, start=start, end=end, fraction=f)[0, 1]) for f in (0.0, 0.5, 1.0)}
-    assert met[0.0] == 1.0  # the ladle is still above
+    met = {f: float(bench(p, into, start=start, end=end, fraction=f)[0, 1]) for f in (0.0, 0.5, 1.0)}
+    assert met[0.0] == 1.0  # it is still above
     assert met[0.5] == pytest.approx(RATE * -0.2)  # here, going down
     assert met[1.0] == 1.0
 

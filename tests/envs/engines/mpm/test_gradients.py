@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from ..bench import slope_errors
 from .bodies import kneaded, kneading, weights
 from .bodies import stirred as stirring
 
@@ -16,12 +17,8 @@ def test_the_gradient_by_tools_on_plasticine_is_the_slope():
     model, paths = kneading()
     adj_x = {model.steps: weights(model, 3, 1)}
     solver, _, gradient = kneaded(model, paths, adj_x)
-    direction = torch.rand(paths.shape, generator=torch.Generator().manual_seed(2), dtype=torch.float64) - 0.5
-    slope, errors = (gradient * direction).sum(dim=(1, 2, 3)), []
-    for step in (1e-4, 1e-5, 1e-6, 1e-7):
-        ends = [(solver.run(paths + s * step * direction) * adj_x[model.steps]).sum(dim=(1, 2)) for s in (1, -1)]
-        errors.append(float((((ends[0] - ends[1]) / (2 * step) - slope) / slope).abs().max()))
-    assert min(errors) < 1e-6
+    steps = (1e-4, 1e-5, 1e-6, 1e-7)
+    assert min(slope_errors(solver.run, paths, adj_x[model.steps], gradient, steps, seed=2)) < 1e-6
 
 
 def test_adjoints_at_several_control_steps_add_up():
@@ -36,15 +33,10 @@ def test_adjoints_at_several_control_steps_add_up():
 
 def test_the_gradient_by_the_tools_is_the_slope_on_a_ladder_of_steps(stirred):
     solver, path = stirred
-    generator = torch.Generator().manual_seed(1)
-    adj_x = torch.rand((2, solver.model.particles, 3), generator=generator, dtype=torch.float64) - 0.5
-    direction = torch.rand(path.shape, generator=generator, dtype=torch.float64) - 0.5
+    adj_x = weights(solver.model, 2, 1)
     solver.run(path)
-    slope = (solver.gradient({solver.model.steps: adj_x}) * direction).sum(dim=(1, 2, 3))
-    errors = []
-    for step in (1e-3, 1e-4, 1e-5, 1e-6, 1e-7):
-        ends = [(solver.run(path + sign * step * direction) * adj_x).sum(dim=(1, 2)) for sign in (1, -1)]
-        errors.append(float((((ends[0] - ends[1]) / (2 * step) - slope) / slope).abs().max()))
+    gradient = solver.gradient({solver.model.steps: adj_x})
+    errors = slope_errors(solver.run, path, adj_x, gradient, (1e-3, 1e-4, 1e-5, 1e-6, 1e-7), seed=2)
     assert min(errors) < 1e-7
     assert errors[0] > 100 * min(errors)  # the slope over a millimetre is another one
 

@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 import torch
 
-from gradscape.envs.engines.mpm.materials import Elastic, Fluid, fluid
+from gradscape.envs.engines.mpm.materials import Elastic, Fluid, Plasticine, fluid
 from gradscape.envs.engines.mpm.materials.fluid import TORN
 
 from ..bench import IDENTITY, MASS, NAMES, MaterialBench, assert_rows_have_the_same_bits, draw, rotations
 
 SYRUP = Fluid(density=1300.0, bulk=4e4, viscosity=4.0)
 RUBBER = Elastic.with_wave_speed(1400.0, 6.0, poisson=0.3)
+FIRM = Plasticine(1000.0, 5e3, 0.2, yield_stress=5e3)  # far from where it yields
 ROUND_OFF = {"float32": 2e-6, "float64": 1e-13}  # of the moduli
 
 
@@ -31,17 +32,18 @@ def test_elastic_stress_turns_with_the_solid():
     torch.testing.assert_close(tau, tau.mT)
 
 
-def test_small_strains_obey_hooke():
+@pytest.mark.parametrize("solid", [RUBBER, FIRM])
+def test_small_strains_obey_hooke(solid):
     strain = draw(20, 3, 3, seed=3)
     strain = strain + strain.mT
     trace = strain.diagonal(dim1=-2, dim2=-1).sum(-1)[:, None, None]
-    hooke = RUBBER.lam * trace * IDENTITY + 2 * RUBBER.mu * strain
+    hooke = solid.lam * trace * IDENTITY + 2 * solid.mu * strain
     errors = [
-        float((MaterialBench(RUBBER).tau(IDENTITY + size * strain) / size - hooke).abs().max())
+        float((MaterialBench(solid).tau(IDENTITY + size * strain) / size - hooke).abs().max())
         for size in (1e-3, 5e-4, 2.5e-4)
     ]
     np.testing.assert_allclose(np.array(errors[:-1]) / errors[1:], 2, atol=0.02)  # first order in the strain
-    assert errors[-1] < 1e-3 * RUBBER.young
+    assert errors[-1] < 1e-3 * solid.young
 
 
 def test_stretching_one_axis_meets_the_modulus_of_pressure_waves():

@@ -12,6 +12,7 @@ from gradscape.envs.engines.mpm.model import Body, Box, Model, place_grid
 from gradscape.envs.engines.mpm.solver import Solver
 from gradscape.envs.engines.runtime import to_torch
 
+from ..bench import draw
 from .bodies import CLAY, SPONGE, SYRUP, kneaded, kneading, lumps, stirred, weights
 from .listing import Listing
 
@@ -86,7 +87,7 @@ def test_particles_are_listed_by_cell_and_then_as_they_lie(first, stretch):
     """A walk has the particles that touch its planes, and the walks along a segment have its planes between them."""
     model, _ = kneading()
     box = Box((0, 0, first), (*model.nodes[:2], model.nodes[2] - first))
-    x = torch.rand((2, 500, 3), generator=torch.Generator().manual_seed(1), dtype=torch.float64) * 0.4 - 0.2
+    x = 0.4 * draw(2, 500, 3, seed=1)
     x[:, :, 1] += 0.4
     cell = ((x - torch.tensor(model.origin)) / model.dx - 0.5).floor().long()
     depth = segments(box) // (box.nodes[0] * box.nodes[1])
@@ -127,7 +128,7 @@ def test_particles_are_listed_by_cell_and_then_as_they_lie(first, stretch):
 def test_particles_that_are_nowhere_are_not_listed():
     model, _ = kneading()
     box = Box((0, 0, 0), model.nodes)
-    x = torch.rand((2, 500, 3), generator=torch.Generator().manual_seed(1), dtype=torch.float64) * 0.4 - 0.2
+    x = 0.4 * draw(2, 500, 3, seed=1)
     x[0, ::3, 1], x[0, 1, 2], x[1] = torch.nan, torch.inf, -torch.inf
     listing = Listing(wp.launch, "float64", place_grid(model, box), box, x)
     for _ in range(2):  # the second time it begins where the first has ended

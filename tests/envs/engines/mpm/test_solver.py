@@ -22,12 +22,12 @@ from .bodies import (
     solved,
     tank,
     to_torch,
+    weights,
 )
 
 
 def random_velocities(model, batch, size):
-    generator = torch.Generator().manual_seed(0)
-    return size * (torch.rand((batch, model.particles, 3), generator=generator, dtype=torch.float64) - 0.5)
+    return size * weights(model, batch, 0)
 
 
 def test_mass_and_momentum_are_conserved_away_from_walls():

@@ -9,16 +9,11 @@ import warp as wp
 from gradscape.envs.engines.mpm.transfers import transfers
 from gradscape.envs.engines.runtime import precision, to_torch
 
-from ..bench import placed
+from ..bench import NAMES, draw, placed
 
 ORIGIN, DX, NODES, DT = (-0.3, 0.2, 1.1), 0.05, (9, 8, 10), 2e-3
 BATCH, COUNT = 2, 43
-NAMES = ["float32", "float64"]
 ROUND_OFF = {"float32": 1e-5, "float64": 1e-13}
-
-
-def draw(*shape, seed):
-    return torch.rand(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) - 0.5
 
 
 X = torch.tensor(ORIGIN, dtype=torch.float64) + DX * (

@@ -10,11 +10,12 @@ import warp as wp
 from scipy.spatial import cKDTree
 
 from gradscape.envs.engines.runtime import precision, to_torch
-from gradscape.envs.engines.sheets.contact import Floor, Pan, PanOverFloor
+from gradscape.envs.engines.sheets.contact import Floor, PanOverFloor
 from gradscape.envs.engines.sheets.springs import Sheet, Solver
 
+from .cloths import PAN
+
 DT = 1e-3
-PAN = Pan(flat=0.14, bend=0.07, sweep=math.asin(6 / 7), thickness=0.03)
 ARC = PAN.bend * PAN.sweep  # the length of the edge from bottom to rim [m]
 SPACING = 1e-3  # of sampled points [m]
 POSES = [(0.0, 0.0, 0.0), (0.04, -0.03, 0.5), (-0.07, 0.1, -0.6)]
@@ -26,15 +27,19 @@ def uniform(low, high, *shape, seed=0):
     return low + (high - low) * torch.rand(shape, generator=rng, dtype=torch.float64)
 
 
-def touched(surface, x, velocity, poses=None, rule="start"):
-    """Return velocities after one step of vertices that no spring joins, and by how far they moved: (batch, vertex, 3).
-
-    All start at `velocity`, shape (batch, 3); `x` has shape (vertex, 3).
-    """
+def loose(surface, x, *, dt=DT, steps=1, rows=1, rule="end", gravity=9.81):
+    """Return a solver of vertices of 1 kg at x [m], shape (vertex, 3), that no spring joins."""
     none = np.zeros(0)
-    sheet = Sheet(x.numpy(), np.zeros((0, 2), dtype=int), none, none, mass=1.0, damping=0.0, gravity=0.0)
-    given = dict(dt=DT, steps=1, name="float64", capacity=len(velocity), device="cpu", rule=rule)
-    solver = Solver(sheet, surface, **given)
+    sheet = Sheet(np.asarray(x), np.zeros((0, 2), dtype=int), none, none, mass=1.0, damping=0.0, gravity=gravity)
+    return Solver(sheet, surface, dt=dt, steps=steps, name="float64", capacity=rows, device="cpu", rule=rule)
+
+
+def touched(surface, x, velocity, poses=None, rule="start"):
+    """Return velocities after one step of such vertices without weight, and how far they moved: (batch, vertex, 3).
+
+    All start at `velocity`, shape (batch, 3).
+    """
+    solver = loose(surface, x, rows=len(velocity), rule=rule, gravity=0.0)
     path = solver.run(velocity, torch.zeros(len(velocity), len(x)), poses)
     return to_torch(solver.v[1]).clone(), path[1] - path[0]
 
@@ -119,10 +124,7 @@ def test_what_would_be_in_the_floor_ends_on_it_and_what_is_in_it_goes_no_deeper(
 
 def fall(rule, height, dt):
     """Return the heights of a vertex that falls from a height [m] onto the floor, over 0.4 s."""
-    none = np.zeros(0)
-    sheet = Sheet(np.array([[0.0, height, 0.0]]), np.zeros((0, 2), dtype=int), none, none, mass=1.0, damping=0.0)
-    given = dict(dt=dt, steps=round(0.4 / dt), name="float64", capacity=1, device="cpu", rule=rule)
-    solver = Solver(sheet, Floor(), **given)
+    solver = loose(Floor(), [[0.0, height, 0.0]], dt=dt, steps=round(0.4 / dt), rule=rule)
     return solver.run(torch.zeros(1, 3, dtype=torch.float64), torch.zeros(1, 1))[:, 0, 0, 1]
 
 
@@ -136,13 +138,10 @@ def test_a_vertex_dropped_on_the_floor_stays_on_it_at_every_step():
 
 def test_friction_stops_what_slides_after_the_way_that_coulomb_says():
     """A vertex of 1.2 m/s slides v^2 / (2 mu g) far, and by half a step's way more or less."""
-    none, mu = np.zeros(0), 0.6
-    sheet = Sheet(np.zeros((1, 3)), np.zeros((0, 2), dtype=int), none, none, mass=1.0, damping=0.0)
-    given = dict(dt=DT, steps=400, name="float64", capacity=1, device="cpu")
-    solver = Solver(sheet, Floor(friction=mu), **given)
-    velocity = torch.tensor([[0.72, 0.0, 0.96]], dtype=torch.float64)
+    mu, velocity = 0.6, torch.tensor([[0.72, 0.0, 0.96]], dtype=torch.float64)
+    solver = loose(Floor(friction=mu), np.zeros((1, 3)), steps=400)
     path = solver.run(velocity, torch.zeros(1, 1))[:, 0, 0]
-    way = 1.2**2 / (2 * mu * sheet.gravity)
+    way = 1.2**2 / (2 * mu * solver.sheet.gravity)
     assert float(path[-1].norm()) == pytest.approx(way, abs=1.2 * DT)
     torch.testing.assert_close(path[-1] / path[-1].norm(), velocity[0] / 1.2, rtol=0, atol=1e-12)
     assert torch.equal(path[-1], path[-2])
@@ -150,14 +149,10 @@ def test_friction_stops_what_slides_after_the_way_that_coulomb_says():
 
 def test_what_misses_the_pan_lands_on_the_floor_beneath_and_a_floor_bears_the_pan_nothing():
     """Its first place decides: one vertex begins over the pan and one beside it; the pan moves, the floor does not."""
-    x = torch.tensor([[0.0, 0.01, 0.0], [0.3, 0.01, 0.0]], dtype=torch.float64)
-    none = np.zeros(0)
-    sheet = Sheet(x.numpy(), np.zeros((0, 2), dtype=int), none, none, mass=1.0, damping=0.0)
-    both = PanOverFloor(PAN, Floor(height=-0.1))
-    given = dict(dt=DT, steps=300, name="float64", capacity=1, device="cpu")
+    solver = loose(PanOverFloor(PAN, Floor(height=-0.1)), [[0.0, 0.01, 0.0], [0.3, 0.01, 0.0]], steps=300)
     poses = torch.zeros(1, 301, 3, dtype=torch.float64)
     poses[0, :, 1] = torch.linspace(0.0, 0.03, 301, dtype=torch.float64)
-    end = Solver(sheet, both, **given).run(torch.zeros(1, 3), torch.zeros(1, 2), poses)[-1, 0]
+    end = solver.run(torch.zeros(1, 3), torch.zeros(1, 2), poses)[-1, 0]
     torch.testing.assert_close(end[:, 1], torch.tensor([0.03, -0.1], dtype=torch.float64), rtol=0, atol=1e-12)
 
 

@@ -1,56 +1,38 @@
 """The Taichi sheets against Warp's, which share no more than the scene's data."""
 
 import gc
-import math
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 
 from gradscape.envs.engines.sheets import springs
-from gradscape.envs.engines.sheets.contact import Floor, Pan, PanOverFloor
-from gradscape.envs.engines.sheets.springs import Sheet
+from gradscape.envs.engines.sheets.contact import Floor, PanOverFloor
 from gradscape.envs.engines.taichi import springs as taichi_springs
 from gradscape.envs.engines.taichi.runtime import start
-from gradscape.envs.sheets import lattice
 from gradscape.envs.sheets.swing import SwingVelocity
+
+from ..sheets.cloths import DT, PAN, ROWS, crumpled, drive
 
 pytestmark = pytest.mark.slow
 
-PAN = Pan(flat=0.14, bend=0.07, sweep=math.asin(6 / 7), thickness=0.03)
-DT, STEPS, ROWS = 2e-3, 40, 3
+STEPS = 40
 
 
-def crumpled(surface):
+def across(surface):
     """Return a sheet of 4 x 4 cells, of which two corners are held, that crosses its surface.
 
     It lies on the floor, or across the whole pan: one vertex starts on the axis, corners are beyond the rim.
     """
-    points, pitch = lattice.square(4), 0.04 if isinstance(surface, Floor) else 0.08
-    pairs, rest, weight = lattice.springs(points, reach=2, bend=0.4)
-    x = np.stack([points[:, 0] - 2, np.zeros(len(points)), points[:, 1] - 2], axis=1) * pitch
-    x += 0.01 * np.random.default_rng(0).uniform(-1, 1, x.shape)
-    x[12] = 0.0, -0.002, 0.0
-    mass = 0.0025 * (1 + np.arange(len(x)) % 4)
-    return Sheet(x, pairs, pitch * rest, weight, mass=mass, damping=0.05, drag=0.5, held=(20, 24))
-
-
-def drive():
-    """Return random velocities, stiffness of every vertex and poses, and a random adjoint of the last positions."""
-    rng = torch.Generator().manual_seed(1)
-
-    def within(low, high, *shape):
-        return low + (high - low) * torch.rand(shape, generator=rng, dtype=torch.float64)
-
-    moved = within(-0.05, 0.05, ROWS, 1, 3) * torch.tensor([1.0, 1.0, 10.0])
-    poses = torch.linspace(0, 1, STEPS + 1, dtype=torch.float64)[:, None] * moved
-    return (within(-1.0, 0.0, ROWS, 3), within(5.0, 40.0, ROWS, 25), poses), within(-1.0, 1.0, ROWS, 25, 3)
+    pitch = 0.04 if isinstance(surface, Floor) else 0.08
+    sheet = crumpled(4, pitch, (-2 * pitch, 0.0, -2 * pitch), held=(20, 24))
+    sheet.x[12] = 0.0, -0.002, 0.0
+    return sheet
 
 
 def made(engine, surface, rule):
     given = dict(dt=DT, steps=STEPS, name="float64", capacity=ROWS + 1, device="cpu", rule=rule)
-    return engine.Solver(crumpled(surface), surface, **given)
+    return engine.Solver(across(surface), surface, **given)
 
 
 ROUGH = PanOverFloor(replace(PAN, friction=0.3), Floor(height=-0.02, friction=0.2))
@@ -69,7 +51,7 @@ def case(request):
 
 @pytest.fixture(scope="module")
 def driven():
-    return drive()
+    return drive(across(Floor()), STEPS, turn=10.0)
 
 
 @pytest.fixture(scope="module")
@@ -115,7 +97,7 @@ def one_step(engine, sheet):
 
 
 def test_ends_that_coincide_pull_in_no_direction(driven):
-    sheet = crumpled(Floor())
+    sheet = across(Floor())
     sheet.x[1] = sheet.x[0]
     (velocity, stiffness, _), adj_x = driven
     ends = []
@@ -157,7 +139,7 @@ def test_fields_go_with_their_solver():
     trees = start("cpu").lang.impl.get_runtime().prog.get_snode_tree_size
     counts = []
     for _ in range(2):
-        one_step(taichi_springs, crumpled(Floor()))
+        one_step(taichi_springs, across(Floor()))
         gc.collect()
         counts.append(trees())
     assert counts[0] == counts[1]
