@@ -26,7 +26,7 @@ from . import contour, page
 Runs = Sequence[xr.Dataset]
 PITCH = 5.4  # room of a panel on a screen [inch]
 HEADING = "Marker size: distance from the plane; colour: the loss the point truly had"
-FEW = 24  # most improvements that are numbered, over all runs
+MAX_NUMBERED = 24  # most improvements that are numbered, over all runs
 CROWD = 4  # runs from which on the lines that join them are thinner
 
 
@@ -149,7 +149,8 @@ def _number_improvements(ax: Axes, runs: Runs, plane: Plane) -> None:
     places = [_places(run, plane) for run in runs]
     rows = [improvements(run)[::-1] for run in runs]
     turns = range(max(map(len, rows), default=0))
-    picked = [(number, own[turn]) for turn in turns for number, own in enumerate(rows) if turn < len(own)][:FEW]
+    every = [(number, own[turn]) for turn in turns for number, own in enumerate(rows) if turn < len(own)]
+    picked = every[:MAX_NUMBERED]
     names = [page.Label(str(_episode(runs[number], row)), tuple(places[number][row])) for number, row in picked]
     clear = np.concatenate([place[own] for place, own in zip(places, rows, strict=True)])
     size = page.sheet_of(ax).small

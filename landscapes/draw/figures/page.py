@@ -228,7 +228,7 @@ def save_prints(draw: Callable[[float], Figure], path: Path, widths: Sequence[fl
 
 
 NARROW = 1.8  # room of a panel that has fewer ticks [inch]
-FEW = 1.0, 1.5  # decades of a logarithmic axis that has more ticks than one in each, in a narrow panel and in another
+FINE_DECADES = 1.0, 1.5  # decades of a logarithmic axis with several ticks in each, in a narrow panel and in another
 DECADES = 3, 6  # of one that has a tick in each
 
 
@@ -276,7 +276,7 @@ def log_axis(axis: Axis) -> None:
     style.log_axis(axis)
     low, high = sorted(axis.get_view_interval())
     decades, wide = math.log10(high / low), sheet_of(axis.axes).pitch > NARROW
-    if decades > FEW[wide]:
+    if decades > FINE_DECADES[wide]:
         every = math.ceil(decades / DECADES[wide])
         powers = range(math.ceil(math.log10(low)), math.floor(math.log10(high)) + 1)
         axis.set_major_locator(FixedLocator([10.0**power for power in powers if power % every == 0]))

@@ -22,7 +22,7 @@ from ...measures.ruggedness import box_slopes
 from .. import style
 from . import contour, page
 
-PITCH, LEAST = 4.4, 40.0  # room of a panel: on a screen [inch], and at least in print [mm]
+PITCH, MIN_PANEL = 4.4, 40.0  # room of a panel: on a screen [inch], and at least in print [mm]
 BELOW = 2.0  # room of a panel that has its colour bar under it [inch]
 FLAT = 0.3  # height of the line's panel, against its width
 LINE, SCALES, ORDERS = "line", "scales", ("narrow", "wide")
@@ -37,7 +37,7 @@ def quality_figure(dataset: xr.Dataset, quality: GradientQuality, *, width: floa
     Raises ValueError where the page is too narrow or too wide.
     """
     plane, samples = plane_of(dataset), quality.samples
-    sheet = style.Sheet.of(width, pitch=PITCH, columns=3, least=LEAST)
+    sheet = style.Sheet.of(width, pitch=PITCH, columns=3, least=MIN_PANEL)
     maps = [str(number) for number in range(samples.sizes["scale"])] if plane.rank == 2 else []
     rows = _rows([*maps, SCALES, *ORDERS], sheet.columns)
     if plane.rank == 1:
