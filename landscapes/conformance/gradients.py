@@ -249,7 +249,7 @@ def check_special_places(subject: Subject) -> Finding:
 
 
 def _name_missing(where: Iterable[str], found: Evaluation) -> list[str]:
-    """Say at which places the gradient is NaN beside a finite loss."""
+    """Say at which places the gradient is NaN though the loss is finite."""
     missing = found.status == Status.NO_GRADIENT
     rows = zip(where, found.loss.tolist(), missing.tolist(), strict=True)
     return [f"the gradient is NaN at {place}, where the loss is {loss:.4g}" for place, loss, none in rows if none]

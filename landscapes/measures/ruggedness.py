@@ -134,7 +134,7 @@ def holder_exponent(loss: Values, axis: int, floor: float) -> float:
 
     The slope of the logarithm of the root mean square of differences over 1, 2, 4, ... steps, up to a quarter of the
     side, against that of the distance: Wang et al. 2023, *Fractal landscapes in policy optimization* (NeurIPS), section
-    5, with differences of samples in the place of a Gaussian's. Differences no larger than `floor` are left out; NaN
+    5, with differences of samples instead of a Gaussian's. Differences no larger than `floor` are left out; NaN
     where fewer than three distances are left.
     """
     lines, known = _lines(loss, axis), list[tuple[float, float]]()

@@ -1,4 +1,4 @@
-"""Which stored points are evaluated anew, and what of them is another number."""
+"""Which stored points are evaluated again, and what of them is another number."""
 
 from pathlib import Path
 from typing import Any

@@ -36,7 +36,7 @@ def overlay_figure(dataset: xr.Dataset, runs: Runs, *, width: float | None = Non
     The colour of a marker is the loss that the point truly had, on the map's own scale: where it differs from the
     colour around it, the plane does not show the point. Markers get smaller, and descents fainter, with the distance
     from the plane. A white line joins the improvements of a run, up to the star at its best point; numbers say in which
-    episodes they came, as far as there is room. Points beyond the map are hollow and at its border; failed episodes are
+    episodes they came, where there is room. Points beyond the map are hollow and at its border; failed episodes are
     crosses. The panel on the right, or below on a narrow page, compares each point with the sample beneath it: points
     on the diagonal have the loss that the map shows.
 
@@ -145,7 +145,7 @@ def _join_improvements(ax: Axes, run: xr.Dataset, plane: Plane, runs: int) -> No
 
 
 def _number_improvements(ax: Axes, runs: Runs, plane: Plane) -> None:
-    """Write the episodes of improvements beside them, the last of each run first, as far as there is room."""
+    """Write the episodes of improvements next to them, the last of each run first, while there is room."""
     places = [_places(run, plane) for run in runs]
     rows = [improvements(run)[::-1] for run in runs]
     turns = range(max(map(len, rows), default=0))

@@ -100,7 +100,7 @@ class Cells:
 
 
 def cells(relief: Relief, dataset: xr.Dataset) -> Cells:
-    """Return a flat top for every sample, over its cell of the map, and upright walls down to what is beside it.
+    """Return a flat top for every sample, over its cell of the map, and upright walls down to what is next to it.
 
     Nothing is drawn between samples that was not sampled: a wall has the colour of the sample it belongs to, the higher
     one. A sample that failed has no top, and like the border of the slice is walled down to the ground.
@@ -144,7 +144,7 @@ class Stand:
         return float(np.sign(x)), float(np.sign(y))
 
     def beside(self, axis: int, share: float, away: float) -> tuple[float, float, float]:
-        """Return a place beside an axis: u and v along the edges in front, the loss up the edge at the right."""
+        """Return a place next to an axis: u and v along the edges in front, the loss up the edge at the right."""
         (right, back), half, along = self.front, SIDE / 2, SIDE * (share - 0.5)
         if axis == 0:
             return (along, back * (half + away), 0.0)

@@ -187,7 +187,7 @@ def _crop(ax: Axes, shown: Shown) -> None:
 
 
 def _label(ax: Axes, dataset: xr.Dataset, shown: Shown) -> None:
-    """Write ticks and names beside the frame's two lower edges in front and the one at the right."""
+    """Write ticks and names next to the frame's two lower edges in front and the one at the right."""
     sheet, body = page.sheet_of(ax), shown.relief
     room = sheet.type / sheet.zoom  # that type takes up of the scene
     for axis, name in enumerate((*body.plane.labels, page.loss_name(dataset))):
