@@ -121,8 +121,8 @@ class Slice:
     def report(self, points: int = 6, seed: int = 0) -> Profile:
         """Measure what the landscape is like here: ruggedness, noise, jumps, gradients at several scales, in words.
 
-        `points` x `points` places of the slice are evaluated again, with points near them. Raises ValueError for a slice
-        without gradients, for one that is not finished, and for one whose objective cannot be made again,
+        `points` x `points` places of the slice are evaluated again, with points near them. Raises ValueError for a
+        slice without gradients, for one that is not finished, and for one whose objective cannot be made again,
         StoreMismatchError where the objective gives other numbers now than the slice holds.
         """
         from .lattice import sampled_lattice

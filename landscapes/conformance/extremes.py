@@ -105,7 +105,7 @@ def describe_counts(counts: Mapping[str, float | None]) -> str:
 
 
 def describe_missing(space: ParameterSpace, x: Float[Tensor, "batch dim"], found: Evaluation, place: str = "") -> str:
-    """Say where the gradient is NaN though the loss is finite, or nothing where that is nowhere; `place` names one point."""
+    """Say where the gradient is NaN though the loss is finite, nothing where it is nowhere; `place` names one point."""
     rows = (found.status == Status.NO_GRADIENT).nonzero().flatten()
     if not len(rows):
         return ""
