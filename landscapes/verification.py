@@ -112,7 +112,7 @@ class _Probe:
 
     @property
     def then(self) -> Evaluation:
-        return self.stored.found.rows(slice(self.row, self.row + 1))
+        return _row(self.stored.found, self.row)
 
 
 def verify(objective: Objective, results: Sequence[StoredPoints], *, points: int = POINTS, todo: str = TODO) -> None:
@@ -184,14 +184,9 @@ def _row(found: Evaluation, number: int) -> Evaluation:
 
 def _same(then: Evaluation, now: Evaluation) -> bool:
     """Whether two evaluations of a point are the same: status, loss, and gradient where both are finite."""
-    if int(then.status) != int(now.status):
-        return False
-    return not any(bool((_apart(one, other) > 0).any()) for one, other in _numbers(then, now))
-
-
-def _numbers(one: Evaluation, other: Evaluation) -> list[tuple[Tensor, Tensor]]:
-    pairs = [(one.loss, other.loss)]
-    return pairs if one.grad is None or other.grad is None else [*pairs, (one.grad, other.grad)]
+    pairs = ((then.loss, now.loss), (then.grad, now.grad))
+    known = [(one, other) for one, other in pairs if one is not None and other is not None]
+    return int(then.status) == int(now.status) and not any(bool((_apart(*pair) > 0).any()) for pair in known)
 
 
 def _apart(one: Tensor, other: Tensor) -> Tensor:
