@@ -129,8 +129,8 @@ def joining(
 ) -> Plane:
     """Return the line from one point to another, or the plane through three: the first at 0, the others at 1.
 
-    A line's ends are samples, and it goes on a little beyond them where the box does. Raises ValueError where points
-    are the same or lie on a line.
+    A line's ends are samples, and it continues a little beyond them where the box does. Raises ValueError where
+    points are the same or lie on a line.
     """
     along = torch.stack([point - points[0] for point in points[1:]])
     labels = [f"from {names[0]} to {name}" for name in names[1:]]

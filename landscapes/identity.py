@@ -21,7 +21,7 @@ ERROR = "error"  # the attribute of a slice or a run with what the first point t
 UNNAMED = "default"  # the fidelity of a simulator that names none
 BOUNDS = "bounds"  # of the parameters, lower and upper, by their own values: of a slice's provenance
 SCALES = "scales"  # of the parameters in an identity; not there where all are linear
-ABSENT = "none"  # in the place of a setting's value
+ABSENT = "none"  # instead of a setting's value
 LISTED_SETTINGS = 6  # settings that differ, in the refusal of a store
 MODEL_VERSION: Final = "model_version"  # in an identity; and so is
 METHOD_VERSION: Final = "method_version"
@@ -85,7 +85,7 @@ def current_identity(stored: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def current_provenance(stored: Mapping[str, Any], identity: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a stored provenance with the package's version, which the identity stored beside it held before."""
+    """Return a stored provenance with the package's version, which the identity stored with it held before."""
     return with_package(stored, str(identity[PACKAGE])) if PACKAGE in identity else dict(stored)
 
 

@@ -218,7 +218,7 @@ class Objective(abc.ABC):
 
     @property
     def packages(self) -> tuple[str, ...]:
-        """Packages that losses depend on, beside those that all depend on."""
+        """Packages that losses depend on, in addition to those that all depend on."""
         return ()
 
     def identity(self) -> dict[str, Any]:
@@ -226,7 +226,7 @@ class Objective(abc.ABC):
         return {"objective": self.name}
 
     def prepare(self) -> None:  # noqa: B027 -- most have nothing to prepare
-        """Do what the first evaluation would do beside evaluating."""
+        """Do what the first evaluation would do besides evaluating."""
 
     def shrink(self, rows: int) -> None:  # noqa: B027 -- most hold no memory between evaluations
         """Take at most `rows` points at once from now on."""

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 class HasData(Protocol):
-    """A run, as far as a slice knows it: its table of evaluations."""
+    """What a slice needs of a run: its table of evaluations."""
 
     @property
     def data(self) -> xr.Dataset:
@@ -39,7 +39,7 @@ class Slice:
     `data` is an xarray dataset of loss(v, u), grad(v, u, dim) unless sampled without, and status(v, u); a line has no
     v. Along a logarithmic parameter a coordinate is the decimal logarithm of the value, and has the attribute `scale`,
     "log10"; gradients are by it. `folder` is where its files are, None for one in memory. `remake` makes the objective
-    again that it was sampled from, for what has to be evaluated anew.
+    again that it was sampled from, for what has to be evaluated again.
     """
 
     data: xr.Dataset
@@ -121,8 +121,8 @@ class Slice:
     def report(self, points: int = 6, seed: int = 0) -> Profile:
         """Measure what the landscape is like here: ruggedness, noise, jumps, gradients at several scales, in words.
 
-        `points` x `points` places of the slice are evaluated anew, with points near them. Raises ValueError for a slice
-        without gradients, for one that is not finished, and for one whose objective cannot be made again,
+        `points` x `points` places of the slice are evaluated again, with points near them. Raises ValueError for a
+        slice without gradients, for one that is not finished, and for one whose objective cannot be made again,
         StoreMismatchError where the objective gives other numbers now than the slice holds.
         """
         from .lattice import sampled_lattice

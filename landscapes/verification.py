@@ -1,4 +1,4 @@
-"""Verification: a few points of a stored result are evaluated anew before it is continued.
+"""Verification: a few points of a stored result are evaluated again before it is continued.
 
 Where their bits are the stored ones, nothing else is asked. Where they are not, it is measured how far losses and
 gradients move when nothing changes: evaluated once more, in other batches, and at points moved within rounding. What
@@ -26,7 +26,7 @@ from .objective import NOT_EVALUATED, BoxedObjective, Evaluation, Objective, Sta
 if TYPE_CHECKING:
     from .storage.store import SliceStore
 
-POINTS = 3  # of a result that are evaluated anew
+POINTS = 3  # of a result that are evaluated again
 ROUNDING = {"float32": 1e-4, "float64": 1e-10}  # what rounding changes: a share of the losses' spread, of a gradient
 LAST_PLACE = {"float32": 2.0**-23, "float64": 2.0**-52}
 PLACES = 64  # units in the last place of a loss that rounding changes
@@ -34,7 +34,7 @@ MOVES, REACH = 8, 8  # evaluations at points that are moved, and how far these a
 MARGIN = 10.0  # times what changes by noise
 SHOWN = 6  # parameters of a point that a refusal shows
 TODO = "write elsewhere with --out, or replace it with --force"
-RESAMPLE = "sample it anew with --force, or take the simulator that it was sampled from"  # where it is only read
+RESAMPLE = "sample it again with --force, or take the simulator that it was sampled from"  # where it is only read
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +65,7 @@ class StoredPoints:
         return cls(path, "slice", x, _evaluation(arrays, plane.dim), "grad" in dataset)
 
     def choose(self, objective: Objective, count: int) -> list[int]:
-        """Return the rows to evaluate anew: the middle one by its loss, the least and the largest.
+        """Return the rows to evaluate again: the middle one by its loss, the least and the largest.
 
         Those that have a gradient come first, then those that have a loss. Points that the objective is not asked at
         are none of them.
@@ -93,7 +93,7 @@ class StoredPoints:
 
 @dataclass(frozen=True, eq=False)
 class _Probe:
-    """One stored point that is evaluated anew, and the sizes that rounding is told in.
+    """One stored point that is evaluated again, and the sizes that rounding is told in.
 
     `spread` is that of all losses that are stored with it, `slope` the middle length of their gradients in widths of
     the box, `widths`. `grad` says whether it was evaluated with its gradient.
@@ -112,11 +112,11 @@ class _Probe:
 
     @property
     def then(self) -> Evaluation:
-        return self.stored.found.rows(slice(self.row, self.row + 1))
+        return _row(self.stored.found, self.row)
 
 
 def verify(objective: Objective, results: Sequence[StoredPoints], *, points: int = POINTS, todo: str = TODO) -> None:
-    """Evaluate so many points of each stored result anew, all in one batch, and refuse other numbers.
+    """Evaluate so many points of each stored result again, all in one batch, and refuse other numbers.
 
     Losses, gradients where they are stored, and how points ended are compared.
 
@@ -183,15 +183,10 @@ def _row(found: Evaluation, number: int) -> Evaluation:
 
 
 def _same(then: Evaluation, now: Evaluation) -> bool:
-    """Whether two evaluations of a point are the same: status, loss, and gradient as far as both are finite."""
-    if int(then.status) != int(now.status):
-        return False
-    return not any(bool((_apart(one, other) > 0).any()) for one, other in _numbers(then, now))
-
-
-def _numbers(one: Evaluation, other: Evaluation) -> list[tuple[Tensor, Tensor]]:
-    pairs = [(one.loss, other.loss)]
-    return pairs if one.grad is None or other.grad is None else [*pairs, (one.grad, other.grad)]
+    """Whether two evaluations of a point are the same: status, loss, and gradient where both are finite."""
+    pairs = ((then.loss, now.loss), (then.grad, now.grad))
+    known = [(one, other) for one, other in pairs if one is not None and other is not None]
+    return int(then.status) == int(now.status) and not any(bool((_apart(*pair) > 0).any()) for pair in known)
 
 
 def _apart(one: Tensor, other: Tensor) -> Tensor:
@@ -227,7 +222,7 @@ class _Suspect:
         return f"points end otherwise now: {Status(then).name} then, {Status(now).name} now"
 
     def differing_gradient(self, names: Sequence[str]) -> str:
-        """Return both gradients by the parameter by which they differ most in widths of the box, nothing as above."""
+        """Return both gradients by the parameter in which they differ most in widths of the box, nothing as above."""
         then, now, widths = self.probe.then.grad, self.now.grad, self.probe.widths
         if then is None or now is None:
             return ""

@@ -36,7 +36,7 @@ class ExtremeCase:
     """Push an objective another way: `make` returns it, or raises ValueError where it refuses that.
 
     It is evaluated at `x`, or else at the first few of the points, and what was made has to answer there. `why` is
-    worth knowing beside the answer, or says why there is nothing to make.
+    worth knowing with the answer, or says why there is nothing to make.
     """
 
     name: str
@@ -105,7 +105,7 @@ def describe_counts(counts: Mapping[str, float | None]) -> str:
 
 
 def describe_missing(space: ParameterSpace, x: Float[Tensor, "batch dim"], found: Evaluation, place: str = "") -> str:
-    """Say where the gradient is NaN beside a finite loss, or nothing where that is nowhere; `place` names one point."""
+    """Say where the gradient is NaN though the loss is finite, nothing where it is nowhere; `place` names one point."""
     rows = (found.status == Status.NO_GRADIENT).nonzero().flatten()
     if not len(rows):
         return ""

@@ -222,15 +222,14 @@ def check_special_places(subject: Subject) -> Finding:
     generator = torch.Generator().manual_seed(subject.seed)
     axes = torch.randperm(space.dim, generator=generator)[:AXES].sort().values
     exact = (here.grad * (space.upper - space.lower))[:, axes]
-    beside = torch.stack(
-        [_slopes_beside(subject, base, here.loss, axes, step) for step in PLACE_STEPS]
-    )  # step, side, place, axis
-    low, high = beside.amin(dim=1), beside.amax(dim=1)
-    largest = torch.maximum(beside.abs().amax(dim=1), exact.abs())
+    slopes = [_side_slopes(subject, base, here.loss, axes, step) for step in PLACE_STEPS]
+    sides = torch.stack(slopes)  # step, side, place, axis
+    low, high = sides.amin(dim=1), sides.amax(dim=1)
+    largest = torch.maximum(sides.abs().amax(dim=1), exact.abs())
     outside = torch.maximum(low - exact, exact - high) > OUTSIDE_SLOPES * largest
     noise = torch.tensor([subject.blur(here.loss) / step for step in PLACE_STEPS], dtype=torch.float64)
     flat = subject.flat(here.loss)
-    seen = beside.isfinite().all(dim=1) & exact.isfinite() & (largest > (CLEAR * noise).clamp(min=flat)[:, None, None])
+    seen = sides.isfinite().all(dim=1) & exact.isfinite() & (largest > (CLEAR * noise).clamp(min=flat)[:, None, None])
     wrong = seen.any(dim=0) & (outside | ~seen).all(dim=0)
     if not bool(seen.any()):
         return skip(*NOTHING_TO_COMPARE)
@@ -239,7 +238,7 @@ def check_special_places(subject: Subject) -> Finding:
         return verdict(True, f"{count}: between those to either side")
     place, axis = wrong.nonzero()[0].tolist()
     step = int(seen[:, place, axis].nonzero()[0])
-    left, right = beside[step, :, place, axis].tolist()
+    left, right = sides[step, :, place, axis].tolist()
     figure = (
         f"{int(wrong.sum())} of {count} are wrong: at {[*where][place]}, by {space.names[int(axes[axis])]}, the "
         f"gradient is {float(exact[place, axis]):.3g} and the loss rises by {left:.3g} and {right:.3g} to either side"
@@ -249,13 +248,13 @@ def check_special_places(subject: Subject) -> Finding:
 
 
 def _name_missing(where: Iterable[str], found: Evaluation) -> list[str]:
-    """Say at which places the gradient is NaN beside a finite loss."""
+    """Say at which places the gradient is NaN though the loss is finite."""
     missing = found.status == Status.NO_GRADIENT
     rows = zip(where, found.loss.tolist(), missing.tolist(), strict=True)
     return [f"the gradient is NaN at {place}, where the loss is {loss:.4g}" for place, loss, none in rows if none]
 
 
-def _slopes_beside(
+def _side_slopes(
     subject: Subject, base: Tensor, loss: Tensor, axes: Tensor, step: float
 ) -> Float[Tensor, "2 place axis"]:
     """Return the slopes over one step to either side of each place along each axis [loss unit per side of the box]."""

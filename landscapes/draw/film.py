@@ -77,7 +77,7 @@ def save_still(picture: Picture, path: Path) -> None:
 
 
 def lighten(path: Path) -> None:
-    """Write a PNG anew with 256 colours, which is a third of its weight where it is a diagram."""
+    """Write a PNG again with 256 colours, which is a third of its weight where it is a diagram."""
     with Image.open(path) as picture, replacing(path) as partial:
         few = picture.convert("RGB").quantize(256, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
         few.save(partial, "PNG", optimize=True)

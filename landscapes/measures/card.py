@@ -1,4 +1,4 @@
-"""The report card of several engines' gradients: what `check` finds of each, beside its landscape on one plane."""
+"""The report card of several engines' gradients: what `check` finds of each, and its landscape on one plane."""
 
 from __future__ import annotations
 

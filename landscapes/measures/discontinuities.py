@@ -131,7 +131,7 @@ def _bisect(
         x = [plane.lift(part) for plane, part in zip(planes, torch.split(u, counts), strict=True)]
         return evaluate(objective, torch.cat(x), grad=False).loss
 
-    below, above = losses(low), losses(high)  # anew: a slice may come from another device
+    below, above = losses(low), losses(high)  # again: a slice may come from another device
     gaps = [(above - below).abs()]
     for _ in range(HALVINGS):
         middle = (low + high) / 2

@@ -1,6 +1,6 @@
 """The verdict on a slice at twice its resolution, estimated from a random tenth of its cells.
 
-The cells are drawn in blocks, two along each axis, which are sampled anew half a step apart. What can be measured
+The cells are drawn in blocks, two along each axis, which are sampled again, half a step apart. What can be measured
 within a block is measured there twice, of all samples and of the slice's own alone. The mean of the difference is added
 to what the whole slice shows (a difference estimator), with Student's interval. A turn is seen there where two
 successive steps turn back. Gradients are taken of a block's inner samples alone: those on its border have no difference

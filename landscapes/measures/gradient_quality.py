@@ -7,7 +7,7 @@ of the box.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -99,8 +99,7 @@ def compare_differences(
         loss = evaluate(objective, plane.lift(ends.reshape(-1, plane.rank)), grad=False).loss
         below, above = loss.reshape(2, len(u), plane.rank)
         parts.append(agreement(slope.numpy(), ((above - below) / scale).numpy(), math.sqrt(2) * deviation / scale))
-    found = {name: (("scale", "point"), np.stack([part[name] for part in parts])) for name in parts[0]}
-    return xr.Dataset(found, {"scale": list(scales), "place": (("point", "axis"), u.numpy())})
+    return xr.Dataset(_stack(parts, "scale", "point"), {"scale": list(scales), "place": (("point", "axis"), u.numpy())})
 
 
 def compare_samples(dataset: xr.Dataset, *, deviation: float = 0.0) -> xr.Dataset:
@@ -118,9 +117,14 @@ def compare_samples(dataset: xr.Dataset, *, deviation: float = 0.0) -> xr.Datase
         widths = np.array([2 * stride / (size - 1) for size in plane.resolution])
         fuzz = math.sqrt(2) * deviation / widths.min()
         parts.append(agreement(box_slopes(dataset), np.stack(axes, axis=-1), fuzz))
-    dims = ("scale", *(name for name in ("v", "u") if name in dataset.dims))
-    found = {name: (dims, np.stack([part[name] for part in parts])) for name in parts[0]} if parts else {}
+    found = _stack(parts, "scale", *(name for name in ("v", "u") if name in dataset.dims))
     return xr.Dataset(found, {"scale": [2 * stride / (max(plane.resolution) - 1) for stride in strides]})
+
+
+def _stack(parts: Sequence[Mapping[str, Values]], *dims: str) -> dict[str, tuple[tuple[str, ...], Values]]:
+    """Return what each part holds in one array by name, the parts along the first dimension; nothing of none."""
+    arrays = {name: np.stack([part[name] for part in parts]) for name in (parts[0] if parts else ())}
+    return {name: (dims[: values.ndim], values) for name, values in arrays.items()}
 
 
 def agreement(slope: Values, difference: Values, noise: float) -> dict[str, Values]:
@@ -193,10 +197,8 @@ def smoothed_slopes(
         slopes = (plane.slope(found.grad) * sides).reshape(2, len(u), pairs, plane.rank)
         above, below = found.loss.reshape(2, len(u), pairs)
         parts.append(_compare_orders(slopes.mean(dim=0), (above - below) / (2 * width), w))
-    dims = ("width", "point", "axis")
-    stacked = {name: np.stack([part[name] for part in parts]) for name in parts[0]}
-    shaped = {name: (dims[: values.ndim], values) for name, values in stacked.items()}
-    return xr.Dataset(shaped, {"width": list(widths), "place": (("point", "axis"), u.numpy())})
+    about = {"width": list(widths), "place": (("point", "axis"), u.numpy())}
+    return xr.Dataset(_stack(parts, "width", "point", "axis"), about)
 
 
 def find_bias(found: xr.Dataset) -> xr.DataArray:

@@ -13,8 +13,8 @@ import numpy as np
 
 from ..statistics import Estimate, Values, fit_line, mean
 
-FEWEST = 4  # horizons that a rate is fitted to
-MUCH = 0.5  # share of the points whose gradients must be known at all horizons
+MIN_HORIZONS = 4  # horizons that a rate is fitted to
+MIN_KNOWN_SHARE = 0.5  # share of the points whose gradients must be known at all horizons
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ def measure_growth(time: Values, norm: Values) -> GradientGrowth:
     nothing = Estimate(math.nan, math.nan, math.nan)
     if known:
         medians = np.median(norm[:, there], axis=1)
-    if len(time) < FEWEST or known < 2 or known < MUCH * points:
+    if len(time) < MIN_HORIZONS or known < 2 or known < MIN_KNOWN_SHARE * points:
         return GradientGrowth(
             nothing, nothing, (math.nan, math.nan), tuple(time.tolist()), tuple(medians.tolist()), known, points
         )

@@ -118,8 +118,8 @@ def effort(rank: int, points: int, shape: Sequence[int] = ()) -> tuple[int, int]
     losses += places * rank * 2 * len(gradients.SCALES)
     slopes = places * (1 + 2 * PAIRS * len(gradients.WIDTHS))
     if shape:
-        anew = doubling_episodes(shape)
-        losses, slopes = losses + probes(math.prod(shape), grad=True) + anew[0], slopes + anew[1]
+        finer = doubling_episodes(shape)
+        losses, slopes = losses + probes(math.prod(shape), grad=True) + finer[0], slopes + finer[1]
     return losses, slopes
 
 

@@ -10,6 +10,7 @@ import math
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
@@ -134,7 +135,7 @@ def holder_exponent(loss: Values, axis: int, floor: float) -> float:
 
     The slope of the logarithm of the root mean square of differences over 1, 2, 4, ... steps, up to a quarter of the
     side, against that of the distance: Wang et al. 2023, *Fractal landscapes in policy optimization* (NeurIPS), section
-    5, with differences of samples in the place of a Gaussian's. Differences no larger than `floor` are left out; NaN
+    5, with differences of samples instead of a Gaussian's. Differences no larger than `floor` are left out; NaN
     where fewer than three distances are left.
     """
     lines, known = _lines(loss, axis), list[tuple[float, float]]()
@@ -266,8 +267,13 @@ def ruggedness(dataset: xr.Dataset, *, floor: float, estimate: Callable[..., Est
     whole, found = span(loss), minima(loss)
     notable = found.sample[found.depth > max(floor, NOTABLE * whole)]
     shares = basins(loss, notable) if len(notable) else np.full(1, math.nan)
-    axes = range(loss.ndim)[::-1]  # u first
     slopes = box_slopes(dataset) if "grad" in dataset else None
+    share_of = partial(estimate, least=0.0, most=1.0)
+
+    def along_axes(measure: Callable[[Values, int], float], **bounds: float) -> tuple[Estimate, ...]:
+        axes = range(loss.ndim)[::-1]  # u first
+        return tuple(estimate(lambda part, axis=axis: measure(part, axis), loss, **bounds) for axis in axes)
+
     return Ruggedness(
         samples=loss.size,
         failed=int((~np.isfinite(loss)).sum()),
@@ -279,22 +285,16 @@ def ruggedness(dataset: xr.Dataset, *, floor: float, estimate: Callable[..., Est
         curve={f"{part:g}": found.count(part * whole) for part in THRESHOLDS},
         largest_basin=float(shares.max()),
         lowest_basin=float(shares[0]),
-        zero=None if slopes is None else estimate(_mean, _below(slopes, 0.0), least=0.0, most=1.0),
-        flat=None if slopes is None else estimate(_mean, _below(slopes, FLAT_SLOPE * whole), least=0.0, most=1.0),
+        zero=None if slopes is None else share_of(_mean, _below(slopes, 0.0)),
+        flat=None if slopes is None else share_of(_mean, _below(slopes, FLAT_SLOPE * whole)),
         missing=missing_gradients(dataset),
-        level=estimate(_mean, level_samples(loss, floor), least=0.0, most=1.0),
-        correlation_length=tuple(
-            estimate(lambda part, axis=axis: correlation_length(part, axis), loss, least=0.0, most=1.0) for axis in axes
-        ),
-        holder=tuple(
-            estimate(lambda part, axis=axis: holder_exponent(part, axis, floor), loss, least=0.0) for axis in axes
-        ),
-        total_variation=tuple(
-            estimate(lambda part, axis=axis: total_variation(part, axis), loss, least=1.0) for axis in axes
-        ),
-        information=estimate(lambda part: information_content(part)[0], loss, least=0.0, most=1.0),
+        level=share_of(_mean, level_samples(loss, floor)),
+        correlation_length=along_axes(correlation_length, least=0.0, most=1.0),
+        holder=along_axes(partial(holder_exponent, floor=floor), least=0.0),
+        total_variation=along_axes(total_variation, least=1.0),
+        information=share_of(lambda part: information_content(part)[0], loss),
         settling=estimate(lambda part: information_content(part)[1], loss),
-        turns=estimate(turns, loss, least=0.0, most=1.0),
+        turns=share_of(turns, loss),
         dispersion=estimate(dispersion, loss, least=0.0),
         fitness_distance=estimate(fitness_distance, loss, least=-1.0, most=1.0),
     )

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from ..storage.checkpoint import Checkpoint
 
 STEP, LINE = 0.025, 5  # of a short line: distance of its points in widths of the box, how many they are
-MOST, LEAST, AFFORDED = 16, 4, 2000  # base points by default, and the episodes up to which they are the most
+MAX_SAMPLES, MIN_SAMPLES, MAX_EPISODES = 16, 4, 2000  # base points by default; episodes up to which they are the most
 CROSSED = 8  # the most sensitive parameters, whose pairs are varied together
 Array = NDArray[np.float64]
 
@@ -151,7 +151,7 @@ class Responses:
 
 def default_samples(dim: int) -> int:
     """Return how many base points are taken in so many dimensions unless said otherwise: 16, fewer in more than 20."""
-    return max(LEAST, min(MOST, AFFORDED // (1 + LINE * dim + CROSSED * (CROSSED - 1) // 2)))
+    return max(MIN_SAMPLES, min(MAX_SAMPLES, MAX_EPISODES // (1 + LINE * dim + CROSSED * (CROSSED - 1) // 2)))
 
 
 def explore(

@@ -14,7 +14,7 @@ Cells are drawn at random from three strata, with new evaluations of their losse
 - quiet: all others. The loss is asked for in the middle, since what left no trace can only be met.
 
 Of a slice that has no gradients, or not at every sample, their place is taken by differences of neighbouring losses. Of
-a refined slice the cells that it interpolates count as resolved; how exact they are is said beside.
+a refined slice the cells that it interpolates count as resolved; how exact they are is said separately.
 """
 
 from __future__ import annotations
@@ -181,7 +181,7 @@ def _step_slopes(dataset: xr.Dataset, loss: Values) -> Values:
     if not has_all_gradients(dataset):
         return np.stack([np.gradient(loss, axis=axis) for axis in range(loss.ndim)], axis=-1)
     slopes: Values = (box_slopes(dataset) / (np.array(plane_of(dataset).resolution) - 1))[..., ::-1]
-    return np.clip(slopes, -LARGE, LARGE)  # no loss goes on like that, and sums of them are numbers
+    return np.clip(slopes, -LARGE, LARGE)  # no loss continues like that, and sums of them are numbers
 
 
 def _strata(loss: Values, slope: Values, least: float) -> dict[str, Cells]:

@@ -1,4 +1,4 @@
-"""Which stored points are evaluated anew, and what of them is another number."""
+"""Which stored points are evaluated again, and what of them is another number."""
 
 from pathlib import Path
 from typing import Any
@@ -57,7 +57,6 @@ def test_points_beyond_the_box_and_those_that_are_not_numbers_are_passed_over() 
 
 def test_a_point_without_a_gradient_is_asked_for_none() -> None:
     found = Slope().evaluate(POINTS)
-    assert found.grad is not None
     with_none, objective = changed(found, grad=torch.full_like(found.grad, torch.nan)), Slope()
     verify(objective, [stored(with_none)])
     assert [grad for _, grad in objective.asked] == [False]

@@ -53,7 +53,7 @@ def _draw_named(sheet: style.Sheet, draw: Callable[[page.Picture, Axes, Mapping[
 def _place_names(
     ax: Axes, names: Mapping[str, str], places: Mapping[str, Place], *, clear: page.Grid, rather: page.Grid
 ) -> list[str]:
-    """Write what stands for each name beside its place; return those that have no room."""
+    """Write what stands for each name next to its place; return those that have no room."""
     sheet = page.sheet_of(ax)
     labels = [page.Label(said, places[name]) for name, said in names.items()]
     gaps = [gap * sheet.type for gap in GAPS]

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from ...measures.slice_comparison import SliceComparison
     from ...statistics import Estimate
 
-PITCH, LEAST = 4.8, 40.0  # room of a panel: on a screen [inch], and at least in print [mm]
+PITCH, MIN_PANEL = 4.8, 40.0  # room of a panel: on a screen [inch], and at least in print [mm]
 HEIGHT = 2.2  # of a panel over a line [inch]
 PLAIN = 3  # digits before or after the point, up to which differences have no power of ten
 LISTED = 4  # settings that differ, in the legend
@@ -48,7 +48,7 @@ def comparison_figure(found: SliceComparison, *, width: float | None = None) -> 
 
 def _draw_maps(found: SliceComparison, width: float | None) -> tuple[page.Picture, list[Artist]]:
     panels = 4 if found.slopes else 3
-    sheet = style.Sheet.of(width, pitch=PITCH, columns=2, least=LEAST)
+    sheet = style.Sheet.of(width, pitch=PITCH, columns=2, least=MIN_PANEL)
     picture = page.Picture(sheet, -(-panels // sheet.columns) * sheet.pitch)
     axes, both = page.grid(picture, panels, share=True), _where_either_failed(found)
     entries = _loss_maps(axes, found)

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from ...episode import Episode
 
 KEYS = 5  # frames
-PITCH, LEAST = 2.5, 33.0  # room of a frame: on a screen [inch], and at least in print [mm]
+PITCH, MIN_FRAME = 2.5, 33.0  # room of a frame: on a screen [inch], and at least in print [mm]
 CORNER = (0.05, 0.06)  # of the scale's bar, in shares of the frame
 
 
@@ -68,7 +68,7 @@ def episode_figure(
     if goals := tuple(replace(part, material="goal") for part in replay.goal_parts(episode)):
         shown += replay.frames(replace(episode, parts=goals), [0], marked=False)
         said.append("target")
-    sheet = style.Sheet.of(width, pitch=PITCH, columns=len(shown), least=LEAST)
+    sheet = style.Sheet.of(width, pitch=PITCH, columns=len(shown), least=MIN_FRAME)
     picture = page.Picture(sheet, -(-len(shown) // sheet.columns) * sheet.pitch)
     for ax, pixels, text in zip(page.grid(picture, len(shown)), shown, said, strict=True):
         ax.imshow(pixels, interpolation="antialiased", aspect="auto")

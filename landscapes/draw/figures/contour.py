@@ -31,7 +31,7 @@ PITCH = 6.0  # room of a map with its colour bar on a screen [inch]
 
 
 def landscape_figure(dataset: xr.Dataset, *, width: float | None = None) -> page.Picture:
-    """Draw a slice of rank 2: the loss as colours above, its negated gradients as arrows below, or beside it.
+    """Draw a slice of rank 2: the loss as colours above, its negated gradients as arrows below, or next to it.
 
     Each cell is one sample, or for a coarse or a refined slice the part of the box nearest to it; nothing is
     interpolated. All

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 PITCH, SHAPE = 5.2, 0.8  # room of a panel on a screen [inch]; its height, against its width
 COLUMN, FLAT = 3, 0.34  # panels of that shape that a column of a page has room for, and the shape of more
-ROW = 0.07  # of a flat panel's width: what a name beside it takes
+ROW = 0.07  # of a flat panel's width: what a name next to it takes
 REACH = 1.8  # what the axes reach beyond the marks, as a ratio
 MIN_MOVE = 1e-16  # of the spread: what is drawn on the lower edge of rounding
 WIDTHS = {

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from ...measures.census import Census
 
 
-PITCH, LEAST = 3.6, 40.0  # room of a panel: on a screen [inch], and at least in print [mm]
+PITCH, MIN_PANEL = 3.6, 40.0  # room of a panel: on a screen [inch], and at least in print [mm]
 TALL = 1.05  # height of a row of panels, in that of their room
 
 
@@ -66,7 +66,7 @@ def companions_figure(
 
     What failed is grey. Raises ValueError where the page is too narrow or too wide.
     """
-    sheet = style.Sheet.of(width, pitch=PITCH, columns=len(cuts), least=LEAST)
+    sheet = style.Sheet.of(width, pitch=PITCH, columns=len(cuts), least=MIN_PANEL)
     rows = -(-len(cuts) // sheet.columns)
     picture = page.Picture(sheet, rows * TALL * sheet.pitch)
     axes = page.grid(picture, len(cuts), share=True)
@@ -146,7 +146,7 @@ def _words(census: Census) -> list[Patch]:
     return [Patch(visible=False, label=text) for text in said[: 2 * FOOT]]
 
 
-WALL_PITCH, WALL_ACROSS, WALL_LEAST = 2.2, 6, 28.0  # room of a landscape [inch]; so many in a row; in print [mm]
+WALL_PITCH, WALL_ACROSS, MIN_LANDSCAPE = 2.2, 6, 28.0  # room of a landscape [inch]; so many in a row; in print [mm]
 LINE = 25  # letters in a line under a landscape
 
 
@@ -170,7 +170,7 @@ def wall_figure(landscapes: Sequence[Landscape], *, width: float | None = None) 
     if not landscapes:
         raise ValueError("a wall needs a landscape at least; got none")
     sheet = style.Sheet.of(
-        width, pitch=WALL_PITCH, columns=min(WALL_ACROSS, len(landscapes)), panels=len(landscapes), least=WALL_LEAST
+        width, pitch=WALL_PITCH, columns=min(WALL_ACROSS, len(landscapes)), panels=len(landscapes), least=MIN_LANDSCAPE
     )
     rows = -(-len(landscapes) // sheet.columns)
     picture = page.Picture(sheet, 1.15 * rows * sheet.pitch)
@@ -201,8 +201,8 @@ def _draw_alone(ax: Axes, dataset: xr.Dataset, *, linewidth: float) -> AxesImage
 
 
 CARD_PITCH, CARD_ACROSS, SHAPE = 2.5, 6, 1.35  # room of a map on a screen [inch]; maps in a row; its height for that
-FEWEST = 3  # for the legend below
-CARD_LEAST = 27.0  # room of a map in print [mm]
+MIN_COLUMNS = 3  # for the legend below
+MIN_CARD_MAP = 27.0  # room of a map in print [mm]
 ARROWS = 9  # most along each axis of a map
 LENGTH = 0.09  # of an arrow, as a share of a side
 OPPOSED = "#ff6b3d"  # legible on all of the map
@@ -218,7 +218,8 @@ def card_figure(card: Card, *, width: float | None = None) -> page.Picture:
     Raises ValueError where the page is too narrow or too wide.
     """
     most = max(Counter(one.scene for one in card.grades).values())
-    sheet = style.Sheet.of(width, pitch=CARD_PITCH, columns=min(CARD_ACROSS, max(FEWEST, most)), least=CARD_LEAST)
+    columns = min(CARD_ACROSS, max(MIN_COLUMNS, most))
+    sheet = style.Sheet.of(width, pitch=CARD_PITCH, columns=columns, least=MIN_CARD_MAP)
     rows = _rows(card, sheet.columns)
     picture = page.Picture(sheet, SHAPE * sheet.pitch * len(rows))
     axes = picture.subplots(len(rows), sheet.columns, squeeze=False)

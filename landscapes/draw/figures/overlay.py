@@ -26,7 +26,7 @@ from . import contour, page
 Runs = Sequence[xr.Dataset]
 PITCH = 5.4  # room of a panel on a screen [inch]
 HEADING = "Marker size: distance from the plane; colour: the loss the point truly had"
-FEW = 24  # most improvements that are numbered, over all runs
+MAX_NUMBERED = 24  # most improvements that are numbered, over all runs
 CROWD = 4  # runs from which on the lines that join them are thinner
 
 
@@ -36,7 +36,7 @@ def overlay_figure(dataset: xr.Dataset, runs: Runs, *, width: float | None = Non
     The colour of a marker is the loss that the point truly had, on the map's own scale: where it differs from the
     colour around it, the plane does not show the point. Markers get smaller, and descents fainter, with the distance
     from the plane. A white line joins the improvements of a run, up to the star at its best point; numbers say in which
-    episodes they came, as far as there is room. Points beyond the map are hollow and at its border; failed episodes are
+    episodes they came, where there is room. Points beyond the map are hollow and at its border; failed episodes are
     crosses. The panel on the right, or below on a narrow page, compares each point with the sample beneath it: points
     on the diagonal have the loss that the map shows.
 
@@ -145,11 +145,12 @@ def _join_improvements(ax: Axes, run: xr.Dataset, plane: Plane, runs: int) -> No
 
 
 def _number_improvements(ax: Axes, runs: Runs, plane: Plane) -> None:
-    """Write the episodes of improvements beside them, the last of each run first, as far as there is room."""
+    """Write the episodes of improvements next to them, the last of each run first, while there is room."""
     places = [_places(run, plane) for run in runs]
     rows = [improvements(run)[::-1] for run in runs]
     turns = range(max(map(len, rows), default=0))
-    picked = [(number, own[turn]) for turn in turns for number, own in enumerate(rows) if turn < len(own)][:FEW]
+    every = [(number, own[turn]) for turn in turns for number, own in enumerate(rows) if turn < len(own)]
+    picked = every[:MAX_NUMBERED]
     names = [page.Label(str(_episode(runs[number], row)), tuple(places[number][row])) for number, row in picked]
     clear = np.concatenate([place[own] for place, own in zip(places, rows, strict=True)])
     size = page.sheet_of(ax).small

@@ -109,7 +109,7 @@ def title(dataset: xr.Dataset) -> str:
 
 
 def provenance(dataset: xr.Dataset) -> str:
-    """Return version, device, date and command, as far as they are known."""
+    """Return version, device, date and command, if they are known."""
     known = {**stored_provenance(dataset), **stored_identity(dataset)}
     version = known.get(VERSIONS, {}).get(PACKAGE)
     said = [f"{PACKAGE} {version}"] if version else []
@@ -211,9 +211,9 @@ def save(figure: Figure, path: str | Path) -> None:
 
 
 def save_prints(draw: Callable[[float], Figure], path: Path, widths: Sequence[float]) -> list[str]:
-    """Write what `draw` draws for a page of so many millimetres as PDF and SVG beside `path`; return their names.
+    """Write what `draw` draws for a page of so many millimetres as PDF and SVG next to `path`; return their names.
 
-    Those that are there from before are drawn anew, so that none is of something else.
+    Those that are there from before are drawn again, so that none is of something else.
 
     Raises ValueError where a width is no page's.
     """
@@ -228,7 +228,7 @@ def save_prints(draw: Callable[[float], Figure], path: Path, widths: Sequence[fl
 
 
 NARROW = 1.8  # room of a panel that has fewer ticks [inch]
-FEW = 1.0, 1.5  # decades of a logarithmic axis that has more ticks than one in each, in a narrow panel and in another
+FINE_DECADES = 1.0, 1.5  # decades of a logarithmic axis with several ticks in each, in a narrow panel and in another
 DECADES = 3, 6  # of one that has a tick in each
 
 
@@ -242,7 +242,7 @@ def grid(picture: Picture, panels: int, *, share: bool = False) -> list[Axes]:
     return every[:panels]
 
 
-LINE_PITCH, LINE_ROOM = 8.0, 1.2  # width of a page of panels over a line on a screen, room beside them [inch]
+LINE_PITCH, LINE_ROOM = 8.0, 1.2  # width of a page of panels over a line on a screen, room next to them [inch]
 FLATTEST = 0.55  # of these panels, against those on a screen: narrow ones are drawn higher than they would be
 
 
@@ -276,7 +276,7 @@ def log_axis(axis: Axis) -> None:
     style.log_axis(axis)
     low, high = sorted(axis.get_view_interval())
     decades, wide = math.log10(high / low), sheet_of(axis.axes).pitch > NARROW
-    if decades > FEW[wide]:
+    if decades > FINE_DECADES[wide]:
         every = math.ceil(decades / DECADES[wide])
         powers = range(math.ceil(math.log10(low)), math.floor(math.log10(high)) + 1)
         axis.set_major_locator(FixedLocator([10.0**power for power in powers if power % every == 0]))
@@ -319,7 +319,7 @@ def colour_bar(
     beside: Sequence[Axes] = (),
     **how: Any,
 ) -> Colorbar:
-    """Put a colour bar beside a panel, or several, with plain numbers where the scale is logarithmic."""
+    """Put a colour bar next to a panel, or several, with plain numbers where the scale is logarithmic."""
     sheet = sheet_of(ax)
     place: dict[str, Any] = {
         "fraction": 0.05, "pad": 0.02, "extend": scale.extend if scale else "neither",
@@ -394,7 +394,7 @@ def _lay_out(picture: Picture) -> None:
 
 
 def _ask_once(artist: Artist, name: str, ax: Axes, kept: ExitStack) -> None:
-    """Let a method of a panel, or of its axis, be run anew only where the panel has moved, until `kept` is closed."""
+    """Let a method of a panel, or of its axis, run again only where the panel has moved, until `kept` is closed."""
     ask: Callable[..., Any] | None = getattr(artist, name, None)
     if ask is None:  # a matplotlib that has no such method is only slower
         return
@@ -505,7 +505,7 @@ def place_labels(
     gaps: Sequence[float],
     gid: str = "name",
 ) -> list[int]:
-    """Write names beside their places, the first of them first, and return the numbers of those with no room.
+    """Write names next to their places, the first of them first, and return the numbers of those with no room.
 
     A name stands in the panel, `gaps` [pt] away from its place, the first that will do, and covers neither another name
     nor any of the points to keep `clear` of, shape (point, 2) [data], nor, if that can be, those to keep clear of

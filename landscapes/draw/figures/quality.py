@@ -22,7 +22,7 @@ from ...measures.ruggedness import box_slopes
 from .. import style
 from . import contour, page
 
-PITCH, LEAST = 4.4, 40.0  # room of a panel: on a screen [inch], and at least in print [mm]
+PITCH, MIN_PANEL = 4.4, 40.0  # room of a panel: on a screen [inch], and at least in print [mm]
 BELOW = 2.0  # room of a panel that has its colour bar under it [inch]
 FLAT = 0.3  # height of the line's panel, against its width
 LINE, SCALES, ORDERS = "line", "scales", ("narrow", "wide")
@@ -31,13 +31,13 @@ LINE, SCALES, ORDERS = "line", "scales", ("narrow", "wide")
 def quality_figure(dataset: xr.Dataset, quality: GradientQuality, *, width: float | None = None) -> page.Picture:
     """Draw gradient quality: first over the slice's own samples, then by scale and under smoothing.
 
-    Panels that show the same by the same colours share a colour bar, beside the last of them. Six panels one below the
+    Panels that show the same by the same colours share a colour bar, next to the last of them. Six panels one below the
     other would be higher than a printed page: on a narrow one they are in pairs.
 
     Raises ValueError where the page is too narrow or too wide.
     """
     plane, samples = plane_of(dataset), quality.samples
-    sheet = style.Sheet.of(width, pitch=PITCH, columns=3, least=LEAST)
+    sheet = style.Sheet.of(width, pitch=PITCH, columns=3, least=MIN_PANEL)
     maps = [str(number) for number in range(samples.sizes["scale"])] if plane.rank == 2 else []
     rows = _rows([*maps, SCALES, *ORDERS], sheet.columns)
     if plane.rank == 1:
@@ -97,7 +97,7 @@ def _cosine_map(ax: Axes, dataset: xr.Dataset, found: xr.Dataset, *, last: bool)
 
 
 def _bar(ax: Axes, drawn: ScalarMappable, label: str) -> None:
-    """Put a colour bar beside a panel, or under it where there is little room beside."""
+    """Put a colour bar next to a panel, or under it where there is little room."""
     below: dict[str, Any] = {"location": "bottom", "fraction": 0.06, "pad": 0.04}
     page.colour_bar(ax, drawn, label, **(below if page.sheet_of(ax).pitch < BELOW else {}))
 

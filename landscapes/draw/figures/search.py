@@ -16,6 +16,7 @@ from ...objective import failed
 from ...space import labelled
 from .. import style
 from . import page
+from .overlay import by_kind
 
 PITCH, SHAPE = 7.2, 0.5  # room of the panel on a screen [inch]; its height, against its width
 WIDE = 30.0  # ratio of losses from which the axis is logarithmic
@@ -64,12 +65,11 @@ def _scale(ax: Axes, loss: NDArray[np.float64]) -> None:
 
 
 def _draw_points(ax: Axes, table: xr.Dataset) -> list[Artist]:
-    loss, kind, episodes = (table[name].to_numpy() for name in ("loss", "kind", "episodes"))
-    names = str(table["kind"].attrs["flag_meanings"]).split()
+    loss, episodes = (table[name].to_numpy() for name in ("loss", "episodes"))
     top = ax.get_ylim()[1]
     entries: list[Artist] = []
-    for code, name in zip(table["kind"].attrs["flag_values"], names, strict=True):
-        here = (kind == code) & np.isfinite(loss)
+    for name, own in by_kind(table):
+        here = own & np.isfinite(loss)
         if not here.any():
             continue
         above = int((loss[here] > top).sum())

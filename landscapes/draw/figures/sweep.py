@@ -17,9 +17,15 @@ from . import contour, page
 
 DPI = 120
 PITCH = 6.25  # room of a panel with its colour bar on a screen [inch]
-LEFT, RIGHT, HEAD, GAP, AXIS = 0.8, 0.83, 1.08, 0.6, 0.55  # room beside, above, between, under panels there [inch]
+LEFT, RIGHT, HEAD, GAP, AXIS = (
+    0.8,
+    0.83,
+    1.08,
+    0.6,
+    0.55,
+)  # room at the sides, above, between, under panels there [inch]
 BESIDE, LINE = 0.93, 1.55  # share of a panel's room that its colour bar leaves; height of a line, in that of its type
-RATES, LEAST = (10, 5, 4, 2), 4.0  # frames per second to choose from, so that a film lasts so many seconds
+RATES, MIN_SECONDS = (10, 5, 4, 2), 4.0  # frames per second to choose from, so that a film lasts so many seconds
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,7 +167,7 @@ def save_films(sweep: Sweep, mp4: Path, gif: Path | None, *, dpi: int = DPI, los
     """
     scales, count = Scales.of(sweep), len(sweep.slices)
     pictures = (film.picture(frame_figure(sweep, number, scales), dpi=dpi) for number in range(count))
-    rate = next((rate for rate in RATES if count / rate >= LEAST), RATES[-1])
+    rate = next((rate for rate in RATES if count / rate >= MIN_SECONDS), RATES[-1])
     film.save_film(pictures, mp4, gif, count=count, rate=rate, loss=loss)
 
 

@@ -23,7 +23,7 @@ from .runs import digest, recording, rgba
 if TYPE_CHECKING:
     from ...episode import Episode, Part, View
 
-MOST = 600_000  # points of a lump in all frames: of more, every so many are shown, larger
+MAX_POINTS = 600_000  # points of a lump in all frames: of more, every so many are shown, larger
 TIMELINE, SCENE = "time", "episode"
 GRAIN = 0.62  # radius of a lump's particles in their distances: they touch
 CLEAR = 0.35  # of that, where a lump is seen through
@@ -81,7 +81,7 @@ def _at(part: Part, frame: int) -> rr.AsComponents:
         case "lump" if part.material == "target":
             return _surface(mesh(part, frame), color)
         case "lump":
-            every = max(1, math.ceil(part.at.shape[0] * len(at) / MOST))
+            every = max(1, math.ceil(part.at.shape[0] * len(at) / MAX_POINTS))
             clear = solids.look(part).get("opacity", 1.0) < 1.0
             radius = part.size[0] * GRAIN * every ** (1 / 3) * (CLEAR if clear else 1.0)
             return rr.Points3D(at[::every], radii=radius, colors=color[:3])

@@ -15,7 +15,6 @@ import xarray as xr
 from matplotlib.colors import to_rgba
 from numpy.typing import ArrayLike, NDArray
 
-from ...identity import plane_of
 from ...objective import failed
 from ...overlay import improvements
 from ...storage.files import replacing
@@ -65,18 +64,16 @@ class Scene:
 
     body: relief.Relief
     reach: float
-    stand: relief.Stand
 
     @classmethod
     def of(cls, dataset: xr.Dataset, runs: Runs, scale: style.Scale | None = None) -> Scene:
         """Return the scene of a slice and of runs laid over it, on the scale of their losses unless given."""
-        body = relief.Relief(plane_of(dataset), scale or joint_scale(dataset, runs))
-        return cls(body, farthest_distance(runs), relief.Stand(relief.azimuth(body, dataset)))
+        return cls(relief.Relief.of(dataset, scale or joint_scale(dataset, runs)), farthest_distance(runs))
 
     @property
     def eye(self) -> rrb.EyeControls3D:
         """From where it is seen at first."""
-        place, focus = self.stand.place(0.0, AWAY, UP), (0.0, 0.0, relief.FOCUS)
+        place, focus = self.body.place(0.0, AWAY, UP), (0.0, 0.0, relief.FOCUS)
         return rrb.EyeControls3D(position=place, look_target=focus, eye_up=(0.0, 0.0, 1.0))
 
     def at(self, u: Grid, v: Grid, loss: Grid) -> Grid:
@@ -127,12 +124,12 @@ def descent_arrows(scene: Scene, dataset: xr.Dataset, scale: style.Scale | None 
 
 def log_axes(stream: rr.RecordingStream, scene: Scene, dataset: xr.Dataset) -> None:
     """Frame the scene, with the ticks of both parameters and of the loss."""
-    frame = rr.LineStrips3D(scene.stand.frame(), colors=rgba(style.MID_GREY), radii=LINE / 2)
+    frame = rr.LineStrips3D(scene.body.frame(), colors=rgba(style.MID_GREY), radii=LINE / 2)
     _log(stream, "landscape/axes/frame", frame)
     for axis, name in enumerate((*scene.body.plane.labels, page.loss_name(dataset))):
         ticks, share = scene.body.ticks(axis)
-        places = [scene.stand.beside(axis, part, TICKS) for part in share]
-        places.append(scene.stand.beside(axis, 0.5, NAMES) if axis < 2 else scene.stand.beside(axis, OVER, TICKS))
+        places = [scene.body.beside(axis, part, TICKS) for part in share]
+        places.append(scene.body.beside(axis, 0.5, NAMES) if axis < 2 else scene.body.beside(axis, OVER, TICKS))
         labels = [*(scene.body.write(axis, tick) for tick in ticks.tolist()), name]
         points = rr.Points3D(places, labels=labels, show_labels=True, colors=rgba(style.MID_GREY), radii=DOT)
         _log(stream, f"landscape/axes/{'uvz'[axis]}", points)
@@ -145,7 +142,7 @@ def _log_key(stream: rr.RecordingStream, scene: Scene, runs: Runs) -> None:
         shown["outside"] = style.BEYOND
     if any(failed(run["status"]).any() for run in runs):
         shown["failed"] = style.LOST
-    behind, left = (np.array(scene.stand.place(turn, 1.0, -relief.FOCUS)) for turn in (180.0, -90.0))
+    behind, left = (np.array(scene.body.place(turn, 1.0, -relief.FOCUS)) for turn in (180.0, -90.0))
     high = np.array([0.0, 0.0, 1.25 * HEIGHT])
     places = [SIDE / 2 * behind + 0.45 * (number - 0.5) * left + high for number in range(len(shown))]
     colors = [rgba(color) for color in shown.values()]
@@ -337,7 +334,7 @@ def save_sweep(sweep: Sweep, path: Path) -> None:
 
 
 def _label(sweep: Sweep, scene: Scene, number: int) -> rr.Points3D:
-    place = scene.stand.place(180.0, SIDE / 2, HEIGHT)
+    place = scene.body.place(180.0, SIDE / 2, HEIGHT)
     said = f"{sweep.name} = {sweep.write_value(sweep.values[number])}"
     return rr.Points3D([place], labels=[said], show_labels=True, colors=rgba(style.MID_GREY), radii=DOT)
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import xarray as xr
 from matplotlib.ticker import LogLocator, MaxNLocator
 from numpy.typing import NDArray
 
+from ...identity import plane_of
 from ...lattice import own_cells
 from ...plane import Plane
 from ...space import LOG10
@@ -33,10 +34,20 @@ SIGHT_STEPS = 160  # of a line of sight across the surface
 
 @dataclass(frozen=True, eq=False)
 class Relief:
-    """Say where plane coordinates and losses are: the slice's window is centred, each of its sides SIDE long."""
+    """Say where plane coordinates and losses are: the slice's window is centred, each of its sides SIDE long.
+
+    It is seen from the `azimuth` of the eye [degrees].
+    """
 
     plane: Plane
     scale: style.Scale
+    azimuth: float = AZIMUTHS[0]
+
+    @classmethod
+    def of(cls, dataset: xr.Dataset, scale: style.Scale) -> Relief:
+        """Return the relief of a slice, seen from where most of its valley is."""
+        flat = cls(plane_of(dataset), scale)
+        return replace(flat, azimuth=azimuth(flat, dataset))
 
     def at(self, u: Grid, v: Grid, loss: Grid) -> Grid:
         """Return positions, shape (..., 3)."""
@@ -80,6 +91,36 @@ class Relief:
     def _has_decades(self, axis: int) -> bool:
         return axis < 2 and self.plane.scales[axis] == LOG10
 
+    def place(self, turn: float, away: float, up: float) -> tuple[float, float, float]:
+        """Return a place so far from the middle, at an angle from the eye [degrees]."""
+        angle = np.radians(self.azimuth + turn)
+        return (float(away * np.cos(angle)), float(away * np.sin(angle)), FOCUS + up)
+
+    @property
+    def front(self) -> tuple[float, float]:
+        """On which side of the surface the edges in front are, -1 or 1 along u and v."""
+        x, y, _ = self.place(0.0, 1.0, 0.0)
+        return float(np.sign(x)), float(np.sign(y))
+
+    def beside(self, axis: int, share: float, away: float) -> tuple[float, float, float]:
+        """Return a place next to an axis: u and v along the edges in front, the loss up the edge at the right."""
+        (right, back), half, along = self.front, SIDE / 2, SIDE * (share - 0.5)
+        if axis == 0:
+            return (along, back * (half + away), 0.0)
+        if axis == 1:
+            return (right * (half + away), along, 0.0)
+        x, y, _ = self.place(90.0, 1.0, 0.0)  # to the right of who looks
+        corner = (-right * half, back * half) if x * right < y * back else (right * half, -back * half)
+        return (corner[0] + x * away, corner[1] + y * away, HEIGHT * share)
+
+    def frame(self) -> list[Grid]:
+        """Return the edges of the ground and of the two walls behind, as lines of shape (point, 3)."""
+        a, top, (right, back) = SIDE / 2, HEIGHT, self.front
+        x, y = -right * a, -back * a  # where the walls are
+        floor = [(-a, -a, 0), (a, -a, 0), (a, a, 0), (-a, a, 0), (-a, -a, 0)]
+        walls = [(-x, y, 0), (-x, y, top), (x, y, top), (x, y, 0)], [(x, y, top), (x, -y, top), (x, -y, 0)]
+        return [np.array(line, dtype=np.float64) for line in (floor, *walls)]
+
 
 @dataclass(frozen=True)
 class Cells:
@@ -100,7 +141,7 @@ class Cells:
 
 
 def cells(relief: Relief, dataset: xr.Dataset) -> Cells:
-    """Return a flat top for every sample, over its cell of the map, and upright walls down to what is beside it.
+    """Return a flat top for every sample, over its cell of the map, and upright walls down to what is next to it.
 
     Nothing is drawn between samples that was not sampled: a wall has the colour of the sample it belongs to, the higher
     one. A sample that failed has no top, and like the border of the slice is walled down to the ground.
@@ -124,43 +165,6 @@ def cells(relief: Relief, dataset: xr.Dataset) -> Cells:
         normals.append(np.tile([float(right), float(back), 0.0], (int((low < high).sum()), 1)))
         sample.append(sample[0][low < high])
     return Cells(np.concatenate(corners), np.concatenate(normals), np.concatenate(sample))
-
-
-@dataclass(frozen=True)
-class Stand:
-    """Say from where the surface is seen: the azimuth of the eye [degrees]."""
-
-    azimuth: float
-
-    def place(self, turn: float, away: float, up: float) -> tuple[float, float, float]:
-        """Return a place so far from the middle, at an angle from the eye [degrees]."""
-        angle = np.radians(self.azimuth + turn)
-        return (float(away * np.cos(angle)), float(away * np.sin(angle)), FOCUS + up)
-
-    @property
-    def front(self) -> tuple[float, float]:
-        """On which side of the surface the edges in front are, -1 or 1 along u and v."""
-        x, y, _ = self.place(0.0, 1.0, 0.0)
-        return float(np.sign(x)), float(np.sign(y))
-
-    def beside(self, axis: int, share: float, away: float) -> tuple[float, float, float]:
-        """Return a place beside an axis: u and v along the edges in front, the loss up the edge at the right."""
-        (right, back), half, along = self.front, SIDE / 2, SIDE * (share - 0.5)
-        if axis == 0:
-            return (along, back * (half + away), 0.0)
-        if axis == 1:
-            return (right * (half + away), along, 0.0)
-        x, y, _ = self.place(90.0, 1.0, 0.0)  # to the right of who looks
-        corner = (-right * half, back * half) if x * right < y * back else (right * half, -back * half)
-        return (corner[0] + x * away, corner[1] + y * away, HEIGHT * share)
-
-    def frame(self) -> list[Grid]:
-        """Return the edges of the ground and of the two walls behind, as lines of shape (point, 3)."""
-        a, top, (right, back) = SIDE / 2, HEIGHT, self.front
-        x, y = -right * a, -back * a  # where the walls are
-        floor = [(-a, -a, 0), (a, -a, 0), (a, a, 0), (-a, a, 0), (-a, -a, 0)]
-        walls = [(-x, y, 0), (-x, y, top), (x, y, top), (x, y, 0)], [(x, y, top), (x, -y, top), (x, -y, 0)]
-        return [np.array(line, dtype=np.float64) for line in (floor, *walls)]
 
 
 def azimuth(relief: Relief, dataset: xr.Dataset) -> float:

@@ -25,7 +25,7 @@ from .. import style
 from ..figures import page
 from ..figures.overlay import by_kind, joint_scale
 from . import relief
-from .relief import FOCUS, HEIGHT, SIDE, Relief, Stand
+from .relief import FOCUS, HEIGHT, SIDE, Relief
 from .solids import off_screen
 
 Runs = Sequence[xr.Dataset]
@@ -44,11 +44,10 @@ ROOM = 0.02  # about the frame, in the picture
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """Hold a scene that is ready to be drawn in so many pixels, and how it is seen."""
+    """Hold a scene that is ready to be drawn in so many pixels."""
 
     plotter: pv.Plotter
     relief: Relief
-    stand: Stand
     pixels: tuple[int, int]
     projection: Grid  # the matrix that takes positions to the picture
 
@@ -71,7 +70,7 @@ def save_surface(dataset: xr.Dataset, runs: Runs, png: str | Path, gltf: str | P
     with scene(dataset, runs) as shown, replacing(Path(gltf)) as partial:
         for actor in shown.plotter.actors.values():
             actor.rotate_x(-90.0)  # after what follows
-            actor.rotate_z(-90.0 - shown.stand.azimuth)
+            actor.rotate_z(-90.0 - shown.relief.azimuth)
         camera = shown.plotter.camera
         camera.position, camera.focal_point = (0.0, FOCUS + relief.UP, relief.AWAY), (0.0, FOCUS, 0.0)
         camera.up = (0.0, 1.0, 0.0)
@@ -110,21 +109,20 @@ def scene(dataset: xr.Dataset, runs: Runs, *, pixels: tuple[int, int] = PIXELS) 
     plane = plane_of(dataset)
     if plane.rank != 2:
         raise ValueError(f"a surface shows a plane; got a slice of rank {plane.rank}, so vary two parameters")
-    body = Relief(plane, joint_scale(dataset, runs))
-    stand = Stand(relief.azimuth(body, dataset))
+    body = Relief.of(dataset, joint_scale(dataset, runs))
     with off_screen(pixels) as plotter:
         focus = (0.0, 0.0, FOCUS)
         for (turn, away, up), strength in LIGHTS:
-            plotter.add_light(pv.Light(position=stand.place(turn, away, up), focal_point=focus, intensity=strength))
-        plotter.camera.position, plotter.camera.focal_point = stand.place(0.0, relief.AWAY, relief.UP), focus
+            plotter.add_light(pv.Light(position=body.place(turn, away, up), focal_point=focus, intensity=strength))
+        plotter.camera.position, plotter.camera.focal_point = body.place(0.0, relief.AWAY, relief.UP), focus
         plotter.camera.up, plotter.camera.view_angle = (0.0, 0.0, 1.0), ANGLE
         _add_surface(plotter, body, dataset)
-        _add_frame(plotter, stand)
+        _add_frame(plotter, body)
         for run in runs:
             _add_run(plotter, body, run)
         plotter.camera.clipping_range = (0.5, 30.0)
         plotter.enable_anti_aliasing("ssaa")
-        yield Shown(plotter, body, stand, pixels, _projection(plotter, pixels))
+        yield Shown(plotter, body, pixels, _projection(plotter, pixels))
 
 
 def _projection(plotter: pv.Plotter, pixels: tuple[int, int]) -> Grid:
@@ -145,8 +143,8 @@ def _add_surface(plotter: pv.Plotter, body: Relief, dataset: xr.Dataset) -> None
     plotter.add_mesh(surface, name="surface", reset_camera=False, **look)
 
 
-def _add_frame(plotter: pv.Plotter, stand: Stand) -> None:
-    for number, line in enumerate(stand.frame()):
+def _add_frame(plotter: pv.Plotter, body: Relief) -> None:
+    for number, line in enumerate(body.frame()):
         lines = pv.lines_from_points(line).tube(radius=FRAME)
         plotter.add_mesh(lines, color=style.FAINT, lighting=False, name=f"frame {number}", reset_camera=False)
 
@@ -187,12 +185,12 @@ def _crop(ax: Axes, shown: Shown) -> None:
 
 
 def _label(ax: Axes, dataset: xr.Dataset, shown: Shown) -> None:
-    """Write ticks and names beside the frame's two lower edges in front and the one at the right."""
+    """Write ticks and names next to the frame's two lower edges in front and the one at the right."""
     sheet, body = page.sheet_of(ax), shown.relief
     room = sheet.type / sheet.zoom  # that type takes up of the scene
     for axis, name in enumerate((*body.plane.labels, page.loss_name(dataset))):
         ticks, share = body.ticks(axis)
-        spots = shown.on_picture(np.array([shown.stand.beside(axis, part, room * AWAY[axis]) for part in share]))
+        spots = shown.on_picture(np.array([shown.relief.beside(axis, part, room * AWAY[axis]) for part in share]))
         look: dict[str, Any] = {"size": sheet.tick, "color": style.INK, "va": "center"}
         look["ha"] = "left" if axis == 2 else "center"
         for tick, (x, y) in zip(ticks.tolist(), spots, strict=True):
@@ -202,7 +200,7 @@ def _label(ax: Axes, dataset: xr.Dataset, shown: Shown) -> None:
 
 def _name(ax: Axes, shown: Shown, axis: int, name: str, away: float) -> None:
     """Write an axis' name along it, farther out than its ticks."""
-    spots = shown.on_picture(np.array([shown.stand.beside(axis, part, away) for part in (0.0, 1.0, 0.5)]))
+    spots = shown.on_picture(np.array([shown.relief.beside(axis, part, away) for part in (0.0, 1.0, 0.5)]))
     start, end, (x, y) = spots
     slope = np.degrees(np.arctan2(start[1] - end[1], end[0] - start[0]))
     slope -= 180.0 * round(slope / 180.0) if abs(slope) > 90.0 + 1e-6 else 0.0

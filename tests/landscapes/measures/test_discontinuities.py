@@ -68,7 +68,6 @@ def test_a_jump_beside_a_failure_is_left_undecided() -> None:
 def test_jumps_are_tied_to_what_is_counted_differently_across_them() -> None:
     objective, dataset = sampled(lambda x: step(x) + 2.0 * (x[:, 1] > EDGE))
     found = jumps(objective, dataset, least=0.5, events=lambda x: {"bounces": (x[:, 0] > EDGE).int()})
-    assert found.explained_by_events is not None
     assert found.explained_by_events.value == 0.5
     assert found.found[0].event is True  # the highest
     unseen = jumps(objective, dataset, least=0.5, events=lambda x: {})

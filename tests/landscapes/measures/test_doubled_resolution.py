@@ -42,7 +42,6 @@ def measured(function: Function, points: int, dims: tuple[int, ...]) -> tuple[xr
 def twice(function: Function, points: int, dims: tuple[int, ...] = (0, 1), seed: int = 0) -> DoubledResolution:
     dataset, found, cosine = measured(function, points, dims)
     result = double_resolution(from_torch(function, SPACE), dataset, found, None, cosine, deviation=0.0, seed=seed)
-    assert result is not None
     losses, gradients = doubling_episodes(dataset["loss"].shape)
     own = (losses + gradients) // (17 if len(dims) == 2 else 3)  # one gradient of each block is the slice's own
     assert result.episodes == losses + gradients - own
@@ -57,7 +56,6 @@ def test_measures_are_those_of_a_slice_that_is_twice_as_fine(
 ) -> None:
     found = twice(function, points, dims).measures
     _, fine, cosine = measured(function, 2 * points - 1, dims)
-    assert fine.flat is not None
     average, uphill = likeness(cosine)
     wanted = {"turns": fine.turns.value, "level": fine.level.value, "flat": fine.flat.value}
     for name, value in (wanted | {"cosine": average, "uphill": uphill}).items():

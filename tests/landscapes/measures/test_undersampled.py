@@ -57,7 +57,6 @@ def look(
     function: Callable[[Tensor], Tensor], points: int = 32, dims: tuple[int, ...] = (0, 1), **how: bool
 ) -> Undersampled:
     found = find_undersampled(*cut(function, points, dims, **how))
-    assert found is not None
     return found
 
 
@@ -144,7 +143,6 @@ def test_it_takes_a_tenth_of_the_slice_at_most(points: int, grad: bool) -> None:
     objective, dataset = cut(counted, points, grad=grad)
     asked = 0
     found = find_undersampled(objective, dataset)
-    assert found is not None
     assert asked == found.episodes <= probes(points**2, grad=grad) <= points**2 / (5 if grad else 10)
 
 
@@ -177,7 +175,6 @@ def test_it_is_the_same_every_time_and_travels_as_text() -> None:
     said = look_between(objective, dataset)
     assert said == look_between(objective, dataset)
     found = Undersampled.of(dataset.assign_attrs(said))
-    assert found is not None
     assert found.attribute() == said
     assert "undersampled cells: 4 %" in found.describe()
     assert Undersampled.of(dataset) is None

@@ -1,5 +1,6 @@
 """Every figure function: shown in a notebook, drawn for print at a journal's widths, saved by its ending."""
 
+import inspect
 import itertools
 import json
 import pkgutil
@@ -15,6 +16,8 @@ from matplotlib import rcParams
 from matplotlib.text import Text
 
 from gradscape.landscapes import draw
+from gradscape.landscapes.draw.figure import FIGURES as DISPATCHED
+from gradscape.landscapes.draw.figure import figure_of
 from gradscape.landscapes.draw.figures import page
 from gradscape.landscapes.draw.figures.accuracy import fidelity_figure, model_figure
 from gradscape.landscapes.draw.figures.comparison import comparison_figure
@@ -166,6 +169,19 @@ def test_every_figure_function_is_held_to_this() -> None:
         names = vars(import_module(module.name))
         found |= {name for name in names if name.endswith("_figure") and not name.startswith("_")}
     assert found == {*FIGURES, "mixed_figure"}  # which is that of a fidelity study, with other marks
+
+
+@pytest.mark.parametrize("kind", DISPATCHED)
+def test_the_figure_of_a_class_is_drawn_from_a_record_of_that_class(kind: str) -> None:
+    module, name = DISPATCHED[kind].split(":")
+    record, *options = inspect.signature(getattr(import_module(f"gradscape.{module}"), name)).parameters.values()
+    assert record.annotation == kind
+    assert any(option.name == "width" and option.kind is option.KEYWORD_ONLY for option in options)
+
+
+def test_what_has_no_figure_is_named() -> None:
+    with pytest.raises(TypeError, match="int has no figure"):
+        figure_of(3)
 
 
 @pytest.mark.parametrize("kind", ["png", "pdf", "svg"])

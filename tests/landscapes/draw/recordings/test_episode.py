@@ -91,7 +91,7 @@ def test_what_rests_is_written_once(held) -> None:
 
 
 def test_many_points_are_thinned_and_many_frames_skipped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gradscape.landscapes.draw.recordings.episode.MOST", 1000)
+    monkeypatch.setattr("gradscape.landscapes.draw.recordings.episode.MAX_POINTS", 1000)
     file = tmp_path / "few.rrd"
     save_episode(replace(EPISODE, parts=PARTS[2:3]), file, title="test", longest=2)
     rows = [

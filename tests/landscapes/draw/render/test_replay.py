@@ -61,7 +61,6 @@ def test_the_scooped_cube_rises_and_the_syrup_stays_in_the_tank() -> None:
     heights = [np.flatnonzero(tinted(picture, "orange").any(axis=1)).mean() for picture in (first, last)]
     assert heights[1] < heights[0] - 20  # rows count downwards
     view = episode.view
-    assert view is not None
     right, _, _ = axes(view)
     half = TANK_WIDTH / 2
     reach = max(abs(np.array([x, 0, z]) @ right) for x in (-half, half) for z in (-half, half))
@@ -89,7 +88,6 @@ def test_a_ball_is_seen_where_the_episode_has_it(name: str) -> None:
     (ball,) = [part for part in episode.parts if (part.shape, part.material) == ("sphere", "rubber")]
     chosen = np.linspace(0, len(episode.time) - 1, 4).round().astype(int).tolist()
     view = episode.view
-    assert view is not None
     for frame, picture in zip(chosen, frames(replace(episode, parts=(ball,)), chosen, height=300), strict=True):
         red, green, _ = picture.astype(float).transpose(2, 0, 1)
         rows, columns = np.nonzero(red > 1.8 * green)

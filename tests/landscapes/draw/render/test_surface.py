@@ -78,7 +78,7 @@ def test_ticks_are_where_parameters_are() -> None:
     texts = {text.get_text(): np.array(text.get_position()) for text in ax.texts}
     assert {"a [m]", "b [m]", "loss", "0.5"} <= set(texts)
     high = float(RELIEF.shade(np.array(0.8)))
-    wanted = SHOWN.on_picture(np.array([SHOWN.stand.beside(2, high, surface.AWAY[2])]))
+    wanted = SHOWN.on_picture(np.array([RELIEF.beside(2, high, surface.AWAY[2])]))
     np.testing.assert_allclose(texts["0.8"], wanted[0], atol=1e-6)
     assert any(
         "holes: 36 of 576 samples" in text.get_text() for legend in figure.legends for text in legend.get_texts()
@@ -169,7 +169,7 @@ def test_files_are_a_picture_and_a_model_that_needs_nothing_else(tmp_path: Path)
     assert all(buffer["uri"].startswith("data:") for buffer in model["buffers"])
     matrix = np.array(next(node["matrix"] for node in model["nodes"] if "mesh" in node)).reshape(4, 4).T[:3, :3]
     np.testing.assert_allclose(matrix @ [0, 0, 1], [0, 1, 0], atol=1e-9)  # losses go up, as glTF has it
-    eye = np.radians(SHOWN.stand.azimuth)
+    eye = np.radians(RELIEF.azimuth)
     np.testing.assert_allclose(matrix @ [np.cos(eye), np.sin(eye), 0], [0, 0, 1], atol=1e-9)  # towards who opens it
     assert not list(tmp_path.glob(".*"))
 
