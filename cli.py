@@ -330,7 +330,7 @@ def _run(words: list[str]) -> Any:
 
 
 def _dims_last(words: Sequence[str], most: int) -> list[str]:
-    """Return a command's words with at most so many behind --dims; others that follow there are arguments, before it."""
+    """Return a command's words with at most so many behind --dims; the arguments that follow it are put before it."""
     found, left = list[str](), list(words)
     while left:
         found.append(left.pop(0))
