@@ -180,7 +180,7 @@ def test_killing_a_worker_loses_nothing_and_repeats_no_more_than_it_held(tmp_pat
     (marks / "killed").unlink()
     points = [mark.read_text() for mark in marks.iterdir()]
     again = len(points) - len(set(points))
-    assert 1 <= again <= 3  # the killed batch, and what its worker had just done and nobody had fetched yet
+    assert 1 <= again <= 4  # the killed batch, and what its worker had done: two workers have two tasks each at a time
 
 
 SCHEDULER = """

@@ -13,7 +13,7 @@ from collections.abc import Callable, Collection, Generator, Iterable, Iterator,
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, Future, wait
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import chain
+from itertools import chain, islice
 from typing import Any, TypeVar
 
 import cloudpickle
@@ -29,6 +29,7 @@ from .memory import MemoryBound, free_memory
 
 T = TypeVar("T")
 POLL = 1.0  # seconds between looks at the workers
+AHEAD = 2  # tasks of each worker that are under way or wait for it
 WITHOUT_WORKERS = 60.0  # seconds without any worker after which they are given up
 
 
@@ -142,11 +143,17 @@ def evaluator(objective: Objective, executor: Executor | None, made: Callable[[]
 
 
 def workers_of(executor: Executor) -> int:
-    """Return how many batches an executor works on at a time, 1 if it does not say: no interface of theirs has it."""
+    """Return how many batches an executor works on at a time, at least 1."""
+    return _workers_there(executor) or 1
+
+
+def _workers_there(executor: Executor) -> int:
+    """Return how many batches an executor works on now, 0 where no worker is left; executors share no interface for it."""
     client = getattr(executor, "_client", None)  # Dask's
-    if client is not None:
-        return sum(client.nthreads().values()) or 1
-    return int(getattr(executor, "_max_workers", 1))
+    try:
+        return int(getattr(executor, "_max_workers", 1)) if client is None else sum(client.nthreads().values())
+    except OSError:  # nobody is there to answer
+        return 0
 
 
 def fill_tiles(
@@ -167,16 +174,22 @@ def fill_tiles(
 def run_tasks(executor: Executor, work: Callable[..., T], tasks: Iterable[Sequence[Any]]) -> Iterator[T]:
     """Let workers do tasks, and yield each result when it is there; what is not begun when that ends is cancelled.
 
+    Each worker has one task to do and one to do next, so little is computed again where one dies with its results.
+
     Raises WorkersLostError where nobody is left to do them, and what a task raises.
     """
-    pending: set[Future[T]] = set()
+    left, pending = iter(tasks), set[Future[T]]()
+    count, seen = workers_of(executor), time.monotonic()
     try:
-        for task in tasks:
-            pending.add(executor.submit(work, *task))
-        seen = time.monotonic()
-        while pending:
+        while True:
+            for task in islice(left, max(0, AHEAD * count - len(pending))):
+                pending.add(executor.submit(work, *task))
+            if not pending:
+                return
             done, pending = wait(pending, timeout=POLL, return_when=FIRST_COMPLETED)
-            alive = bool(done) or _has_workers(executor)
+            if there := _workers_there(executor):
+                count = there
+            alive = bool(done or there)
             while done:  # held no longer than needed: Dask computes again what was lost with a worker and is held
                 yield done.pop().result()
             if alive:
@@ -188,15 +201,6 @@ def run_tasks(executor: Executor, work: Callable[..., T], tasks: Iterable[Sequen
     finally:
         for future in pending:
             future.cancel()
-
-
-def _has_workers(executor: Executor) -> bool:
-    """Say whether an executor has a worker, as far as it can be asked."""
-    client = getattr(executor, "_client", None)  # Dask's
-    try:
-        return client is None or bool(client.nthreads())
-    except OSError:  # nobody is there to answer
-        return False
 
 
 def _evaluate(

@@ -33,9 +33,9 @@ from ..plane import Plane
 from ..space import LOG10
 from .checkpoint import PARTS
 from .files import store_files
-from .paths import HEADER
 
 FORMAT = 2
+HEADER = "slice.json"  # what a slice is that is being filled
 MARK = "gradscape_slice"  # the attribute that says that something is a slice, and of which format
 AXES = ("u", "v")
 SAMPLES = ("loss", "grad", "status")  # the arrays of what was evaluated

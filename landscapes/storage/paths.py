@@ -9,7 +9,6 @@ from .files import check_ours, foreign_files, lost_root
 from .records import read_json
 
 SLICE, FILLING = "slice.zarr", ".filling"
-HEADER = "slice.json"  # what a slice is that is being filled
 
 
 def filling_path(path: Path) -> Path:
@@ -40,7 +39,7 @@ def refuse_missing(path: str | Path, what: str) -> None:
 
 def is_slice(path: Path) -> bool:
     """Say whether a slice of this format, finished or not, is at `path`."""
-    from .arrays import FORMAT, MARK, open_group
+    from .arrays import FORMAT, HEADER, MARK, open_group
 
     place = place_of(path)
     try:
@@ -52,7 +51,7 @@ def is_slice(path: Path) -> bool:
 
 def has_lost_root(place: Path) -> bool:
     """Whether a slice has lost the file that says what it is, and everything else in its folder is of a slice."""
-    from .arrays import FILES, FILLING_FILES
+    from .arrays import FILES, FILLING_FILES, HEADER
 
     if not place.name.endswith(FILLING):
         return lost_root(place, FILES)

@@ -49,6 +49,7 @@ from .arrays import (
     FILES,
     FILLING_FILES,
     FORMAT,
+    HEADER,
     MARK,
     SAMPLES,
     Arrays,
@@ -63,7 +64,6 @@ from .arrays import (
 from .checkpoint import Checkpoint
 from .files import placing, remove, resolve
 from .paths import (
-    HEADER,
     SLICE,
     check_replaceable,
     filling_path,

@@ -233,7 +233,7 @@ def test_other_gradients_are_another_slice(tmp_path: Path) -> None:
         ({"gradients": 17}, "got 17 x 17 samples and gradients at every 17"),
         ({"gradients": 2, "refine": 0.05}, "leave out one of the two"),
         ({"gradients": -1}, "gradients is a whole number of at least 0; got -1"),
-        ({"gradients": 2.5}, "gradients is a whole number of at least 0; got 2.5"),
+        ({"gradients": 2.5}, "slice takes a whole number as gradients; got 2.5"),
     ],
 )
 def test_what_cannot_be_is_refused(how: dict[str, object], said: str) -> None:

@@ -145,7 +145,7 @@ def test_smoothing_keeps_a_constant_and_averages_no_value_that_is_not_there() ->
 
 
 def test_smoothing_is_a_gaussian_of_that_share_of_each_side() -> None:
-    wide = Plane.through(SPACE, SPACE.center, ("a", "b"), resolution=(41, 61), extent=((-1.0, -3.0), (1.0, 3.0)))
+    wide = Plane.through(SPACE, SPACE.center, ("a", "b"), resolution=(41, 61), window=((-1.0, -3.0), (1.0, 3.0)))
     dataset = sample(Bowl(), wide, gradients=0)
     u, v = np.meshgrid(dataset["u"], dataset["v"])
     ok = np.full(u.shape, Status.OK, dataset["status"].dtype)
