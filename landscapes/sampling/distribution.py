@@ -148,7 +148,7 @@ def workers_of(executor: Executor) -> int:
 
 
 def _workers_there(executor: Executor) -> int:
-    """Return how many batches an executor works on now, 0 where no worker is left; executors have no interface for it."""
+    """Return how many batches an executor works on now, 0 where no worker is left."""
     client = getattr(executor, "_client", None)  # Dask's
     try:
         return int(getattr(executor, "_max_workers", 1)) if client is None else sum(client.nthreads().values())
