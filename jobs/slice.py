@@ -36,7 +36,7 @@ from ..landscapes.storage.arrays import Tile, need_of
 from ..landscapes.storage.files import clear
 from ..landscapes.storage.paths import is_slice, slice_exists
 from ..landscapes.storage.store import SliceStore
-from ..landscapes.verification import verify_dataset, verify_store
+from ..landscapes.verification import verify_dataset
 from .folder import ROOT, SLICE, SUMMARY, folder_named
 from .job import SummaryJob
 from .scene import provenance
@@ -229,7 +229,7 @@ class SliceJob(SummaryJob[SliceSummary]):
             if self.refinement and not self.store.ascending:
                 verify_dataset(self.objective, partly_refined(self.store), self.folder)
             else:
-                verify_store(self.objective, self.store)
+                self.store.verify(self.objective)
 
     def _announce(self, watch: Watch) -> None:
         """Say what is left to compute and what that costs."""

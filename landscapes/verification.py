@@ -11,7 +11,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -22,9 +22,6 @@ from torch import Tensor
 
 from .identity import StoreMismatchError, plane_of, stored_identity
 from .objective import NOT_EVALUATED, BoxedObjective, Evaluation, Objective, Status, evaluate, in_box
-
-if TYPE_CHECKING:
-    from .storage.store import SliceStore
 
 POINTS = 3  # of a result that are evaluated again
 ROUNDING = {"float32": 1e-4, "float64": 1e-10}  # what rounding changes: a share of the losses' spread, of a gradient
@@ -62,7 +59,7 @@ class StoredPoints:
         }
         grid = np.meshgrid(*(dataset[name].to_numpy() for name in names), indexing="ij")[::-1]
         x = plane.lift(torch.from_numpy(np.stack([axis.ravel() for axis in grid], axis=1)))
-        return cls(path, "slice", x, _evaluation(arrays, plane.dim), "grad" in dataset)
+        return cls(path, "slice", x, stored_evaluation(arrays, plane.dim), "grad" in dataset)
 
     def choose(self, objective: Objective, count: int) -> list[int]:
         """Return the rows to evaluate again: the middle one by its loss, the least and the largest.
@@ -134,25 +131,6 @@ def verify(objective: Objective, results: Sequence[StoredPoints], *, points: int
             _compare(objective, suspects, now.rows(torch.tensor(unlike)), grad=grad, todo=todo)
 
 
-def verify_store(objective: Objective, store: SliceStore) -> None:
-    """Verify a slice on disk by three of its finished tiles, once for an objective.
-
-    Raises StoreMismatchError where the objective gives other numbers.
-    """
-    if store.path is None or store.verified_for is objective:
-        return
-    left = set(store.pending())
-    finished = [tile for tile in store.tiles() if tile not in left]
-    chosen = sorted({0, len(finished) // 2, len(finished) - 1}) if finished else []
-    read = [(tile, store.read_tile(tile)) for tile in (finished[number] for number in chosen)]
-    parts = [(store.points(tile), values) for tile, values in read if values is not None]
-    if parts:
-        x, dim = torch.cat([x for x, _ in parts]), store.plane.dim
-        found = Evaluation.join((_evaluation(values, dim) for _, values in parts), dim=dim, grad=store.grad)
-        verify(objective, [StoredPoints(store.path, "slice", x, found, store.grad)])
-    store.verified_for = objective
-
-
 def verify_dataset(objective: Objective, dataset: xr.Dataset, path: Path, *, todo: str = TODO) -> None:
     """Verify a slice that was read; raises StoreMismatchError where the objective gives other numbers."""
     if stored_identity(dataset).get("boxed"):
@@ -160,7 +138,7 @@ def verify_dataset(objective: Objective, dataset: xr.Dataset, path: Path, *, tod
     verify(objective, [StoredPoints.of_slice(dataset, path)], todo=todo)
 
 
-def _evaluation(arrays: Mapping[str, NDArray[Any]], dim: int) -> Evaluation:
+def stored_evaluation(arrays: Mapping[str, NDArray[Any]], dim: int) -> Evaluation:
     """Return what arrays of a slice hold, point by point."""
     loss, status = (torch.from_numpy(arrays[name].reshape(-1)) for name in ("loss", "status"))
     return Evaluation(loss, torch.from_numpy(arrays["grad"].reshape(-1, dim)) if "grad" in arrays else None, status)

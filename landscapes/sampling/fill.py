@@ -20,7 +20,6 @@ from ..space import as_stride, as_whole
 from ..storage.arrays import Tile
 from ..storage.files import full, is_full
 from ..storage.store import SliceStore
-from ..verification import verify_store
 from .distribution import PortableObjective, WorkersLostError, fill_tiles
 
 
@@ -81,7 +80,7 @@ def sample(
         about["identity"] = with_stride(about["identity"], gradients)
         store = SliceStore.in_memory(plane, objective.space, **about, grad=gradients > 0)
     _check_store(store, objective, plane, grad=gradients > 0)
-    verify_store(objective, store)
+    store.verify(objective)
     batch = as_whole(objective.preferred_batch if batch is None else batch, "sample's batch", least=1)
     status, pending = store.status(), store.pending()
     counts: Counter[Status] = Counter({kind: int((status == kind).sum()) for kind in Status if kind != Status.MISSING})

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
+import torch
 import xarray as xr
 from jaxtyping import Float
 from numpy.typing import NDArray
@@ -39,10 +40,11 @@ from ..identity import (
     gradient_stride,
     with_package,
 )
-from ..objective import Evaluation, Status, has_loss
+from ..objective import Evaluation, Objective, Status, has_loss
 from ..plain import digest, plain_json
 from ..plane import Plane
 from ..space import ParameterSpace
+from ..verification import StoredPoints, stored_evaluation, verify
 from .arrays import (
     ANEW,
     AXES,
@@ -87,7 +89,7 @@ class SliceStore:
     """
 
     def __init__(self, empty: xr.Dataset, path: Path | None = None, chunks: Chunks | None = None) -> None:
-        self.verified_for: object = None  # the objective that gave a few stored points again
+        self._verified_for: Objective | None = None  # the objective that gave a few stored points again
         self._adopt(empty, path, chunks)
 
     def _adopt(self, empty: xr.Dataset, path: Path | None, chunks: Chunks | None) -> None:
@@ -247,6 +249,24 @@ class SliceStore:
             with contextlib.suppress(DamagedError, FileNotFoundError):
                 self._tiles[tile] = self.parts.read(tile.name)
         return self._tiles.get(tile)
+
+    def verify(self, objective: Objective) -> None:
+        """Verify a slice on disk by three of its finished tiles, once for an objective.
+
+        Raises StoreMismatchError where the objective gives other numbers.
+        """
+        if self.path is None or self._verified_for is objective:
+            return
+        left = set(self.pending())
+        finished = [tile for tile in self.tiles() if tile not in left]
+        chosen = sorted({0, len(finished) // 2, len(finished) - 1}) if finished else []
+        read = [(tile, self.read_tile(tile)) for tile in (finished[number] for number in chosen)]
+        parts = [(self.points(tile), values) for tile, values in read if values is not None]
+        if parts:
+            x, dim = torch.cat([x for x, _ in parts]), self.plane.dim
+            found = Evaluation.join((stored_evaluation(values, dim) for _, values in parts), dim=dim, grad=self.grad)
+            verify(objective, [StoredPoints(self.path, "slice", x, found, self.grad)])
+        self._verified_for = objective
 
     def write(self, tile: Tile, evaluation: Evaluation) -> None:
         """Write a whole tile; `evaluation` has its points in the order of `points`, failures blanked.
