@@ -311,15 +311,17 @@ def _announce(env: Environment, dataset: xr.Dataset, points: int, watch: Watch) 
 def _open(subject: ReportedSlice) -> xr.Dataset:
     """Read a slice that can be reported on; raise ValueError for one that cannot."""
     from ..landscapes.lattice import sampled_lattice
+    from ..landscapes.storage.paths import is_finished
     from ..landscapes.storage.store import open_slice
 
     dataset = open_slice(subject.store)
     if "grad" not in dataset or min(dataset["loss"].shape) < 3:
         raise ValueError(f"{subject.name}: report needs a slice with gradients and three samples per axis; got another")
-    if missing := int((dataset["status"] == 0).sum()):
+    missing = int((dataset["status"] == 0).sum())
+    if missing or not is_finished(subject.store):
         raise ValueError(
-            f"{subject.store}: {missing} of {dataset['status'].size} samples are missing or damaged; let the command "
-            "that samples the slice go on first"
+            f"{subject.store}: {missing} of {dataset['status'].size} samples are missing or damaged, or the slice is not "
+            "finished; run the command that samples it again first"
         )
     return sampled_lattice(dataset)
 

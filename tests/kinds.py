@@ -23,6 +23,7 @@ import numpy as np
 import pytest
 
 from gradscape.cli import main
+from gradscape.landscapes.storage.paths import FILLING, finished_path
 
 from .clock import Clock
 from .command import Said
@@ -220,11 +221,14 @@ class Numbers:
 
 
 def numbers(folder: Path) -> dict[str, Numbers]:
-    """Return what files say, but for what differs every time; those that do not open are left out."""
+    """Return what files say, but for what differs every time; those that do not open are left out.
+
+    A slice that is being filled says what it will say when it is finished.
+    """
     found = {}
     for path, read in _readable(folder):
         with suppress(Exception):  # whatever a damaged file raises
-            found[str(path.relative_to(folder))] = read(path)
+            found[str(finished_path(path).relative_to(folder))] = read(path)
     return found
 
 
@@ -252,9 +256,11 @@ def _readable(folder: Path) -> Iterator[tuple[Path, Callable[[Path], Numbers]]]:
     kinds = {".json": _json, ".csv": _table, ".npz": _arrays, ".js": _text, ".zip": _zipped}
     for path in sorted(folder.rglob("*")):
         parts = path.relative_to(folder).parts
-        if any(part.startswith(".") or part.endswith(".zarr") for part in parts[:-1]) or parts[-1].startswith("."):
+        if any(part.startswith(".") or part.endswith((".zarr", FILLING)) for part in parts[:-1]):
             continue
-        if path.suffix == ".zarr":
+        if path.name.startswith("."):
+            continue
+        if path.suffix in (".zarr", FILLING):
             yield path, _store
         elif path.suffix in kinds and path.name not in ("settings.json", "summary.json"):
             yield path, kinds[path.suffix]

@@ -31,6 +31,11 @@ def slice_exists(path: Path) -> bool:
     return place_of(path).exists()
 
 
+def is_finished(path: Path) -> bool:
+    """Say whether a slice, given by its place or by its folder, is finished, and not a file for each of its tiles."""
+    return any((place / "zarr.json").exists() for place in (path, path / SLICE))
+
+
 def refuse_missing(path: str | Path, what: str) -> None:
     """Raise StoreError where nothing is at a path that is to hold `what`; whoever opens it says more."""
     if not slice_exists(Path(path)):
