@@ -320,8 +320,8 @@ def _open(subject: ReportedSlice) -> xr.Dataset:
     missing = int((dataset["status"] == 0).sum())
     if missing or not is_finished(subject.store):
         raise ValueError(
-            f"{subject.store} is not finished: {missing} of {dataset['status'].size} samples are missing or damaged; run "
-            "the command that samples the slice again first"
+            f"{subject.store} is not finished: {missing} of {dataset['status'].size} samples are missing or damaged; "
+            "run the command that samples the slice again first"
         )
     return sampled_lattice(dataset)
 
