@@ -69,7 +69,7 @@ def _is_scene(given: str | Path | Slice | Scene) -> bool:
 
 
 def _second(given: str | Path | Slice | Scene, keywords: SceneKeywords) -> Slice | Environment:
-    """Return a slice that is there, and else the objective to sample. Raises ValueError for keywords beside a slice."""
+    """Return a slice that is there, or else the objective to sample; raise ValueError for a slice with keywords."""
     if _is_scene(given):
         return environment(given, keywords)
     if keywords:

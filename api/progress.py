@@ -55,7 +55,7 @@ class _PlainStatus(Status):
 
 
 class Described(TextColumn):
-    """Say beside a bar what it counts, as it is."""
+    """Say next to a bar what it counts, as it is."""
 
     def __init__(self) -> None:
         super().__init__("{task.description}", markup=False)
@@ -80,7 +80,7 @@ class Bars(Watch):
 
     @contextmanager
     def busy(self, text: str) -> Iterator[Say]:
-        """Turn a wheel beside a text, which may change."""
+        """Turn a wheel next to a text, which may change."""
         with self.console.status(text) as status:
             yield status.update
 

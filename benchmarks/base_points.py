@@ -105,7 +105,7 @@ def _batches(points: Tensor, size: int, name: str) -> Iterator[Tensor]:
 
 
 def write_choice(path: Path, figure: str, found: dict[str, Any]) -> None:
-    """Put the point and its result into the figure's table of a list of figures, in the place of those before."""
+    """Put the point and its result into the figure's table of a list of figures, instead of those before."""
     text = path.read_text()
     heads = [match.start() for match in re.finditer(r"^\[\[figure\]\]$", text, flags=re.MULTILINE)] + [len(text)]
     blocks = [text[: heads[0]], *(text[low:high] for low, high in pairwise(heads))]

@@ -81,7 +81,7 @@ class EpisodeOptions:
 
     Steps and controls stay what they are and when they are. A shorter episode ends earlier, so that controls it does
     not reach have no effect and no gradient; in a longer one tools, pan, cart and joints rest after the last control,
-    and bodies go on. The loss is that of the state at the episode's end, or of the steps there are; targets that a
+    and bodies continue. The loss is that of the state at the episode's end, or of the steps there are; targets that a
     demonstration makes stay those of horizon 1.
     """
 

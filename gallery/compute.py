@@ -48,7 +48,7 @@ def compute_parts(
 
     It makes all kinds of parts but the league where no `parts` are named. A figure that fails, by whatever cause,
     leaves the others to be made. Raises ValueError for a part or a device that there is not, Stopped where it is
-    interrupted, and DiskFullError; the same call goes on then.
+    interrupted, and DiskFullError; the same call continues then.
     """
     if unknown := set(parts) - set(PARTS):
         raise ValueError(f"--part takes {', '.join(PARTS)}; got {', '.join(sorted(unknown))}")

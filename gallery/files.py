@@ -43,7 +43,7 @@ THUMBNAIL = "thumbnail.png"  # of a slice, in a site
 COMPANION_TABLE, QUALITY_TABLE = "companions.csv", "gradient-quality.csv"  # of those pictures, in a site
 CSV, ZARR = "slice.csv", "slice.zarr.zip"  # a slice's data in a site
 DEVICES = ("cuda", "cpu")  # that studies are shown of
-REMAKE = "delete it, and `landscape gallery compute --part {}` makes it anew"
+REMAKE = "delete it, and `landscape gallery compute --part {}` makes it again"
 
 _EPISODE = re.compile(r"episode-\d+-\d+\.(?:mp4|webp)")
 
@@ -72,7 +72,7 @@ def is_of_episode(file: Path) -> bool:
 
 @dataclass(frozen=True)
 class RecordFiles:
-    """A record, and the files of the same name beside it."""
+    """A record, and the files of the same name next to it."""
 
     record: Path
 

@@ -55,7 +55,7 @@ ABOUT_MEDIANS = ("env", "method", "seed", "budget", "fidelity", "loss_unit", "id
 class LeaguePart(FigurePart):
     """The race in the figure's environment, which its other figures share, with the options that it has by default.
 
-    Its runs stay in the folder of `landscape league` on this device, under out/: either goes on with the other's.
+    Its runs stay in the folder of `landscape league` on this device, under out/: either continues with the other's.
     """
 
     of_environment = True
@@ -341,7 +341,7 @@ def keep_both(picture: Picture, path: Path) -> None:
 
 
 def save_both(picture: Picture, path: Path) -> None:
-    """Write a picture, and the same for a dark page beside it."""
+    """Write a picture, and the same for a dark page next to it."""
     from ..landscapes.draw.figures.dark import darken
     from ..landscapes.draw.figures.page import save
 

@@ -245,7 +245,7 @@ class CompanionPart(FigurePart):
         return 0 if there else len(names) * self._resolution ** len(self.figure.dims)
 
     def make(self, watch: Watch) -> str:
-        """Sample them, draw them beside the slice, and keep what they are."""
+        """Sample them, draw them next to the slice, and keep what they are."""
         from ..landscapes.draw.figures.multiples import CompanionSlice, companions_figure
         from ..landscapes.draw.figures.page import save
         from ..landscapes.draw.film import lighten
@@ -444,7 +444,7 @@ class SearchPart(FigurePart):
 
 
 class ReportPart(FigurePart):
-    """What the slice is like, beside it."""
+    """What the slice is like, next to it."""
 
     def label(self) -> str:
         """Return the command that measures it elsewhere, which names no folder above this one: its record is kept."""

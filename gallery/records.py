@@ -26,7 +26,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class SweepRecord:
-    """Say what a sweep's film shows, as `sweep.json` beside it has it: how it was sampled, and what moves."""
+    """Say what a sweep's film shows, as `sweep.json` next to it has it: how it was sampled, and what moves."""
 
     over: str
     fidelity: str
@@ -53,7 +53,7 @@ def read_sweep(folder: Path) -> SweepRecord | None:
 
 @dataclass(frozen=True)
 class Companion:
-    """A slice beside a figure's: the point it goes through, the ends of its losses, the share of episodes that failed.
+    """A slice next to a figure's: the point it goes through, the ends of its losses, the share of episodes that failed.
 
     The ends are None where all failed.
     """
@@ -65,7 +65,7 @@ class Companion:
 
 
 def read_companions(folder: Path) -> list[Companion]:
-    """Return the slices beside a figure's, none where none are made."""
+    """Return the slices next to a figure's, none where none are made."""
     path = folder / COMPANIONS
     if not path.exists() or not (folder / COMPANION_PICTURE).exists():
         return []

@@ -1,1 +1,1 @@
-"""Work in a folder on disk that can be stopped and goes on: progress by callback, nothing printed."""
+"""Work in a folder on disk that can be stopped and continues: progress by callback, nothing printed."""

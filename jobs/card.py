@@ -104,7 +104,7 @@ class CardJob(CheckpointedJob[Card]):
         prints: Sequence[float] = (),
         command: str = "",
     ) -> CardJob:
-        """Go on with the card in its folder, by default one under `root`, or begin it there.
+        """Continue the card in its folder, by default one under `root`, or begin it there.
 
         `scenes` are those of the card, by default all. Raises ValueError for a scene that it does not have,
         StoreMismatchError where the folder holds a card of other versions of the engines, or of other scenes.

@@ -76,7 +76,7 @@ class CensusJob(CheckpointedJob["Census"]):
         prints: Sequence[float] = (),
         command: str = "",
     ) -> CensusJob:
-        """Go on with the census in its folder, by default one named after it under `root`, or begin it there.
+        """Continue the census in its folder, by default one named after it under `root`, or begin it there.
 
         Raises ValueError for what the scene does not have, for fewer than six samples along an axis or three of them
         with gradients, and where the scene has one parameter; TooLargeError for more slices than there is memory for;
@@ -101,7 +101,7 @@ class CensusJob(CheckpointedJob["Census"]):
         design = CensusDesign.draw(env.space, slices, **cut)
         other = replace(scene, fidelity=also, tolerance=None).make() if also else None
         identity = {**env.identity(), "slices": slices, "resolution": resolution, "along": along, "seed": seed}
-        if gradients > 1:  # a census that was begun when all had them goes on
+        if gradients > 1:  # a census that was begun when all had them continues
             identity["gradients"] = gradients
         identity["other"] = other.identity()["settings"] if other else None
         folder = out or folder_named(["census", env.name, env.fidelity.name, slices], identity, root)
@@ -242,7 +242,7 @@ def open_census(folder: Path) -> Census:
     """Read the census in a folder. Raises DamagedError where it holds none that is whole."""
     from ..landscapes.measures.census import Census
 
-    todo = "delete it, and `landscape census` goes on from the slices that are kept"
+    todo = "delete it, and `landscape census` continues from the slices that are kept"
     with reading(folder / LOSSES, todo), np.load(folder / LOSSES, allow_pickle=False) as arrays:
         losses = arrays["loss"]
     with reading(folder / RECORD, todo):

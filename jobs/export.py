@@ -28,7 +28,7 @@ class Export:
 
 
 def export(source: Path, to: str, *, out: Path | None = None, force: bool = False) -> Export:
-    """Write the slice or the run in a folder as csv, parquet or netcdf to `out`, by default beside it.
+    """Write the slice or the run in a folder as csv, parquet or netcdf to `out`, by default next to it.
 
     Raises ValueError for another format, where there is no slice and no run, and where the file exists already, which
     `force` replaces.

@@ -100,7 +100,7 @@ class PairsJob(CheckpointedJob[PairRanking]):
         force: bool = False,
         command: str = "",
     ) -> PairsJob:
-        """Go on with the study in its folder, by default one named after it under `root`, or begin it there.
+        """Continue the study in its folder, by default one named after it under `root`, or begin it there.
 
         `samples` base points are taken, by default as many as their episodes are worth. Raises ValueError where the
         scene has one parameter, TooLargeError for more samples than there is memory for, StoreMismatchError where the

@@ -265,7 +265,7 @@ class Lines:
 
 
 def race_folder(env: Environment, options: Options, root: Path = ROOT) -> Path:
-    """Return a folder of its own for every different race; more methods, seeds or episodes go on in the same one."""
+    """Return a folder of its own for every different race; more methods, seeds or episodes continue in the same one."""
     texts = {method: {name: str(value) for name, value in chosen.items()} for method, chosen in options.items()}
     return folder_named(["race", env.name, env.fidelity.name], [env.identity(), texts], root)
 

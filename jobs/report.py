@@ -123,7 +123,7 @@ class ReportJob:
         seed: int = 0,
         **how: Any,
     ) -> ReportJob:
-        """Go on with the reports in a folder, by default one under `root` named after `what`, or begin them there.
+        """Continue the reports in a folder, by default one under `root` named after `what`, or begin them there.
 
         Raises ValueError where the folder holds something else.
         """
@@ -137,8 +137,8 @@ class ReportJob:
         """Measure what is missing, write and return the reports: those on disk as they are, the others measured now.
 
         One that fails among several is left out, and named with what was wrong. Raises Stopped where it is interrupted,
-        and DiskFullError; the same job goes on with the next slice then. Raises ValueError where a single slice cannot
-        be reported on, or where another report is there.
+        and DiskFullError; the same job then continues with the next slice. Raises ValueError where a single slice
+        cannot be reported on, or where another report is there.
         """
         watch, done, failed = watch or Watch(), list[Report](), dict[str, str]()
         watch.plan(self.work())
@@ -407,7 +407,7 @@ def _holds(folder: Path, key: ReportKey) -> bool:
 
 
 def _fetch(source: Path, folder: Path, key: ReportKey, watch: Watch) -> None:
-    """Copy the same report from beside its slice, where the gallery has it, rather than measure again."""
+    """Copy the same report from next to its slice, where the gallery has it, rather than measure again."""
     files = [source / name for name in (PICTURE, MEASURES, RECORD)]
     if not (folder / RECORD).exists() and _holds(source, key):
         make_folder(folder)
@@ -427,7 +427,7 @@ def _keep(folder: Path, key: ReportKey, device: str, watch: Watch) -> Report:
     watch.note(f"{folder} is there already{elsewhere}")
     if (theirs := kept.key.model_version) != (ours := key.model_version):
         said = f"{kept.env} model {theirs}; this is model {ours}"
-        watch.note(f"warning: it was measured by {said}. Delete the folder to measure it anew")
+        watch.note(f"warning: it was measured by {said}. Delete the folder to measure it again")
     return kept
 
 
@@ -521,7 +521,7 @@ class Report:
         FileNotFoundError.
         """
         path = path / RECORD if path.is_dir() else path
-        with reading(path, "delete it, and the same command measures the slice anew"):
+        with reading(path, "delete it, and the same command measures the slice again"):
             return replace(from_json(cls, read_json(path)), folder=path.parent)
 
     @property
@@ -567,7 +567,7 @@ class Report:
 
         if self.folder is None or self.store is None or not (self.folder / ARRAYS).exists():
             raise ValueError(
-                f"{self.folder} is a report from before {ARRAYS} was kept to draw from; delete it to measure it anew"
+                f"{self.folder} is a report from before {ARRAYS} was kept to draw from; delete it to measure it again"
             )
         dataset, kept = sampled_lattice(open_slice(self.store)), open_bundle(self.folder / ARRAYS)
         samples = compare_samples(dataset, deviation=float(np.nan_to_num(kept["noise"]["deviation"])))

@@ -34,7 +34,7 @@ PACKAGES = (
     *("pyvista", "rerun-sdk", "botorch", "gpytorch", "cma", "cyclopts", "cattrs", "rich"),
 )
 AT = "@"  # between a scene and its fidelity
-ABSENT = "not installed"  # in the place of a version
+ABSENT = "not installed"  # instead of a version
 
 
 @dataclass(frozen=True)
@@ -138,7 +138,7 @@ def environment_of(dataset: xr.Dataset, device: str, env: Any = None) -> Environ
         if env is not None:
             raise
         raise ValueError(
-            f"{name} is not registered here, and evaluating it anew needs it: say where it is, --env FILE.py:NAME, or "
+            f"{name} is not registered here, and evaluating it again needs it: say where it is, --env FILE.py:NAME, or "
             "env= in Python"
         ) from error
     return make(
@@ -425,7 +425,7 @@ def best_of_league(env: Environment) -> tuple[Tensor, float] | None:
     path = league_file(env.name)
     if not path.is_file():
         return None
-    with reading(path, "delete it, and `landscape gallery compute --part league` makes it anew"):
+    with reading(path, "delete it, and `landscape gallery compute --part league` makes it again"):
         found = from_json(SceneStandings, read_json(path))
     if found.best is None or not has_options(found.identity, env) or len(found.best.x) != env.space.dim:
         return None

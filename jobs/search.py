@@ -44,7 +44,7 @@ class BestRecord:
 
 @dataclass(frozen=True)
 class SearchSummary:
-    """Say what a run cost and found, as `summary.json` beside it has it; `best` is None where no episode succeeded.
+    """Say what a run cost and found, as `summary.json` next to it has it; `best` is None where no episode succeeded.
 
     `forwards` is what it cost in episodes without gradient, `error` is what the first episode that raised said.
     """

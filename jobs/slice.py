@@ -59,7 +59,7 @@ Draw = Callable[..., "Figure"]  # draw(dataset, width=None): a slice for a scree
 
 @dataclass(frozen=True)
 class SliceSummary:
-    """Say what a slice cost, as `summary.json` beside it has it; `status` counts points, `flat` those without slope.
+    """Say what a slice cost, as `summary.json` next to it has it; `status` counts points, `flat` those without slope.
 
     Gradients are at every `gradients_every` samples along each axis. `episodes` are those of the samples;
     `undersampled` has those that looked between them, and what they found, None where nothing is known of it.
@@ -224,7 +224,7 @@ class SliceJob(SummaryJob[SliceSummary]):
             save(self.plot(coarse), self.folder / PICTURE)
 
     def _verify(self, watch: Watch) -> None:
-        """Evaluate a few stored points anew, before anything is added to them."""
+        """Evaluate a few stored points again, before anything is added to them."""
         with watch.busy(f"{self.store.identity.get('objective')}: {PREPARING}"):
             if self.refinement and not self.store.ascending:
                 verify_dataset(self.objective, partly_refined(self.store), self.folder)
@@ -443,7 +443,7 @@ def kept_plane(
 ) -> Plane | None:
     """Return the plane of a slice that was begun with the same cut along directions, None where there is none.
 
-    It goes on along these: others may come out a little different each time, on a GPU, and some take many episodes.
+    It continues along these: others may come out a little different each time, on a GPU, and some take many episodes.
     """
     identity = _identity(objective, gradients, boxed=True, cut=cut)
     path = (out or default_folder(identity, resolution, None, gradients > 0, root, refinement)) / STORE

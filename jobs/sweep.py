@@ -78,7 +78,7 @@ class FrameSummary:
 
 @dataclass(frozen=True)
 class SweepSummary:
-    """Say what a sweep cost and what each of its frames shows, as `summary.json` beside it has it."""
+    """Say what a sweep cost and what each of its frames shows, as `summary.json` next to it has it."""
 
     env: str
     dims: list[str]

@@ -13,7 +13,7 @@ from ..landscapes.storage.files import until_full
 if TYPE_CHECKING:
     from ..landscapes.objective import Objective
 
-Advance = Callable[..., None]  # advance(done, said=""): so much is done, and what is said beside the bar
+Advance = Callable[..., None]  # advance(done, said=""): so much is done, and what is said next to the bar
 AdvanceOne = Callable[[str, int, str], None]  # advance(name, done, said): the same, of one of several
 Say = Callable[[str], None]  # say(text): what is being done now
 
@@ -36,7 +36,7 @@ class Work:
 
 
 class Stopped(KeyboardInterrupt):
-    """Say what is kept of a job that Ctrl-C has stopped; the same call, or the same command, goes on from there.
+    """Say what is kept of a job that Ctrl-C has stopped; the same call, or the same command, continues from there.
 
     Where nothing is `kept`, it begins again.
     """
@@ -89,7 +89,7 @@ class Watch:
 
     @contextmanager
     def progress(self, total: int, what: str = "episodes") -> Iterator[Advance]:
-        """Give a function that takes how many of `total` are done, and in words what to say beside that."""
+        """Give a function that takes how many of `total` are done, and in words what to say next to that."""
         yield lambda done, said="": None
 
     @contextmanager

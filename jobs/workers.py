@@ -74,7 +74,9 @@ def workers(scheduler: str | None, device: str) -> Iterator[Executor | None]:
         except KilledWorker as error:
             from ..landscapes.sampling.distribution import WorkersLostError
 
-            said = "what every worker died of that took it was given up; the rest is kept, and the same command goes on"
+            said = (
+                "what every worker that took it died of was given up; the rest is kept, and the same command continues"
+            )
             raise WorkersLostError(f"{said}: {error}") from error
 
 

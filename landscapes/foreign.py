@@ -250,7 +250,7 @@ def _run_of(x: Values, loss: Values, dataset: xr.Dataset, space: ParameterSpace,
 
 
 def _points_of(frame: pd.DataFrame, space: ParameterSpace, name: str, note: Note = lambda _: None) -> pd.DataFrame:
-    """Return the rows of a table that may hold points: not one of units below the heading, nor trials that go on.
+    """Return the rows of a table that may hold points: not one of units below the heading, nor trials that continue.
 
     Raises ValueError where there is none.
     """

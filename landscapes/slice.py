@@ -131,7 +131,7 @@ class Slice:
         from .verification import RESAMPLE, verify_dataset
 
         if missing := int((self.data["status"] == Status.MISSING).sum()):
-            raise ValueError(f"{missing} samples of this slice are missing; let what samples it go on first")
+            raise ValueError(f"{missing} samples of this slice are missing; let what samples it continue first")
         if self.remake is None or "grad" not in self.data:
             lacking = "the objective it was sampled from" if "grad" in self.data else "gradients"
             raise ValueError(f"a report needs {lacking}, which this slice is without; sample it by gradscape.slice")

@@ -154,7 +154,7 @@ class Optimizer(abc.ABC):
 
     @final
     def state(self) -> dict[str, Any]:
-        """Return all there is to go on from, as data that `optim.runs.store.encode` writes."""
+        """Return all there is to continue from, as data that `optim.runs.store.encode` writes."""
         return {
             "method": self.name,
             "seed": self.seed,
@@ -187,7 +187,7 @@ class Optimizer(abc.ABC):
         """Prepare the first `_ask`."""
 
     def _state(self) -> dict[str, Any]:
-        """Return what the method itself goes on from; `self.random` stands where it did after the last draw."""
+        """Return what the method itself continues from; `self.random` stands where it did after the last draw."""
         return {name: _to_data(value) for name, value in vars(self).items() if name not in COMMON}
 
     def _restore(self, own: Mapping[str, Any]) -> None:

@@ -126,7 +126,7 @@ class Lockstep:
         return [self._results[number] for number in range(len(searches))]
 
     def _advance(self, number: int, answer: Answer | None) -> None:
-        """Let a search go on to its next request, or to its end."""
+        """Let a search continue to its next request, or to its end."""
         began = time.perf_counter()
         try:
             self._asked[number] = self._searches[number].send(answer)  # type: ignore[arg-type] # None starts it

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from ..landscapes.draw.figures.page import Picture
 
 
-MAX_ABREAST = 200  # runs that go on in lockstep: the folder of each is open
+MAX_ABREAST = 200  # runs that advance in lockstep: the folder of each is open
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,11 +53,11 @@ def race(
 ) -> None:
     """Let every competitor search until its run holds `budget` episodes; runs that do already are not touched.
 
-    Runs go on in lockstep: all propose, what they propose is evaluated in one batch, and all are told. So a simulator
+    Runs advance in lockstep: all propose, what they propose is evaluated in one batch, and all are told. So a simulator
     that is quicker at many points at once is used well, and what comes out is what each run gives alone but for the
-    seconds, given an objective whose rows do not depend on their batch. `MAX_ABREAST` runs go on at a time. Methods
+    seconds, given an objective whose rows do not depend on their batch. `MAX_ABREAST` runs advance at a time. Methods
     compute in so many processes, `workers`. `gradient_cost`, what an episode with gradient costs in episodes without,
-    is measured if a run needs it. Stop it at any instant: the same call goes on.
+    is measured if a run needs it. Stop it at any instant: the same call continues.
     """
     left = [one for one in competitors if one.run.count < budget]
     for start in range(0, len(left), MAX_ABREAST):

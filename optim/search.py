@@ -40,8 +40,8 @@ def search(
     """Let a method evaluate `budget` episodes, not one more, and return the run; what it holds already is not repeated.
 
     A method is an optimiser or the name of one, made with the run's seed. Without a run one is made in memory. Stop it
-    at any instant: the same call goes on, and the rows are those of an uninterrupted one but for their `seconds`, given
-    an objective whose rows do not depend on their batch. A proposal that does not fit into the budget is cut short.
+    at any moment: the same call continues. The rows are those of an uninterrupted one but for their `seconds`, given an
+    objective whose rows do not depend on their batch. A proposal that does not fit into the budget is cut short.
     `gradient_cost` is what an episode with gradient costs in episodes without; it is measured if not given.
 
     Raises ValueError for a budget, a method or a gradient cost that cannot be, and StoreError where the run on disk
@@ -92,7 +92,7 @@ def _fill(optimizer: Optimizer | None, run: RunStore, budget: int, report: Calla
     if optimizer is None:
         return
     while run.count < budget:
-        if budget - run.count < largest:  # the next proposal may be cut short, and is proposed again by who goes on
+        if budget - run.count < largest:  # the next proposal may be cut short, and is proposed again by who continues
             run.stage(optimizer.state)
         proposal = yield from optimizer.asking()
         _check(optimizer, len(proposal.x), grad=proposal.grad)
@@ -109,7 +109,7 @@ def _fill(optimizer: Optimizer | None, run: RunStore, budget: int, report: Calla
 
 
 def _begin(objective: Objective, method: Optimizer | str, run: RunStore, gradient_cost: float | None) -> Optimizer:
-    """Return the optimiser that the run goes on with, the one it kept or a new one, and take the run back to it."""
+    """Return the optimiser that the run continues with, the one it kept or a new one, and take the run back to it."""
     state = run.state()
     if state is not None:
         optimizer = _restore_optimizer(objective, method, run, state)
@@ -140,7 +140,7 @@ def _restore_optimizer(
     except Exception as error:  # whatever the method stumbles upon
         raise StoreError(
             f"{run.path} keeps no state of {kind.name} that can be gone on from ({type(error).__name__}: {error}); "
-            "begin the run anew in another folder"
+            "begin the run again in another folder"
         ) from error
 
 

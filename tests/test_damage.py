@@ -15,7 +15,7 @@ def test_a_slice_with_a_damaged_layout_is_begun_anew_by_force(run: Run, tmp_path
     run.ok(CUT)
     for place in ("zarr.json", "loss/zarr.json"):
         (tmp_path / "cut/slice.zarr" / place).write_text("{")
-        run.refuse(CUT, said="restore it, or sample the slice anew in another folder")
+        run.refuse(CUT, said="restore it, or sample the slice again in another folder")
         run.ok(*CUT.split(), "--force")
 
 

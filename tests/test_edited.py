@@ -1,4 +1,4 @@
-"""A simulator that was edited does not go on with what was stored before: it is refused with both numbers."""
+"""A simulator that was edited does not continue with what was stored before: it is refused with both numbers."""
 
 import shutil
 from collections.abc import Callable
@@ -69,8 +69,8 @@ def test_a_finished_slice_of_an_edited_function_is_refused_with_both_numbers(tmp
         gs.slice(loss_of(edited), DIMS, resolution=8, out=tmp_path / "cut")
     assert str(tmp_path / "cut") in str(refused.value)
     assert bits(tmp_path / "cut/slice.zarr") == kept
-    anew = gs.slice(loss_of(edited), DIMS, resolution=8, out=tmp_path / "cut", force=True)
-    assert float(anew.data["loss"].min()) < -90
+    again = gs.slice(loss_of(edited), DIMS, resolution=8, out=tmp_path / "cut", force=True)
+    assert float(again.data["loss"].min()) < -90
 
 
 @pytest.mark.parametrize("refine", [None, 0.01])
@@ -249,7 +249,7 @@ def test_an_overlay_over_a_slice_cut_anew_refuses_an_edited_scene(
     gs.overlay(cut, run, through="best", out=tmp_path / "over")
     monkeypatch.setattr(Throw, "curvature", 3.0)
     with pytest.raises(StoreMismatchError, match="losses are others now"):
-        gs.overlay(cut, run, through="best", out=tmp_path / "anew")
+        gs.overlay(cut, run, through="best", out=tmp_path / "again")
     gs.overlay(cut, run, out=tmp_path / "stored")  # which evaluates nothing
 
 

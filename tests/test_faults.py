@@ -47,7 +47,7 @@ class Disturbed(RuleBasedStateMachine):
 
     @rule(changes=st.integers(0, 80), kills=st.booleans())
     def interrupt(self, changes: int, kills: bool) -> None:
-        """Begin or go on, until the process is killed or the disk is full."""
+        """Begin or continue, until the process is killed or the disk is full."""
         try:
             with FAULTS.after(changes, self.result, kills=kills):
                 done = say(KINDS[self.kind].make, self.folder)

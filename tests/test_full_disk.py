@@ -1,4 +1,4 @@
-"""A disk that is full ends every verb that writes with what is kept, where, and how to go on."""
+"""A disk that is full ends every verb that writes with what is kept, where, and how to continue."""
 
 import errno
 import os

@@ -98,7 +98,7 @@ def test_a_report_is_printed_from_what_it_kept(run: Run, tmp_path: Path, monkeyp
     (tmp_path / "told/gradient-quality.npz").unlink()
     older = run(*command, "--figure-width-mm", "85")
     assert older.returncode == 2
-    assert older.stderr.splitlines()[-1].endswith("delete it to measure it anew")
+    assert older.stderr.splitlines()[-1].endswith("delete it to measure it again")
 
 
 @pytest.mark.parametrize("width", ["40", "wide"])

@@ -1,4 +1,4 @@
-"""Two commands on the same result, started together: one fills it, the other waits and goes on with the rest."""
+"""Two commands on the same result, started together: one fills it, the other waits and continues with the rest."""
 
 import signal
 import subprocess
@@ -86,5 +86,5 @@ def test_what_another_process_fills_is_not_begun_anew(tmp_path: Path, command: s
         forced = begin(f"{command} --force", tmp_path)
         said = forced.communicate()[1]
     assert forced.returncode == 2
-    assert "made is being filled by another process, so it is not begun anew" in said
+    assert "made is being filled by another process, so it is not begun again" in said
     assert said.strip().count("\n") == 0

@@ -40,7 +40,7 @@ class _Call:
 
 @dataclass(frozen=True)
 class _Mark:
-    """Where launches go on, on a stream of a GPU by its number, 0 being the first; or the first waits, if None."""
+    """Where launches continue, on a stream of a GPU by its number, 0 being the first; or the first waits, if None."""
 
     stream: int | None
 

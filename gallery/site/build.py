@@ -3,7 +3,7 @@
 Whatever of `surface.png`, `.html`, `.gltf` and `.glb` lies in a figure's folder beside what `..files` names is shown,
 too. Runs are laid over every slice of their environment and options; trade-offs are shown with every slice of theirs.
 
-`manifest.json` lists all of it for programs. Its `files` are all that the site has: a folder is built anew only where
+`manifest.json` lists all of it for programs. Its `files` are all that the site has: a folder is built again only where
 it holds nothing else.
 """
 
@@ -160,7 +160,7 @@ def _number(value: Any, digits: int = 4) -> str:
 
 
 def _describe_companion(one: Companion, unit: str) -> str:
-    """Say what the losses of a slice beside a page's own range over."""
+    """Say what the losses of a slice next to a page's own range over."""
     if one.lowest is None or one.highest is None:
         return f"through {one.through} all failed"
     return f"through {one.through} from {_number(one.lowest)} to {_number(one.highest)}{unit}"

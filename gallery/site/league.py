@@ -44,7 +44,7 @@ class LeaguePage:
 
     @classmethod
     def of(cls, league: League, paper: Paper, slices: Mapping[str, str]) -> LeaguePage:
-        """Return what is to be said of a league beside the paper."""
+        """Return what is to be said of a league compared with the paper."""
         found = [(scene, paper.claims_about(scene.env)) for scene in league.scenes]
         verdicts = [(scene.env, one, VERDICTS[one.verdict]) for scene, said in found for one in scene.findings(said)]
         return cls(league, verdicts, [(scene.env, said.silence) for scene, said in found if said.silence], slices)

@@ -54,7 +54,7 @@ class Studio:
                 one.result()
 
     def develop(self, source: Path, target: Path, within: Reading = nullcontext) -> None:
-        """Make the dark variant of a picture beside where that goes, within what names the file of a failure."""
+        """Make the dark variant of a picture next to where that goes, within what names the file of a failure."""
         self._begun.append(self._thread.submit(_develop, source, target, within))
 
     def place(self, source: RecordFiles, target: RecordFiles) -> None:

@@ -24,8 +24,8 @@ GRADIENTS = (GOOD, NOISY, OPPOSITE, ZERO, MISSING)
 SHAPES = tuple(word for word in WORDS if word not in GRADIENTS)
 MIN_SHARE = 1 / 3  # of the slices: from this share on a word is said of an environment
 SHOWN_WORDS = 3  # of how smooth an environment is
-REMAKE_CENSUS = "delete it, and `landscape census {} --device {}` measures it anew"
-REMAKE_CARD = "delete it, and `landscape card --out {}` measures it anew"
+REMAKE_CENSUS = "delete it, and `landscape census {} --device {}` measures it again"
+REMAKE_CARD = "delete it, and `landscape card --out {}` measures it again"
 SIZES = {"1-3": "1 to 3", "4-16": "4 to 16", "17-": "17 or more"}  # numbers of parameters, by the name in a link
 
 

@@ -228,7 +228,7 @@ class Sheet:
 
 @dataclass(frozen=True, eq=False)
 class Scale:
-    """Map values to colours; `extend` says at which end of the colour bar values go on beyond it."""
+    """Map values to colours; `extend` says at which end of the colour bar values continue beyond it."""
 
     norm: Normalize
     extend: str
@@ -243,7 +243,7 @@ class Scale:
 
     @classmethod
     def between(cls, low: float, high: float, *, logarithmic: bool = False, extend: str = "neither") -> Scale:
-        """Span a range, of positive values where it is logarithmic; `extend` says where values go on beyond it."""
+        """Span a range, of positive values where it is logarithmic; `extend` says where values continue beyond it."""
         return cls(LogNorm(low, high) if logarithmic else Normalize(low, high), extend)
 
     @classmethod

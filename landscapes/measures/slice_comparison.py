@@ -254,7 +254,7 @@ def check_finished(*slices: xr.Dataset) -> None:
     """Raise ValueError where samples are missing."""
     for name, dataset in zip("AB", slices, strict=False):
         if missing := int((dataset["status"] == Status.MISSING).sum()):
-            raise ValueError(f"{missing} samples of {name} are missing; let what samples it go on first")
+            raise ValueError(f"{missing} samples of {name} are missing; let what samples it continue first")
 
 
 def _name_axes(ours: Plane, theirs: Plane) -> str:

@@ -247,11 +247,11 @@ def _merge(having: Evaluation, lacking: Evaluation, sloped: Tensor, tiling: Tili
 class Batches:
     """The points of tiles that have a gradient, or with `grad` false those that have none, in batches.
 
-    Where all points are of one kind, a batch is whole tiles: `batch` points or more. Otherwise batches go on from tile
-    to tile, so that all are full but the last, however few points of the kind a tile has: they hold `batch` points, or
-    the least multiple of it that the points of any tile fit into.
+    Where all points are of one kind, a batch is whole tiles: `batch` points or more. Otherwise batches span tiles, so
+    that all are full but the last, however few points of the kind a tile has: they hold `batch` points, or the least
+    multiple of it that the points of any tile fit into.
 
-    Batches are the same however many of the tiles are `pending`, so that a run that goes on repeats them; each is
+    Batches are the same however many of the tiles are `pending`, so that a run that continues repeats them; each is
     evaluated at the points of tiles that are.
     """
 

@@ -54,12 +54,12 @@ def sample(
 ) -> xr.Dataset:
     """Evaluate an objective on a plane and return the slice; what `store` holds already is not evaluated again.
 
-    Up to three points of a store on disk are evaluated anew, to see that they are the objective's. Without a store the
+    Up to three points of a store on disk are evaluated again, to see that they are the objective's. Without a store the
     slice lives in memory. Losses are at all samples, gradients at every so many along each axis, `gradients`, 0 for
     none; how far apart they are in a store it says itself. `batch` is the number of points per
     evaluation, rounded up to whole tiles (default: the objective's `preferred_batch`, else one tile); where some
     samples have no gradient, there are batches of those that have one and batches of the others, as `Batches` says.
-    `progress` is called once at the start and after every tile. Stop it at any instant: the same call goes on, and the
+    `progress` is called once at the start and after every tile. Stop it at any moment: the same call continues. The
     result is bit for bit that of an uninterrupted one, given an objective whose rows do not depend on their batch. A
     batch that does not fit into memory is halved.
 
@@ -137,7 +137,7 @@ def resumable(store: SliceStore, counts: Counter[Status]) -> Iterator[None]:
     except OSError as error:
         kept = f"{counts.total()} of {math.prod(store.shape)} points are kept in {store.path or 'memory'}"
         if isinstance(error, WorkersLostError):
-            raise WorkersLostError(f"{error}; {kept}, and the same command goes on from there") from error
+            raise WorkersLostError(f"{error}; {kept}, and the same command continues from there") from error
         if is_full(error):
             raise full(error, kept) from error
         raise

@@ -4,7 +4,7 @@ The coarsest lattice of the quadtree comes first. Then, round after round, the c
 split, and those beside much smaller ones. Where none is left, points are drawn at random to test the interpolation by;
 they are samples as well. The grid is done once at least nineteen of twenty such points are as exact as was asked for,
 and the cells of the others are split. What a round samples follows from the samples before it, so that one that was
-stopped goes on as it would have.
+stopped continues as it would have.
 """
 
 from __future__ import annotations
@@ -143,7 +143,7 @@ def refine(
     refinement.check(plane)
     if store.ascending:
         if store.path is not None and store.pending():
-            raise DamagedError.of(store.path, "samples are lost", "restore it, or begin anew with --force")
+            raise DamagedError.of(store.path, "samples are lost", "restore it, or begin again with --force")
         dataset = store.dataset()
     else:
         batch = max(LEAST_BATCH, objective.preferred_batch)

@@ -51,10 +51,10 @@ Arrays = dict[str, NDArray[Any]]  # loss, status and, unless sampled without gra
 
 
 def need_of(shape: tuple[int, ...], dim: int, *, grad: bool) -> Need:
-    """Return an upper bound of what sampling a slice takes: memory beside what the process holds, and disk.
+    """Return an upper bound of what sampling a slice takes: memory in addition to what the process holds, and disk.
 
     In memory there are four copies of the arrays when it is finished and sorted, and what a picture takes. On the disk
-    there are the files of the tiles, and for a moment the finished slice beside them.
+    there are the files of the tiles, and for a moment the finished slice next to them.
     """
     points, depth = math.prod(shape), dim if grad else 0
     tiles = math.prod(-(-side // tile_side(side)) for side in shape)
@@ -433,7 +433,7 @@ def write_sums(group: zarr.Group, dataset: xr.Dataset) -> None:
     create_array(group, SUMS, tiles, tiles, dims, "int64", long_name=said)[...] = sums
 
 
-ANEW = "restore it, or sample the slice anew in another folder"
+ANEW = "restore it, or sample the slice again in another folder"
 
 
 def check_layouts(path: Path) -> None:

@@ -39,10 +39,10 @@ class Checkpoint:
 
     @classmethod
     def open(cls, folder: Path, identity: Mapping[str, Any], *, what: str, force: bool = False) -> Checkpoint:
-        """Go on with a study of the same settings, or begin one; `force` begins anew where another one is.
+        """Continue a study of the same settings, or begin one; `force` begins again where another one is.
 
         Raises ValueError where the folder holds something else, StoreMismatchError where it holds another study, and
-        StoreError where another process fills the study that is to be begun anew.
+        StoreError where another process fills the study that is to be begun again.
         """
         wanted, path = plain_json({"kind": what, **identity}, f"a {what}'s identity"), folder / SETTINGS
         if not path.exists():
@@ -70,7 +70,7 @@ class Checkpoint:
         the study began with.
         """
         name, x = f"{PROBES}-{of}" if of else PROBES, objective.space.sobol(POINTS, seed=0)
-        path, todo = self._path(name), f"restore it, or begin {self.folder} anew with --force"
+        path, todo = self._path(name), f"restore it, or begin {self.folder} again with --force"
         if not path.exists():
             if any(map(self._is_ours, [of] if of else self.names())):
                 raise DamagedError.of(path, "it is missing, so nothing says what the other pieces are of", todo)

@@ -1,6 +1,6 @@
 """Files and folders that appear whole or not at all.
 
-What is being made lies in a hidden folder beside its place, which its maker holds by a lock as long as it lives. So
+What is being made lies in a hidden folder next to its place, which its maker holds by a lock as long as it lives. So
 what a process that was killed has left is known at once, by anyone and on any clock: nobody holds it.
 """
 
@@ -291,7 +291,7 @@ def check_free(folder: Path) -> None:
     try:
         if not _lock(lock, wait=False):
             raise StoreError(
-                f"{folder} is being filled by another process, so it is not begun anew; wait for it or stop it, or "
+                f"{folder} is being filled by another process, so it is not begun again; wait for it or stop it, or "
                 "write elsewhere with --out"
             )
     finally:
@@ -360,7 +360,7 @@ def is_full(error: BaseException) -> TypeGuard[OSError]:
 
 def full(error: OSError, kept: str) -> DiskFullError:
     """Return the error to raise for a full disk; `kept` says what of the job is."""
-    said = f"the disk is full; {kept}: make room, and the same command goes on from there"
+    said = f"the disk is full; {kept}: make room, and the same command continues from there"
     return DiskFullError(error.errno or errno.ENOSPC, said)
 
 

@@ -88,7 +88,7 @@ def open_bundle(path: Path) -> dict[str, xr.Dataset]:
     import xarray as xr
 
     found: dict[str, dict[str, Any]] = {}
-    with reading(path, "delete its folder to measure it anew"), np.load(path, allow_pickle=False) as arrays:
+    with reading(path, "delete its folder to measure it again"), np.load(path, allow_pickle=False) as arrays:
         for key, values in arrays.items():
             name, variable, dims = key.split("/")
             found.setdefault(name, {})[variable] = (dims.split(",") if dims else [], values)

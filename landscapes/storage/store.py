@@ -81,7 +81,7 @@ T = TypeVar("T")
 
 
 class SliceStore:
-    """Keep a slice on disk tile by tile, so that a run stopped at any instant can go on.
+    """Keep a slice on disk tile by tile, so that a run stopped at any instant can continue.
 
     Make one with `create`, `open`, `open_or_create` or `in_memory`, all by the `path` of the finished slice; `place` is
     where it is now. Two processes may fill the same store: a tile is the same whoever writes it, and each file appears
@@ -175,7 +175,7 @@ class SliceStore:
         provenance: Mapping[str, Any] | None = None,
         grad: bool = True,
     ) -> SliceStore:
-        """Go on with the store at `path`, or make it; a store made by other settings raises `StoreMismatchError`."""
+        """Continue the store at `path`, or make it; a store made by other settings raises `StoreMismatchError`."""
         try:
             return cls.create(path, plane, space, identity=identity, provenance=provenance, grad=grad)
         except StoreExistsError:
@@ -386,7 +386,7 @@ class SliceStore:
         return read() if self._follow_finished() else found
 
     def _follow_finished(self) -> bool:
-        """Go on with the finished slice where another process has finished this one meanwhile, and say whether it has.
+        """Continue the finished slice where another process has finished this one meanwhile, and say whether it has.
 
         Raise StoreError where the store was replaced or removed.
         """

@@ -232,7 +232,7 @@ class TuRBOOptions(MethodOptions):
 
     A region's side is `length` widths of the box at first. It doubles after `successes` batches in a row that improve
     the best loss, and halves after as many in a row that do not as hold a point for each parameter, or four points;
-    where it is shorter than `shortest` the search begins anew. `batch_size` points are drawn at a time, each where a
+    where it is shorter than `shortest` the search begins again. `batch_size` points are drawn at a time, each where a
     sample of the process is least among `candidates` points of the region, 0 for 100 for each parameter and at most
     2000: more cost much and gain little.
     """

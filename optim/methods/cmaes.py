@@ -17,10 +17,10 @@ from ..memory import FLOAT, SearchSize
 from ..options import MethodOptions, number
 
 MATRICES = 8  # of dim x dim, that CMA-ES holds while it is written to disk: C, its eigenvectors, a pickle of both
-POPULATION = 7000  # bytes for each member of a population, beside its numbers (measured with pycma 4)
+POPULATION = 7000  # bytes for each member of a population, in addition to its numbers (measured with pycma 4)
 
 OTHERS = (
-    "cma-es goes on with the points and losses that the run holds; cma or its linear algebra draws others here than "
+    "cma-es continues with the points and losses that the run holds; cma or its linear algebra draws others here than "
     "where the run began, so that it ends in other points than it would have there"
 )
 

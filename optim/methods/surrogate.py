@@ -147,7 +147,7 @@ class SurrogateOptions(MethodOptions):
     Matern-5/2, with a length-scale per parameter. Points are drawn at random until `initial` of them are known: fewer
     say nothing about length-scales, and the search would settle on what they suggest. `max_points` points are
     modelled at most: of more, those with the least losses for one half and as many of the others, spread evenly over
-    the run, chosen anew whenever the process is full or its length-scales are fitted.
+    the run, chosen again whenever the process is full or its length-scales are fitted.
     """
 
     method = "bo"
@@ -170,7 +170,7 @@ class Surrogate(Part):
     low losses everywhere to a search that has seen none below a hundred. Hyper-parameters (length-scales and noise)
     maximise the marginal likelihood times BoTorch's priors, which scale with the dimension (Hvarfner et al. 2024): with
     fewer points than dimensions the likelihood alone would decide nothing. They are fitted to at most 300 points,
-    evenly spread over the run, and anew whenever the data have grown by a tenth; the process itself holds all points.
+    evenly spread over the run, and again whenever the data have grown by a tenth; the process itself holds all points.
     """
 
     def __init__(self, dim: int, options: SurrogateOptions) -> None:
@@ -208,7 +208,7 @@ class Surrogate(Part):
             return Process(self._covariance(), float(self._hyper["noise"][0]), u, values, len(self._chosen))
 
     def _learn(self) -> Rows:
-        """Fit hyper-parameters and choose points anew if that is due, and return which points are modelled."""
+        """Fit hyper-parameters and choose points again if that is due, and return which points are modelled."""
         count = len(self.loss)
         due = self._fitted == 0 or count >= GROWTH * self._fitted
         if due:

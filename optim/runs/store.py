@@ -82,7 +82,7 @@ COLUMNS: dict[str, tuple[str, dict[str, Any]]] = {  # status last: a row that ha
 Columns = dict[str, NDArray[Any]]
 FILES = store_files((*COLUMNS, "dim"), STATE)  # of a run on disk
 PAUSE = 1.0  # least seconds between two writes, so that quick episodes are not held up
-SHARE = 0.05  # most of the time that may go into writing, that of all runs that go on abreast
+SHARE = 0.05  # most of the time that may go into writing, that of all runs that continue abreast
 
 
 def encode(state: Any) -> bytes:
@@ -159,7 +159,7 @@ class Journal:
 
 def damage_error(path: Path, why: str) -> StoreError:
     """Return the error that says of a run, or of a file in it, that it is not what was written."""
-    return StoreError(f"{path} is damaged: {why}; restore it, or begin the run anew in another folder")
+    return StoreError(f"{path} is damaged: {why}; restore it, or begin the run again in another folder")
 
 
 def digest_of(attributes: Mapping[str, Any]) -> str:
@@ -282,7 +282,7 @@ class RunStore:
         self._written = 0  # rows known to be on disk
         self._saved_at = time.monotonic()
         self._next_save = PAUSE  # seconds after that
-        self.abreast = 1  # runs that are filled beside each other, this one included
+        self.abreast = 1  # runs that are filled next to each other, this one included
         if path:
             self._inode = path.stat().st_ino
             self._load(path)
@@ -339,7 +339,7 @@ class RunStore:
         provenance: Mapping[str, Any] | None = None,
         budget: int,
     ) -> RunStore:
-        """Go on with the run at `path`, or make it; a run made by other settings raises `StoreMismatchError`."""
+        """Continue the run at `path`, or make it; a run made by other settings raises `StoreMismatchError`."""
         with contextlib.suppress(StoreExistsError):
             return cls.create(path, space, identity=identity, provenance=provenance, budget=budget)
         run = cls.open(path)

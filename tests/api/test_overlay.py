@@ -209,7 +209,7 @@ def test_capitals_tell_parameters_apart_where_both_are_there(cut: gs.Slice) -> N
 
 
 def experiment_of_ax(names: tuple[str, ...], *, minimize: bool = True) -> Any:
-    """What Ax 1.3.1 has of an experiment of five trials: one is measured twice, one failed and one goes on."""
+    """What Ax 1.3.1 has of an experiment of five trials: one is measured twice, one failed and one continues."""
     ends = ("COMPLETED", "COMPLETED", "FAILED", "COMPLETED", "RUNNING")
     points = gs.make("branin").space.uniform(len(ends), seed=3).tolist()
     arms = [Named(name=f"{n}_0", parameters=dict(zip(names, x, strict=True))) for n, x in enumerate(points)]

@@ -1,4 +1,4 @@
-"""`landscape compare`: what it leaves, samples, goes on with, and refuses."""
+"""`landscape compare`: what it leaves, samples, continues with, and refuses."""
 
 import json
 import shutil

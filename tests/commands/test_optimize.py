@@ -61,8 +61,8 @@ def test_same_command_computes_nothing_twice_a_larger_budget_goes_on_and_force_b
     more = run.json(*QUICK, "--budget", "80")
     assert (more["folder"], more["budget"]) == (first["folder"], 80)
     assert more["episodes"] + more["resumed"] == 80
-    anew = run.json(*QUICK, "--force")
-    assert (anew["episodes"], anew["resumed"], anew["best"]) == (50, 0, first["best"])
+    again = run.json(*QUICK, "--force")
+    assert (again["episodes"], again["resumed"], again["best"]) == (50, 0, first["best"])
 
 
 def test_another_run_is_not_overwritten(run: Run, tmp_path: Path) -> None:

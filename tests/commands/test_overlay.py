@@ -1,4 +1,4 @@
-"""`landscape overlay`: what it leaves, cuts anew, and refuses."""
+"""`landscape overlay`: what it leaves, cuts again, and refuses."""
 
 import shutil
 from pathlib import Path

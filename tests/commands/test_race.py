@@ -46,8 +46,8 @@ def test_more_seeds_methods_and_episodes_go_on_where_the_race_ended(run: Run, tm
     both = [next(rank for rank in said.json["ranks"] if rank["method"] == "random") for said in (less, more)]
     assert both[0]["final"][0] >= both[1]["final"][0]
     assert both[0]["forwards"] == 20
-    anew = run("race branin --methods random --budget 20 --seeds 2 --force")
-    assert "40 episodes to compute:" in anew.stderr
+    again = run("race branin --methods random --budget 20 --seeds 2 --force")
+    assert "40 episodes to compute:" in again.stderr
 
 
 def test_race_prints_ranks_and_what_the_paper_claims(run: Run) -> None:

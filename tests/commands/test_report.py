@@ -1,4 +1,4 @@
-"""`landscape report`: what it prints, leaves, refuses and goes on from."""
+"""`landscape report`: what it prints, leaves, refuses and continues from."""
 
 import json
 import re

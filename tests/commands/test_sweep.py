@@ -1,4 +1,4 @@
-"""`landscape sweep`: what it leaves, goes on from, and refuses."""
+"""`landscape sweep`: what it leaves, continues from, and refuses."""
 
 import json
 import shutil

@@ -1,4 +1,4 @@
-"""The gallery's league: what is kept of its races, in how little room, and how it goes on."""
+"""The gallery's league: what is kept of its races, in how little room, and how it continues."""
 
 import json
 from pathlib import Path
@@ -67,7 +67,7 @@ def test_a_scene_is_raced_once_for_all_its_figures_and_kept(small: Path, capsys:
     assert {path.name for path in (small / "league").iterdir()} == {
         "branin.json", "branin.npz", "branin.png", "branin-dark.png"
     }  # fmt: skip
-    assert compute(small) == 0  # and goes on with the scene that is left
+    assert compute(small) == 0  # and continues with the scene that is left
     assert "league: 2 of 3 are there already" in capsys.readouterr().err
     league = read_league(small)
     assert league is not None

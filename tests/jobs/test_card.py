@@ -1,4 +1,4 @@
-"""The report card as a study: who is in it, what it leaves, how it goes on."""
+"""The report card as a study: who is in it, what it leaves, how it continues."""
 
 import json
 from pathlib import Path

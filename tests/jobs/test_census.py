@@ -1,4 +1,4 @@
-"""`landscape census` and `gs.census`: what they leave, go on from, and refuse."""
+"""`landscape census` and `gs.census`: what they leave, continue from, and refuse."""
 
 import json
 from collections.abc import Callable

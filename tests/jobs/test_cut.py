@@ -1,4 +1,4 @@
-"""Slices along directions that are named: what they cover, that they go on, what is said of others."""
+"""Slices along directions that are named: what they cover, that they continue, what is said of others."""
 
 import json
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""A league: races in many scenes that are stopped, go on and fail by themselves, and what they say together."""
+"""A league: races in many scenes that are stopped, continue and fail by themselves, and what they say together."""
 
 import json
 from pathlib import Path

@@ -40,7 +40,7 @@ def planted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 )
 def test_no_file_that_a_result_names_is_run(read: Callable[[], object], planted: Path) -> None:
     assert json.loads(open_slice(Path("slice")).attrs["identity"])["objective"] == "evil.py:Evil"
-    with pytest.raises(ValueError, match="is not registered here, and evaluating it anew needs it"):
+    with pytest.raises(ValueError, match="is not registered here, and evaluating it again needs it"):
         read()
     assert not (planted / "evil.ran").exists()
 

@@ -1,4 +1,4 @@
-"""Identity: results of other releases go on, of whatever time; those of another model are refused by both versions."""
+"""Identity: results of any other release continue; those of another model are refused, and both versions named."""
 
 import json
 from pathlib import Path

@@ -151,7 +151,7 @@ def test_a_missing_row_is_damage_not_data(tmp_path: Path) -> None:
     (tmp_path / "run.zarr/status/c/1").unlink()
     with pytest.raises(
         StoreError,
-        match=f"rows {CHUNK + 1} to {2 * CHUNK} are not what was written; .* begin the run anew",
+        match=f"rows {CHUNK + 1} to {2 * CHUNK} are not what was written; .* begin the run again",
     ):
         RunStore.open(tmp_path / "run.zarr")
 
@@ -305,7 +305,7 @@ def test_a_file_of_somebody_elses_in_a_run_is_not_lost_by_force(tmp_path: Path) 
     assert (path / "x/thesis.txt").read_text() == "precious"
     (path / "x/thesis.txt").unlink()
     (path / "zarr.json").write_text("{")
-    with pytest.raises(StoreError, match=r"run\.zarr/zarr\.json is damaged: .*begin the run anew in another"):
+    with pytest.raises(StoreError, match=r"run\.zarr/zarr\.json is damaged: .*begin the run again in another"):
         RunStore.open(path)
     assert RunStore.create(path, SPACE, identity={}, budget=3, overwrite=True).budget == 3
 

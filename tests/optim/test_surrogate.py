@@ -63,7 +63,7 @@ def test_the_process_is_the_posterior_of_a_zero_mean_with_squared_exponential_co
 
 
 def going_on(surrogate: Surrogate, first: int) -> Process:
-    """Return the process of a surrogate as one that goes on from the factor of its first points."""
+    """Return the process of a surrogate as one that continues from the factor of its first points."""
     return replace(surrogate.process(), first=first)
 
 
@@ -268,5 +268,5 @@ def test_a_full_process_makes_room_and_keeps_every_point_that_comes_until_it_is_
         assert len(known) <= 44
         assert torch.equal(known[-1], torch.from_numpy(z[0] + 1.0) / 2.0)
         fits.append(len(surrogate._chosen))
-    assert len(set(fits)) > 1  # it was chosen anew
+    assert len(set(fits)) > 1  # it was chosen again
     assert len(set(fits)) < 8  # and not for every point

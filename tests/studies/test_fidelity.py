@@ -1,4 +1,4 @@
-"""`landscape study fidelity` and `--tolerance`: what they leave, say, go on from and refuse."""
+"""`landscape study fidelity` and `--tolerance`: what they leave, say, continue from and refuse."""
 
 import json
 import weakref

@@ -358,7 +358,7 @@ def rolling(name: str) -> Rolling:
 
     @wp.func(module=module)
     def rate(data: Data, mode: real, turn: Turn) -> Turn:
-        """Return what changes; past lift-off, which ends this motion, friction goes on smoothly below 0."""
+        """Return what changes; past lift-off, which ends this motion, friction continues smoothly below 0."""
         along = -data.gravity * wp.cos(turn.phi)
         push = rub(data, mode, along, press(data, turn))
         found = Turn()

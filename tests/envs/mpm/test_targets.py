@@ -100,4 +100,4 @@ def test_a_target_is_made_once_and_again_when_its_content_changes(tmp_path, monk
     assert made == [0]
     assert not np.array_equal(load_or_make("clay", "two", make), first)
     next(path for path in tmp_path.rglob("*.npy") if np.array_equal(np.load(path), first)).write_bytes(b"torn")
-    assert np.array_equal(load_or_make("clay", "one", make), np.full((3, 3), 3.0))  # unreadable: made anew
+    assert np.array_equal(load_or_make("clay", "one", make), np.full((3, 3), 3.0))  # unreadable: made again

@@ -63,9 +63,9 @@ def refusal(data: Path, out: Path) -> str:
 def maker(file: Path) -> str:
     """Return the command that makes a file again: a study of a scene is none of the gallery's parts."""
     if file.name == "card.json":
-        return f"card --out {file.parent}` measures it anew"
+        return f"card --out {file.parent}` measures it again"
     if file.parent.name == "census":
-        return f"census {file.stem.removesuffix('-cuda')} --device cuda` measures it anew"
+        return f"census {file.stem.removesuffix('-cuda')} --device cuda` measures it again"
     scene, _, study = file.stem.partition("-cuda.")
     return f"study {study} {scene}` measures it again" if study else "gallery compute --part "
 

@@ -179,7 +179,7 @@ def test_workers_that_are_gone_end_it_with_what_is_kept(tmp_path):
                 future.cancel()
                 future.set_running_or_notify_cancel()
 
-    said = r"the workers are gone.*; \d+ of 288 points are kept in .*s\.zarr.*goes on"
+    said = r"the workers are gone.*; \d+ of 288 points are kept in .*s\.zarr.*continues"
     with pytest.raises(WorkersLostError, match=said):
         sample(from_torch(wave, SPACE), PLANE, store, batch=32, executor=slow, progress=lose)
 
@@ -208,7 +208,7 @@ def test_workers_that_never_come_back_are_given_up(tmp_path, clock, monkeypatch)
 
     monkeypatch.setattr(spread, "wait", wait)
     store = store_at(tmp_path / "s.zarr")
-    with pytest.raises(WorkersLostError, match=r"none was there for 60 s.*0 of .* the same command goes on"):
+    with pytest.raises(WorkersLostError, match=r"none was there for 60 s.*0 of .* the same command continues"):
         sample(from_torch(wave, SPACE), PLANE, store, executor=Deserted())
     assert spread.WITHOUT_WORKERS < clock.now <= spread.WITHOUT_WORKERS + spread.POLL
 

@@ -165,7 +165,7 @@ def test_a_damaged_axis_is_said_with_what_to_do(tmp_path):
     sample(from_torch(wave, SPACE), PLANE, store_at(path))
     (file,) = (path / "u" / "c").iterdir()
     file.write_bytes(b"")
-    with pytest.raises(StoreError, match=r"s\.zarr/u is damaged .*restore it, or sample the slice anew"):
+    with pytest.raises(StoreError, match=r"s\.zarr/u is damaged .*restore it, or sample the slice again"):
         store_at(path)
 
 
@@ -180,7 +180,7 @@ def test_a_full_disk_ends_it_with_what_is_kept_and_the_slice_goes_on(tmp_path, w
         replace(source, target)
 
     monkeypatch.setattr(os, "replace", full)
-    said = r"the disk is full; 80 of 288 points are kept in .*s\.zarr: make room, and the same command goes on"
+    said = r"the disk is full; 80 of 288 points are kept in .*s\.zarr: make room, and the same command continues"
     with pytest.raises(OSError, match=said) as ended:
         sample(from_torch(wave, SPACE), PLANE, store)
     assert ended.value.errno == code

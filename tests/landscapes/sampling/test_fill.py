@@ -79,7 +79,7 @@ def test_interruptions_change_no_bit_and_cost_no_finished_tile(tmp_path_factory,
     resumed = sample(last, PLANE, store_at(path), batch=batch)
     asked += last.asked
     assert len(set(asked)) == 18 * 16
-    assert len(asked) <= 18 * 16 + POINTS * len(stops)  # those that are verified where it goes on
+    assert len(asked) <= 18 * 16 + POINTS * len(stops)  # those that are verified where it continues
     assert same(resumed, sample(Wave(), PLANE, batch=batch))
 
 

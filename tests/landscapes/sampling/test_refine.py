@@ -1,4 +1,4 @@
-"""Refined slices: where they are sampled, that they go on, and that nothing interpolated is taken for a sample."""
+"""Refined slices: where they are sampled, that they continue, and that nothing interpolated is taken for a sample."""
 
 import math
 from collections.abc import Callable, Iterator

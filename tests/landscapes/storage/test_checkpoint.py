@@ -1,4 +1,4 @@
-"""The checkpoint of a study: its parts say which study they are of, and are verified before it goes on."""
+"""The checkpoint of a study: its parts say which study they are of, and are verified before it continues."""
 
 import shutil
 from pathlib import Path
@@ -52,7 +52,7 @@ def test_parts_of_an_earlier_version_that_do_not_say_are_computed_again(tmp_path
     np.savez(tmp_path / "pieces/one.npz", piece=np.array("one"), loss=np.zeros(3))
     with pytest.warns(RuntimeWarning, match="of an earlier version"):
         assert study(tmp_path).load("one") is None
-    study(tmp_path).verify(BOWL)  # it begins anew
+    study(tmp_path).verify(BOWL)  # it begins again
     study(tmp_path).verify(BOWL)
 
 

@@ -88,7 +88,7 @@ def test_a_slice_without_its_root_can_be_begun_anew_as_its_refusal_says(
     place = made(tmp_path / "slice.zarr")
     root = place / ("zarr.json" if made is finished else "slice.json")
     root.unlink() if damage is None else root.write_text(damage)
-    with pytest.raises(StoreError, match=rf"{root.name} is damaged .*; restore it, or sample the slice anew"):
+    with pytest.raises(StoreError, match=rf"{root.name} is damaged .*; restore it, or sample the slice again"):
         SliceStore.open(tmp_path / "slice.zarr")
     assert make(tmp_path / "slice.zarr", overwrite=True).pending()
 

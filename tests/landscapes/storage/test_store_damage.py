@@ -155,7 +155,7 @@ def test_plain_json_is_asked_for():
 
 
 def test_a_creation_that_is_killed_leaves_nothing_in_the_way(tmp_path):
-    """Kill the making of a store at ever later instants; whatever is left, the same call goes on from it."""
+    """Kill the making of a store at ever later instants; whatever is left, the same call continues from it."""
     left = []
     for instant in range(1, alone(partial(make, tmp_path / "whole.zarr"), tmp_path).changes + 1):
         path = tmp_path / str(instant) / "s.zarr"

@@ -27,7 +27,7 @@ def test_an_episode_is_one_launch_there_and_one_back(monkeypatch):
 
 
 def test_rows_that_need_more_room_than_was_made_end_as_they_do_where_there_is_enough():
-    """Of two balls one jams between two faces and goes on from where room ended, as often as that takes."""
+    """Of two balls one jams between two faces and continues from where room ended, as often as that takes."""
     board = replace(BOARD, pivots=((3.45, 5.0), (4.55, 5.0)), half_length=0.6)
     angle, start = vectors((-0.8, 0.8), (0.3, -0.2)), vectors((4.0, 6.0), (1.0, 6.0))
     roomy, cramped = (solver(board, dt=1 / 60, duration=6.0, rows=2) for _ in range(2))
