@@ -164,8 +164,9 @@ def test_stopping_cancels_what_is_queued_and_the_slice_goes_on(tmp_path, alone):
 
     with pytest.raises(KeyboardInterrupt):
         sample(from_torch(wave, SPACE), PLANE, store, batch=32, executor=slow, progress=interrupt)
-    assert len(slow.futures) > 5
-    assert all(future.cancelled() for future in slow.futures[1:])
+    first, queued = slow.futures  # no more are handed out ahead
+    assert first.done()
+    assert queued.cancelled()
     sample(from_torch(wave, SPACE), PLANE, store)
     assert same(store, alone)
 
