@@ -91,20 +91,24 @@ def _check_numbers(function: Callable[..., object], given: tuple[object, ...], n
     """Raise ValueError for a number that is outside the limits in the function's signature, or that is not whole."""
     slots = signature(function).parameters
     for name, value in (dict(zip(slots, given, strict=False)) | named).items():
-        if name not in slots or isinstance(value, bool) or not isinstance(value, int | float):
-            continue
-        hint = hint_of(function, slots[name].annotation)
-        kinds = get_args(getattr(hint, "__origin__", hint)) or (getattr(hint, "__origin__", hint),)
-        if int in kinds and isinstance(value, float) and not value.is_integer():
-            raise ValueError(f"{function.__name__} takes a whole number as {name}; got {value}")
-        marks = (one for one in getattr(hint, "__metadata__", ()) if isinstance(one, Parameter))
-        checks = (check for mark in marks for check in cast("tuple[object, ...]", mark.validator))
-        for limit in (check for check in checks if isinstance(check, Number)):
+        if name in slots and isinstance(value, int | float) and not isinstance(value, bool):
+            wanted = _wanted(name, value, hint_of(function, slots[name].annotation))
+            if wanted:
+                raise ValueError(f"{function.__name__} takes {wanted}; got {value}")
+
+
+def _wanted(name: str, value: float, hint: Any) -> str:
+    """Say what number a parameter takes by its type and the limits that stand with it, empty where `value` is one."""
+    kind, *marks = get_args(hint) if hasattr(hint, "__metadata__") else (hint,)
+    if int in (kind, *get_args(kind)) and isinstance(value, float) and not value.is_integer():
+        return f"a whole number as {name}"
+    for mark in (one for one in marks if isinstance(one, Parameter)):
+        for limit in (one for one in cast("tuple[object, ...]", mark.validator) if isinstance(one, Number)):
             try:
                 limit(type(value), value)
             except ValueError as error:
-                said = str(error).removeprefix("Must be ").rstrip(".")
-                raise ValueError(f"{function.__name__} takes {name} {said}; got {value}") from None
+                return f"{name} {str(error).removeprefix('Must be ').rstrip('.')}"
+    return ""
 
 
 def _written(value: object) -> str:

@@ -127,7 +127,8 @@ def _subjects(
 
 def _is_finished(folder: Path) -> bool:
     from ..jobs.folder import SLICE_STORE
-    from ..landscapes.storage.paths import is_slice
+    from ..landscapes.storage.paths import is_finished, is_slice
     from ..landscapes.storage.store import SliceStore
 
-    return is_slice(folder / SLICE_STORE) and not SliceStore.open(folder / SLICE_STORE).pending()
+    store = folder / SLICE_STORE
+    return is_finished(store) and is_slice(store) and not SliceStore.open(store).pending()

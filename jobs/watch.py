@@ -13,7 +13,7 @@ from ..landscapes.storage.files import until_full
 if TYPE_CHECKING:
     from ..landscapes.objective import Objective
 
-Advance = Callable[..., None]  # advance(done, said=""): so much is done, and what is said next to the bar
+Advance = Callable[..., None]  # advance(done, said=""): how much is done, and the text next to the bar
 AdvanceOne = Callable[[str, int, str], None]  # advance(name, done, said): the same, of one of several
 Say = Callable[[str], None]  # say(text): what is being done now
 

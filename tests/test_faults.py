@@ -81,22 +81,17 @@ class Disturbed(RuleBasedStateMachine):
 
     @rule()
     def finish(self) -> None:
-        """Let the command end; where it refuses what is there, `--force` or an empty folder makes it whole.
-
-        Where a file that it replaces has become a folder, `--force` refuses that, too.
-        """
+        """Let the command end; where it refuses what is there, `--force` or an empty folder makes the whole result."""
         command = KINDS[self.kind].make
         done = say(command, self.folder)
         self.judge(command, done, self.folder, complete=True)
-        if done.returncode and "--force" in done.stderr:
-            done = say(f"{command} --force", self.folder)
-            assert done.returncode == 0 or "is a directory" in done.stderr, done.stderr
-            self.judge(f"{command} --force", done, self.folder, complete=True)
         if done.returncode:
-            shutil.rmtree(self.result)
-            done = say(command, self.folder)
+            if "--force" not in done.stderr:
+                shutil.rmtree(self.result)
+            forced = f"{command} --force" if "--force" in done.stderr else command
+            done = say(forced, self.folder)
             assert done.returncode == 0, done.stderr
-            self.judge(command, done, self.folder, complete=True)
+            self.judge(forced, done, self.folder, complete=True)
 
     def judge(self, command: str, done: Said, folder: Path, *, complete: bool) -> None:
         """Hold what a command left and said against the undisturbed."""

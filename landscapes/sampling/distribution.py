@@ -150,8 +150,10 @@ def workers_of(executor: Executor) -> int:
 def _workers_there(executor: Executor) -> int:
     """Return how many batches an executor works on now, 0 where no worker is left."""
     client = getattr(executor, "_client", None)  # Dask's
+    if client is None:
+        return int(getattr(executor, "_max_workers", 1))
     try:
-        return int(getattr(executor, "_max_workers", 1)) if client is None else sum(client.nthreads().values())
+        return sum(client.nthreads().values()) if client.status == "running" else 0  # else it waits for an answer
     except OSError:  # nobody is there to answer
         return 0
 
@@ -179,7 +181,8 @@ def run_tasks(executor: Executor, work: Callable[..., T], tasks: Iterable[Sequen
     Raises WorkersLostError where nobody is left to do them, and what a task raises.
     """
     left, pending = iter(tasks), set[Future[T]]()
-    count, seen = workers_of(executor), time.monotonic()
+    count, there = workers_of(executor), True
+    asked = seen = time.monotonic()
     try:
         while True:
             for task in islice(left, max(0, AHEAD * count - len(pending))):
@@ -187,8 +190,9 @@ def run_tasks(executor: Executor, work: Callable[..., T], tasks: Iterable[Sequen
             if not pending:
                 return
             done, pending = wait(pending, timeout=POLL, return_when=FIRST_COMPLETED)
-            if there := _workers_there(executor):
-                count = there
+            if time.monotonic() - asked >= POLL:
+                found, asked = _workers_there(executor), time.monotonic()
+                count, there = found or count, found > 0
             alive = bool(done or there)
             while done:  # held no longer than needed: Dask computes again what was lost with a worker and is held
                 yield done.pop().result()

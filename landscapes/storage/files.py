@@ -45,10 +45,15 @@ def make_folder(folder: Path) -> None:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Give a path of its own to write to, and put what was written in the place of `path` at the end."""
+    """Give a path of its own to write to, and put what was written in the place of `path` at the end.
+
+    An empty folder there, which a damaged disk may leave instead of a file, is replaced; one with files is not.
+    """
     with _hidden_folder(path) as folder:
         partial = folder / f"{path.name}.partial"
         yield partial
+        if path.is_dir() and not path.is_symlink():
+            path.rmdir()
         os.replace(partial, path)
 
 

@@ -31,9 +31,14 @@ def slice_exists(path: Path) -> bool:
     return place_of(path).exists()
 
 
+def slice_path(path: Path) -> Path:
+    """Return the path of a slice once it is finished, given that or the folder that `landscape slice` left it in."""
+    return path / SLICE if slice_exists(path / SLICE) else finished_path(path)
+
+
 def is_finished(path: Path) -> bool:
-    """Say whether a slice, given by its place or by its folder, is finished, and not a file for each of its tiles."""
-    return any((place / "zarr.json").exists() for place in (path, path / SLICE))
+    """Say whether a slice, given by its path or by its folder, is finished, and not a file for each of its tiles."""
+    return slice_path(path).exists()
 
 
 def refuse_missing(path: str | Path, what: str) -> None:

@@ -66,14 +66,13 @@ from .arrays import (
 from .checkpoint import Checkpoint
 from .files import placing, remove, resolve
 from .paths import (
-    SLICE,
     check_replaceable,
     filling_path,
     finished_path,
     has_lost_root,
     is_slice,
     place_of,
-    slice_exists,
+    slice_path,
 )
 from .records import read_json, reading, write_record
 
@@ -414,8 +413,7 @@ def open_slice(path: str | Path) -> xr.Dataset:
 
     Raises StoreError where there is no slice, DamagedError where it is not what was written.
     """
-    path = Path(path)
-    return SliceStore.open(path / SLICE if slice_exists(path / SLICE) else path).dataset()
+    return SliceStore.open(slice_path(Path(path))).dataset()
 
 
 def _header(

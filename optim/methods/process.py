@@ -30,7 +30,7 @@ Pull = Callable[[Matrix], Tensor]
 PointsTensor = Float[Tensor, "point dim"]
 Model = TypeVar("Model", bound=ExactGP)
 
-KEPT = 64  # factors; fewer than the searches that continue abreast would be lost before they are asked for again
+KEPT = 64  # factors; with fewer than there are searches in lockstep, each would be lost before its next use
 GROWTH = 1.1  # hyper-parameters are fitted again when there are this many times more points than at the last fit
 FIT_STEPS = 30  # of L-BFGS, from where the last fit ended
 _factors: OrderedDict[tuple[Any, ...], Factor] = OrderedDict()  # by covariance, noise and the bytes of its first points

@@ -82,7 +82,7 @@ COLUMNS: dict[str, tuple[str, dict[str, Any]]] = {  # status last: a row that ha
 Columns = dict[str, NDArray[Any]]
 FILES = store_files((*COLUMNS, "dim"), STATE)  # of a run on disk
 PAUSE = 1.0  # least seconds between two writes, so that quick episodes are not held up
-SHARE = 0.05  # most of the time that may go into writing, that of all runs that continue abreast
+SHARE = 0.05  # most of the time that may go into writing, summed over all runs in lockstep
 
 
 def encode(state: Any) -> bytes:
@@ -282,7 +282,7 @@ class RunStore:
         self._written = 0  # rows known to be on disk
         self._saved_at = time.monotonic()
         self._next_save = PAUSE  # seconds after that
-        self.abreast = 1  # runs that are filled next to each other, this one included
+        self.abreast = 1  # number of runs that advance in lockstep, this one included
         if path:
             self._inode = path.stat().st_ino
             self._load(path)

@@ -1,4 +1,4 @@
-"""Slices along directions that are named: what they cover, that they continue, what is said of others."""
+"""Slices along named directions: what they cover, that they continue, and how other names are refused."""
 
 import json
 from pathlib import Path

@@ -154,7 +154,7 @@ def smoothed_struct(name: str) -> Any:
 
     @partial(wp.struct, module=f"gradscape.smoothed.{name}")
     class Smoothed:
-        """`volume` and `x` are those of all particles, of which the body's begin at `first`; J and J' are its own."""
+        """`volume` and `x` cover all particles; those of the body begin at `first`. J and J' cover the body alone."""
 
         first: int
         slope: real

@@ -243,7 +243,7 @@ def _views(
     panel: rrb.TimePanel,
     ranges: rrb.VisibleTimeRange | None = None,
 ) -> rrb.Blueprint:
-    """Return the scene on the left, curves and what is said of all on the right."""
+    """Return the layout: the scene on the left, curves and a description of all runs on the right."""
     space = rrb.Spatial3DView(
         name=page.title(dataset), origin="landscape", time_ranges=ranges, eye_controls=scene.eye, line_grid=False
     )

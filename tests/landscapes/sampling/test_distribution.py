@@ -189,7 +189,7 @@ class Deserted(Executor):
     """Like Dask's, with a scheduler that answers and no worker."""
 
     class _client:  # noqa: N801 -- Dask's name for it
-        nthreads = staticmethod(dict)
+        status, nthreads = "running", staticmethod(dict)
 
     def submit(self, fn, /, *args, **kwargs):
         return Future()

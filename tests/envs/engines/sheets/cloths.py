@@ -26,7 +26,7 @@ def crumpled(cells, pitch, shift, **more):
 def drive(sheet, steps, *, turn=1.0):
     """Return random velocities, stiffness of every vertex and poses, and a random adjoint of the last positions.
 
-    Poses tilt `turn` times as far as they move.
+    A pose's tilt is `turn` times its displacement.
     """
     rng = torch.Generator().manual_seed(1)
 
