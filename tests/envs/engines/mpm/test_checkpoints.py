@@ -213,8 +213,8 @@ def test_a_control_step_that_needs_more_nodes_is_launched_anew_and_no_other(colu
         solver.margins[1] += 2
     again, slopes = solver.run(paths), solver.gradient(adj_x)
     assert solver.tapes[1].bytes > room
-    again = {key for key, sequence in solver.launches.sequences.items() if before.get(key) is not sequence}
-    assert {key[:2] for key in again} == {("forward", 1), ("backward", 1)}
+    recorded = {key for key, sequence in solver.launches.sequences.items() if before.get(key) is not sequence}
+    assert {key[:2] for key in recorded} == {("forward", 1), ("backward", 1)}
     assert torch.equal(again, end)
     assert torch.equal(slopes, gradient)
 
