@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from ..jobs.check import CheckReport
-    from ..landscapes.conformance.finding import Finding
+    from ..landscapes.checks.finding import Finding
 
 STYLES = {
     "pass": "green",

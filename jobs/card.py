@@ -15,7 +15,7 @@ import torch
 from ..envs.engines import installed_version
 from ..envs.registry import EXTRAS, entries, environment_class, installs
 from ..landscapes.capacity import require
-from ..landscapes.conformance.finding import FAIL, UNEXPECTED
+from ..landscapes.checks.finding import FAIL, UNEXPECTED
 from ..landscapes.identity import PACKAGE
 from ..landscapes.measures.card import Card, CardSlice, Grade, Outcome, count_outcomes, first_finding
 from ..landscapes.storage.arrays import need_of

@@ -9,7 +9,7 @@ from functools import cache, cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 from ..landscapes.capacity import Need, require
-from ..landscapes.conformance.finding import Finding
+from ..landscapes.checks.finding import Finding
 from ..landscapes.cost import duration, episode_cost
 from ..landscapes.plain import jsonable
 from .scene import SceneSpec
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from ..envs.base import Environment
-    from ..landscapes.conformance.extremes import ExtremeCase
+    from ..landscapes.checks.extremes import ExtremeCase
 
 FACTORS = (1, 2, 4, 8)  # of the fidelity's time step, and of the scene's horizon
 GROWTH = (1, 2, 4)  # of the horizon: how long gradients are held against the rise of the loss
@@ -31,7 +31,7 @@ MODES = ("forward", "reverse")  # of automatic differentiation
 
 def _materials(job: CheckJob) -> list[ExtremeCase]:
     """Return the softest and the stiffest of what a scene is made of, by its options or its parameters."""
-    from ..landscapes.conformance.extremes import ExtremeCase
+    from ..landscapes.checks.extremes import ExtremeCase
 
     if (ends := job.env.material_range) is not None:
         values = (ends.softest, ends.stiffest)
@@ -151,7 +151,7 @@ class CheckJob:
         )
 
     def _run(self, follow: Callable[[str], None]) -> Iterator[Finding]:
-        from ..landscapes.conformance.suite import check
+        from ..landscapes.checks.suite import check
 
         yield from check(  # once the cost is known, and by that the type of the losses
             self.env,
@@ -177,7 +177,7 @@ class CheckJob:
 
     def work(self) -> list[Work]:
         """Return about how many episodes all checks take."""
-        from ..landscapes.conformance.suite import episodes
+        from ..landscapes.checks.suite import episodes
 
         losses, gradients = episodes(self.env.space.dim, self.points, tuple(_lengths(self)))
         gradients += 2 * (sum(FACTORS) + 4)  # two points over longer horizons, time steps and materials
@@ -196,7 +196,7 @@ class CheckJob:
 
 def _need(dim: int, points: int) -> Need:
     """Return what the points and gradients of all checks take, a copy of each included."""
-    from ..landscapes.conformance.suite import episodes
+    from ..landscapes.checks.suite import episodes
 
     return Need(4.0 * 8 * dim * sum(episodes(dim, points)))
 
@@ -220,7 +220,7 @@ def _twin(job: CheckJob) -> Callable[[], Environment] | None:
 
 
 def _time_steps(job: CheckJob) -> list[ExtremeCase]:
-    from ..landscapes.conformance.extremes import ExtremeCase
+    from ..landscapes.checks.extremes import ExtremeCase
 
     if not job.env.fidelity.dt:
         return [ExtremeCase("dt 1x to 8x", why="it has no time step")]
@@ -238,7 +238,7 @@ def _time_steps(job: CheckJob) -> list[ExtremeCase]:
 
 
 def _time_step(job: CheckJob, factor: int, dt: float) -> ExtremeCase:
-    from ..landscapes.conformance.extremes import ExtremeCase
+    from ..landscapes.checks.extremes import ExtremeCase
 
     if factor == 1:
         return ExtremeCase("dt 1x", lambda: job.env)
@@ -256,7 +256,7 @@ def _time_step(job: CheckJob, factor: int, dt: float) -> ExtremeCase:
 
 
 def _horizons(job: CheckJob) -> list[ExtremeCase]:
-    from ..landscapes.conformance.extremes import ExtremeCase
+    from ..landscapes.checks.extremes import ExtremeCase
 
     if not job.longer:
         return [ExtremeCase("horizon 1x to 8x", why="no setting says how long an episode is")]

@@ -457,7 +457,7 @@ def spread_points(dim: int, points: int, seed: int) -> Tensor:
     """Return points of the unit cube: corners, half of the points at most, and Sobol points."""
     import torch
 
-    from ..landscapes.conformance.extremes import corners
+    from ..landscapes.checks.extremes import corners
     from ..landscapes.space import sobol
 
     ends = corners(dim)

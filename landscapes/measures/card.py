@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
-from ..conformance.finding import FAIL, UNEXPECTED, WARN
+from ..checks.finding import FAIL, UNEXPECTED, WARN
 from ..convert import NOT_JSON
 
 if TYPE_CHECKING:

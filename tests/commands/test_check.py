@@ -10,7 +10,7 @@ import pytest
 from gradscape.envs.registry import Entry, entries, environment_class
 from gradscape.jobs import check as job
 from gradscape.jobs.scene import SceneSpec
-from gradscape.landscapes.conformance import suite as conformance
+from gradscape.landscapes.checks import suite as conformance
 
 from ..command import Run
 

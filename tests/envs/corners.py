@@ -6,7 +6,7 @@ from typing import Any
 import torch
 
 from gradscape.envs.registry import environment_class, make
-from gradscape.landscapes.conformance.extremes import corners
+from gradscape.landscapes.checks.extremes import corners
 from gradscape.landscapes.objective import Status
 
 OUTWARD = (0.0, 1e-12, 0.01, 0.1, 1.0, 1e3, 1e9, 1e30, 1e38, 1e39, 1e300)  # shares of the box

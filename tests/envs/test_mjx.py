@@ -12,8 +12,8 @@ import gradscape as gs
 from gradscape.envs.engines.jax_functions import compiled, computing_in
 from gradscape.envs.mjx.scene import MjxScene, Parameter
 from gradscape.envs.mjx.scenes import Drop, Push
-from gradscape.landscapes.conformance.gradients import check_special_places
-from gradscape.landscapes.conformance.subject import Subject
+from gradscape.landscapes.checks.gradients import check_special_places
+from gradscape.landscapes.checks.subject import Subject
 
 from .scenes import made_once
 

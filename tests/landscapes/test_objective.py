@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from gradscape import Evaluation, ParameterSpace, Plane, Status, from_numpy, sample
-from gradscape.landscapes.conformance.suite import check
+from gradscape.landscapes.checks.suite import check
 from gradscape.landscapes.measures.gradient_quality import compare_differences, subgrid
 from gradscape.landscapes.measures.profile import OutsideBounds, measure_profile
 from gradscape.landscapes.measures.sensitivity import Design, explore

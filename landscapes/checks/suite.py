@@ -1,4 +1,4 @@
-"""The conformance suite: the protocol of an objective, its gradients, and its extremes."""
+"""All checks of an objective: the protocol of an objective, its gradients, and its extremes."""
 
 from __future__ import annotations
 

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from gradscape.envs.adapters import from_torch
-from gradscape.landscapes.conformance.extremes import CORNERS, ExtremeCase, corners
-from gradscape.landscapes.conformance.suite import check
+from gradscape.landscapes.checks.extremes import CORNERS, ExtremeCase, corners
+from gradscape.landscapes.checks.suite import check
 from gradscape.landscapes.objective import Evaluation, Objective, Status
 from gradscape.landscapes.space import ParameterSpace
 

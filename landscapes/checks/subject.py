@@ -1,4 +1,4 @@
-"""The subject of a conformance check: an objective, its evaluation at some points, and the noise between repeats."""
+"""The subject of a check: an objective, its evaluation at some points, and the noise between repeats."""
 
 from __future__ import annotations
 

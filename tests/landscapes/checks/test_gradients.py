@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from gradscape.landscapes.conformance.suite import check
+from gradscape.landscapes.checks.suite import check
 from gradscape.landscapes.objective import Evaluation
 
 from .test_suite import OneWrongSign, Sound, Spoiled, WrongWhere, failures, outcomes, refusing
