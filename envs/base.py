@@ -281,6 +281,17 @@ class Environment(Objective):
         return torch.cat(known) if known else None
 
     @final
+    def closed_form(self, x: Float[Tensor, "batch dim"]) -> Evaluation | None:
+        """Return losses and gradients that the scene's physics has in closed form; None where it has none."""
+        points = self._check_points(x).clone().requires_grad_()
+        with torch.inference_mode(False), torch.enable_grad():
+            loss = self._closed_form(self.space.to_values(points))
+            if loss is None:
+                return None
+            (slope,) = torch.autograd.grad(loss.sum(), points)
+        return Evaluation.from_results(loss.detach(), slope)
+
+    @final
     def observe(self, x: Float[Tensor, "batch dim"], decision: int) -> Float[Tensor, "batch feature"]:
         """Return what the state is just before a decision, float64, in units that make it about one.
 
@@ -396,6 +407,10 @@ class Environment(Objective):
     def _observe(self, x: Float[Tensor, "batch dim"], decision: int) -> Float[Tensor, "batch feature"]:
         """Return the state just before a decision, in units that make it about one."""
         return x.new_zeros(len(x), 0)
+
+    def _closed_form(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, " batch"] | None:
+        """Return the losses of the scene's physics in closed form, differentiable in the parameters' own values."""
+        return None
 
     def _energy(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch step"] | None:
         """Return the energy over time of a motion that nothing drives [J], of no more rows than a solver takes."""

@@ -125,6 +125,10 @@ class Entry:
 
 
 VELOCITY, CLOTH = "initial velocity x, y, z [m/s]", "mass-spring cloth, held at two corners, over a floor"
+STARTED = "initial position x, y [m], velocity x, y [m/s]"
+THROWN = "initial position x, z [m], velocity x, z [m/s]"
+PUSHED = "two initial positions [m] and velocities [m/s], a push x, y [m/s²]"
+START = "initial position x, y [m], velocity x, y [m/s], first push x, y [m/s²]"
 BALL = "planar rigid ball, hard contacts with restitution"
 
 
@@ -142,9 +146,14 @@ def _mjx(name: str, target: str, dim: str, parameters: str, model: str) -> Entry
     return replace(_scene(name, f"mjx.scenes:{target}", dim, parameters, f"MuJoCo in JAX: {model}"), extra="mjx")
 
 
-def _newton(name: str, target: str, model: str) -> Entry:
-    found = _scene(name, f"newton.scenes:{target}", "3", VELOCITY, f"Newton: {model}")
+def _newton(name: str, target: str, model: str, parameters: str = VELOCITY) -> Entry:
+    dim = "3" if parameters == VELOCITY else "4"
+    found = _scene(name, f"newton.scenes:{target}", dim, parameters, f"Newton: {model}")
     return replace(found, fidelities=SCENE[:2], extra="newton")
+
+
+def _collision(name: str, target: str, dim: str, parameters: str, model: str) -> Entry:
+    return replace(_scene(name, f"collisions:{target}", dim, parameters, model), fidelities=("standard",))
 
 
 def _function(name: str, target: str, model: str, dim: str = "2") -> Entry:
@@ -163,6 +172,11 @@ BUILTIN = (
     ),
     _scene("pinball-2", "pinball:Pinball2", "2", "angles of 1 x 2 colliders [rad]", BALL),
     _scene("pinball-16", "pinball:Pinball16", "16", "angles of 4 x 4 colliders, row by row [rad]", BALL),
+    _collision("bounce-once", "BounceOnce", "6", START, "one elastic impact on the ground, in closed form"),
+    _collision("ground-wall", "GroundWall", "6", START, "a ball off the ground and a wall, in closed form"),
+    _collision(
+        "two-balls", "TwoBalls", "10", PUSHED, "an elastic impact of two balls, in closed form",
+    ),
     _scene("swing-velocity", "sheets.swing:SwingVelocity", "3", VELOCITY, CLOTH),
     _scene("swing-stiffness", "sheets.swing:SwingStiffness", "16", "stiffness of 4 x 4 patches [N/m]", CLOTH),
     _scene("flip", "sheets.flip:Flip", "15", "5 x (pan x [m], pan y [m], tilt [rad])", "mass-spring disc, moving pan"),
@@ -178,9 +192,14 @@ BUILTIN = (
     _mjx("mjx-bounce", "MjxBounce", "3", VELOCITY, "bounce's ball and target"),
     _mjx("mjx-cartpole", "MjxCartpole", "400", "100 x (cart velocity [m/s], 3 torques [N m])", "cartpole's chain"),
     _mjx("mjx-push", "Push", "10", "5 x (ball velocity x, y) [m/s]", "a box pushed across friction"),
+    _mjx("mjx-bounce-once", "MjxBounceOnce", "4", THROWN, "bounce-once's ball and ground"),
+    _mjx("mjx-ground-wall", "MjxGroundWall", "4", THROWN, "ground-wall's ball, ground and wall"),
+    _mjx("mjx-two-balls", "MjxTwoBalls", "10", PUSHED, "two-balls' balls and push"),
     _newton("newton-flight", "Flight", "a sphere in free flight"),
     _newton("newton-ball", "Ball", "bounce's ball and target"),
     _newton("newton-cloth", "ClothThrow", "a cloth that bounces off a floor"),
+    _newton("newton-bounce-once", "NewtonBounceOnce", "bounce-once's ball and ground", STARTED),
+    _newton("newton-ground-wall", "NewtonGroundWall", "ground-wall's ball, ground and wall", STARTED),
     _function("ackley", "Ackley", "many shallow minima around a funnel", "any"),
     _function("beale", "Beale", "flat plain with sharp corner peaks"),
     _function("branin", "Branin", "three equal minima in a smooth valley"),

@@ -69,6 +69,7 @@ ENGINES = {
             concurrent=False,
             newest_python=(3, 12),
         ),
+        Engine("torch", {"collisions": "balls.collisions"}, concurrent=False),  # by autograd
         Engine("mjx", {"rollout": "mjx.rollout"}, concurrent=False, extra="mjx"),  # MuJoCo in JAX
         Engine("newton", {"rollout": "newton.rollout"}, concurrent=False, extra="newton"),  # by Warp's tape
     )

@@ -94,6 +94,11 @@ class MjxScene(Environment):
         count: int = self._course.held * self._course.steps
         return count
 
+    @property
+    def time(self) -> float:
+        """How long an episode is [s]."""
+        return self.steps * self.fidelity.dt
+
     def work(self) -> Work:
         """Count steps of bodies."""
         return Work(self.steps * max(1, self._rollout.host.nbody - 1), "body-step")

@@ -1,11 +1,18 @@
-"""Four scenes of MuJoCo: a drop, a bounce, a chain on a cart, and a push across friction."""
+"""Scenes of MuJoCo: a drop, bounces, a chain on a cart, a push across friction, and three with a closed form."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from .. import closed_forms
 from ..base import Fidelity
+from ..closed_forms import GRAVITY, RADIUS, REACH, WALL
+from ..collisions import PRICE, missed
 from .scene import MjxOptions, MjxScene, Mode, Parameter
 
 BALL = """
@@ -198,3 +205,127 @@ class Push(MjxScene):
     def loss_of(self, state: Any) -> Any:
         """Return the squared distance to the goal on the floor [m^2]."""
         return (state.qpos[0] - GOAL[0]) ** 2 + (state.qpos[1] - GOAL[1]) ** 2
+
+
+BOUNCY = 'condim="1" solref="-10000 {damping}" solimp="0.999 0.999 0.001"'  # stiffness, and damping for each kg
+SLIDER = """
+<body name="{name}">
+  <joint name="{name} x" type="slide" axis="1 0 0"/><joint name="{name} {up}" type="slide" axis="{axis}"/>
+  <geom name="{name}" type="sphere" size="{radius}" mass="1" {contact}/>
+</body>
+"""
+LIVELY_DAMPING = -5.3  # with which a rebound is 0.92 times as fast, times minus one, as MuJoCo writes it
+
+
+def _slider(name: str, up: str, radius: float, damping: float = 0.0) -> str:
+    """Return a ball that slides along x and the axis `up`."""
+    axis = {"y": "0 1 0", "z": "0 0 1"}[up]
+    return SLIDER.format(name=name, up=up, axis=axis, radius=radius, contact=BOUNCY.format(damping=damping))
+
+
+def _ball(gravity: float, damping: float, walls: str = "") -> str:
+    """Return a ball that slides in an upright plane, over the ground and among walls."""
+    contact = BOUNCY.format(damping=damping)
+    ball = _slider("ball", "z", RADIUS, damping)
+    return f"""
+<mujoco>
+  <option timestep="0.004" gravity="0 0 {-gravity}"/>
+  <worldbody><geom type="plane" size="20 20 0.1" {contact}/>{walls.format(contact=contact)}{ball}</worldbody>
+</mujoco>
+"""
+
+
+def _start(x: tuple[float, float], z: tuple[float, float], vx: tuple[float, float], vz: tuple[float, float]) -> Any:
+    """Return the parameters of a ball at first, each given by its middle and half width."""
+    named = (("position x", "qpos", "ball x", x, "m"), ("position z", "qpos", "ball z", z, "m"))
+    named += (("velocity x", "qvel", "ball x", vx, "m/s"), ("velocity z", "qvel", "ball z", vz, "m/s"))  # type: ignore[assignment]
+    return tuple(
+        Parameter(name, field, at, mid - half, mid + half, unit) for name, field, at, (mid, half), unit in named
+    )
+
+
+class MjxBounceOnce(MjxScene):
+    """Let a ball bounce off the ground once, as in `bounce-once`, by MuJoCo; the loss is how high it is then.
+
+    Model: MuJoCo's, in JAX: a ball of radius 0.1 m and mass 1 kg slides in an upright plane, without gravity and
+    friction; the ground pushes back by MuJoCo's contact with stiffness 1e4 for each kg, without damping; semi-implicit
+    Euler, dt 1/500 s at standard. The contact lasts pi/100 s, by which its slopes differ from those of an impact.
+    Parameters: initial position x, z [m] and velocity x, z [m/s], z upwards.
+    Loss: height of the ball's centre after 1 s [m].
+    """
+
+    name = "mjx-bounce-once"
+    mjcf: ClassVar[str] = _ball(0.0, 0.0)
+    parameters: ClassVar[tuple[Parameter, ...]] = _start((-1.0, 0.5), (1.0, 0.4), (2.0, 1.0), (-2.0, 1.5))
+    duration: ClassVar[float] = 1.0
+    loss_unit = "m"
+
+    def loss_of(self, state: Any) -> Any:
+        """Return the height [m]."""
+        return state.qpos[1]
+
+    def _closed_form(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, " batch"]:
+        return closed_forms.bounce_once(x[:, 1], x[:, 3], torch.zeros_like(x[:, 1]), self.time)
+
+
+class MjxGroundWall(MjxScene):
+    """Throw a ball at the ground and a wall, as in `ground-wall`, by MuJoCo, so that it comes back to the target.
+
+    Model: MuJoCo's, in JAX: a ball of radius 0.1 m and mass 1 kg slides in an upright plane without friction; ground
+    and wall push back by MuJoCo's contact with stiffness 1e4 and damping 5.3 for each kg, after which a rebound is 0.92
+    times as fast; semi-implicit Euler, dt 1/500 s at standard.
+    Parameters: initial position x, z [m] and velocity x, z [m/s], z upwards.
+    Loss: squared distance of the ball's centre to (-2, 1.5) m after 0.6 s [m^2].
+    """
+
+    name = "mjx-ground-wall"
+    mjcf: ClassVar[str] = _ball(
+        GRAVITY, LIVELY_DAMPING, f'<geom type="plane" size="20 20 0.1" pos="{WALL} 0 0" zaxis="-1 0 0" {{contact}}/>'
+    )
+    parameters: ClassVar[tuple[Parameter, ...]] = _start((-0.5, 0.4), (1.0, 0.4), (5.0, 4.0), (-5.0, 3.0))
+    duration: ClassVar[float] = 0.6
+    loss_unit = "m²"
+
+    def loss_of(self, state: Any) -> Any:
+        """Return the squared distance to the target [m^2]."""
+        return (state.qpos[0] + 2.0) ** 2 + (state.qpos[1] - 1.5) ** 2
+
+    def _closed_form(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, " batch"]:
+        return missed(closed_forms.ground_wall(x[:, :2], x[:, 2:], torch.zeros_like(x[:, :2]), self.time))
+
+
+class MjxTwoBalls(MjxScene):
+    """Push a ball against another one, as in `two-balls`, by MuJoCo, so that this is at the origin after 1 s.
+
+    Model: MuJoCo's, in JAX: two balls of radius 0.2 m and mass 1 kg slide on a plane without friction and gravity, and
+    push each other by MuJoCo's contact with stiffness 1e4 for each kg, without damping; semi-implicit Euler, dt 1/500 s
+    at standard.
+    Parameters: initial positions x, y [m] and velocities x, y [m/s] of both, and the push x, y on the first [m/s²].
+    Loss: squared distance of the second ball to the origin after 1 s, and 0.1 times the push's square by time [m²].
+    """
+
+    name = "mjx-two-balls"
+    mjcf: ClassVar[str] = f"""
+<mujoco>
+  <option timestep="0.004" gravity="0 0 0"/>
+  <worldbody>{_slider("1", "y", REACH)}{_slider("2", "y", REACH)}</worldbody>
+  <actuator><motor name="push x" joint="1 x"/><motor name="push y" joint="1 y"/></actuator>
+</mujoco>
+"""
+    parameters: ClassVar[tuple[Parameter, ...]] = (
+        *(Parameter(f"position {k} {axis}", "qpos", f"{k} {axis}", at - 0.1, at + 0.1, "m")
+          for k, at in ((1, -2.0), (2, -1.0)) for axis in "xy"),
+        *(Parameter(f"velocity {k} {axis}", "qvel", f"{k} {axis}", -0.2, 0.2, "m/s") for k in (1, 2) for axis in "xy"),
+        *(Parameter(f"push {axis}", "ctrl", f"push {axis}", 2.5, 3.5, "m/s²") for axis in "xy"),
+    )  # fmt: skip
+    duration: ClassVar[float] = 1.0
+    loss_unit = "m²"
+
+    def loss_of(self, state: Any) -> Any:
+        """Return the squared distance to the origin, and what the push costs."""
+        cost = PRICE * self.time * (state.ctrl[0] ** 2 + state.ctrl[1] ** 2)
+        return state.qpos[2] ** 2 + state.qpos[3] ** 2 + cost
+
+    def _closed_form(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, " batch"]:
+        end = closed_forms.two_balls(x[:, :4].view(-1, 2, 2), x[:, 4:8].view(-1, 2, 2), x[:, 8:], self.time)
+        return end.square().sum(dim=1) + PRICE * self.time * x[:, 8:].square().sum(dim=1)

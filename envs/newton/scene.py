@@ -41,6 +41,7 @@ class NewtonScene(Environment):
 
     model_version = 1
     duration: ClassVar[float]
+    gravity: ClassVar[float] = GRAVITY  # [m/s^2]
     target: ClassVar[tuple[float, float, float]]
     rows: ClassVar[int]
     bytes_per_step: ClassVar[dict[str, int]]  # of a row, by solver: states with their adjoints, and what steps allocate
@@ -67,7 +68,7 @@ class NewtonScene(Environment):
     def episode(self, x: Float[Tensor, " dim"]) -> Episode:
         """Return where the thing is during the episode at one point."""
         with self._solvers.lend() as rollout:
-            frames = rollout.frames(self._row(x))[:, 0]
+            frames = rollout.frames(self._start(self._row(x)))[:, 0]
         shown = torch.linspace(0, len(frames) - 1, min(FRAMES, len(frames))).round().long()
         at = frames[shown]
         target = torch.tensor(self.target, dtype=torch.float64).expand(len(at), 3)
@@ -99,15 +100,27 @@ class NewtonScene(Environment):
             )
         engine = self._engine("rollout")
         self._capacity = max(1, min(self.rows, self._max_rows, BUDGET // self.memory()))
-        settings = engine.Settings(self.fidelity.dt, self.steps, GRAVITY, self.options.solver, self._capacity)
+        settings = engine.Settings(self.fidelity.dt, self.steps, self.gravity, self.options.solver, self._capacity)
         self._solvers = Pool(partial(engine.Rollout, self._thing(), self._ground(), settings), most=1)
 
     def _evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
         with self._solvers.lend() as rollout:
             if not grad:
-                return Evaluation.from_results(self._miss(rollout.ends(x)[: len(x)]).square().sum(dim=1), None)
-            end, slope = rollout.pull_back(x, self._adjoint)
-        return Evaluation.from_results(self._miss(end[: len(x)]).square().sum(dim=1), slope)
+                return Evaluation.from_results(self._loss(rollout.ends(self._start(x))[: len(x)]), None)
+            end, slope = rollout.pull_back(self._start(x), self._adjoint)
+        return Evaluation.from_results(self._loss(end[: len(x)]), self._slope(slope))
+
+    def _start(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch start"]:
+        """Return velocities [m/s], and by what particles are moved at first [m] where parameters say that."""
+        return x
+
+    def _slope(self, start: Float[Tensor, "batch start"]) -> Float[Tensor, "batch dim"]:
+        """Return the gradient by parameters from that by starts."""
+        return start
+
+    def _loss(self, end: Float[Tensor, "batch point 3"]) -> Float[Tensor, " batch"]:
+        """Return the squared distance to the target [m^2]."""
+        return self._miss(end).square().sum(dim=1)
 
     def _miss(self, end: Float[Tensor, "batch point 3"]) -> Float[Tensor, "batch 3"]:
         """Return how far from the target the middle of the points is [m]."""

@@ -1,4 +1,4 @@
-"""Three scenes of Newton: a sphere in free flight, a ball that bounces, a cloth that bounces."""
+"""Scenes of Newton: a sphere in free flight, balls that bounce, two with a closed form, a cloth that bounces."""
 
 from __future__ import annotations
 
@@ -6,11 +6,17 @@ import math
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from ...landscapes.episode import Part
+from ...landscapes.space import ParameterSpace
+from .. import closed_forms
 from ..base import Fidelity
+from ..closed_forms import RADIUS, WALL
+from ..collisions import TARGET, missed
+from ..records import EpisodeOptions
 from .scene import NewtonOptions, NewtonScene, speeds
 
 MASS = 1.0  # of the ball [kg]
@@ -131,3 +137,106 @@ class ClothThrow(NewtonScene):
         with self._solvers.lend() as rollout:
             faces = rollout.faces
         return (Part("sheet", "cloth", at, (0.01,), faces=faces),)
+
+
+@dataclass(frozen=True)
+class ImpactOptions(EpisodeOptions):
+    """`solver`: which of Newton's solvers makes the steps; featherstone leaves particles to semi-implicit."""
+
+    solver: Literal["semi-implicit", "xpbd"] = "semi-implicit"
+
+
+class ImpactScene(NewtonScene):
+    """A ball in an upright plane whose place and velocity at first are the parameters, as in the scene it names.
+
+    Model: Newton's: a particle of radius 0.1 m and mass 1 kg; what it meets pushes back by Newton's contact of
+    particles with stiffness 1e4 N/m, under xpbd with a restitution instead, and does not rub; dt 1/480 s at standard,
+    float32.
+    Parameters: initial position x, y [m] and velocity x, y [m/s], y upwards.
+    """
+
+    middle: ClassVar[tuple[float, float]]
+    damping: ClassVar[float]
+    restitution: ClassVar[float]
+    wall: ClassVar[float | None] = None
+    rows: ClassVar[int] = 256
+    bytes_per_step: ClassVar[dict[str, int]] = {"semi-implicit": 160, "xpbd": 570}
+    Options: ClassVar[type[Any]] = ImpactOptions
+    fidelities: ClassVar[dict[str, Fidelity]] = {
+        "draft": Fidelity("draft", dt=1 / 320),
+        "standard": Fidelity("standard", dt=1 / 480),
+    }
+
+    @property
+    def time(self) -> float:
+        """How long an episode is [s]."""
+        return self.steps * self.fidelity.dt
+
+    def _thing(self) -> Any:
+        return self._engine("rollout").Particle((*self.middle, 0.0), RADIUS, MASS)
+
+    def _ground(self) -> Any:
+        return self._engine("rollout").Ground(1e4, self.damping, 0.0, 0.0, self.restitution, self.wall)
+
+    def _start(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch start"]:
+        none = torch.zeros_like(x[:, :1])
+        return torch.cat([x[:, 2:], none, x[:, :2] - x.new_tensor(self.middle), none], dim=1)
+
+    def _slope(self, start: Float[Tensor, "batch start"]) -> Float[Tensor, "batch dim"]:
+        return torch.cat([start[:, 3:5], start[:, :2]], dim=1)
+
+
+class NewtonBounceOnce(ImpactScene):
+    """Let a ball bounce off the elastic ground once, as in `bounce-once`, by Newton, without gravity.
+
+    Loss: height of the ball's centre after 1 s [m].
+    """
+
+    name = "newton-bounce-once"
+    duration: ClassVar[float] = 1.0
+    gravity: ClassVar[float] = 0.0
+    target: ClassVar[tuple[float, float, float]] = (1.0, 0.0, 0.0)
+    middle: ClassVar[tuple[float, float]] = (-1.0, 1.0)
+    damping: ClassVar[float] = 0.0
+    restitution: ClassVar[float] = 1.0
+    loss_unit = "m"
+    space = ParameterSpace(
+        {
+            "position x": (-1.5, -0.5, "m"), "position y": (0.6, 1.4, "m"),
+            "velocity x": (1.0, 3.0, "m/s"), "velocity y": (-3.5, -0.5, "m/s"),
+        }
+    )  # fmt: skip
+
+    def _loss(self, end: Float[Tensor, "batch point 3"]) -> Float[Tensor, " batch"]:
+        return end[:, 0, 1]
+
+    def _adjoint(self, end: Float[Tensor, "batch point 3"]) -> Float[Tensor, "batch point 3"]:
+        return end.new_tensor([0.0, 1.0, 0.0]).expand_as(end)
+
+    def _closed_form(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, " batch"]:
+        return closed_forms.bounce_once(x[:, 1], x[:, 3], torch.zeros_like(x[:, 1]), self.time)
+
+
+class NewtonGroundWall(ImpactScene):
+    """Throw a ball at the ground and a wall, as in `ground-wall`, by Newton, so that it comes back to the target.
+
+    Loss: squared distance of the ball's centre to (-2, 1.5) m after 0.6 s [m²]. The semi-implicit solver damps the
+    approach with 10 N s/m, after which a rebound is 0.92 times as fast.
+    """
+
+    name = "newton-ground-wall"
+    duration: ClassVar[float] = 0.6
+    target: ClassVar[tuple[float, float, float]] = (*TARGET, 0.0)
+    middle: ClassVar[tuple[float, float]] = (-0.5, 1.0)
+    damping: ClassVar[float] = 10.0
+    restitution: ClassVar[float] = closed_forms.LIVELY
+    wall: ClassVar[float | None] = WALL
+    space = ParameterSpace(
+        {
+            "position x": (-0.9, -0.1, "m"), "position y": (0.6, 1.4, "m"),
+            "velocity x": (1.0, 9.0, "m/s"), "velocity y": (-8.0, -2.0, "m/s"),
+        }
+    )  # fmt: skip
+
+    def _closed_form(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, " batch"]:
+        return missed(closed_forms.ground_wall(x[:, :2], x[:, 2:], torch.zeros_like(x[:, :2]), self.time))

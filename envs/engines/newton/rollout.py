@@ -29,6 +29,9 @@ SOLVERS: dict[str, tuple[str, dict[str, Any]]] = {  # of Newton, which imports t
 }
 
 
+MATERIAL = ("ke", "kd", "kf", "mu", "restitution")  # of ground and particles
+
+
 @dataclass(frozen=True)
 class Sphere:
     """A solid ball that is a rigid body and touches nothing: where it starts [m], its radius [m] and mass [kg].
@@ -103,7 +106,7 @@ class Cloth:
 
 @dataclass(frozen=True)
 class Ground:
-    """How the plane y = 0 pushes back and rubs.
+    """How the plane y = 0, and the plane x = `wall` [m] where there is one, push back and rub.
 
     Stiffness `ke` [N/m], damping `kd` and viscous friction `kf` [N s/m], Coulomb's `mu`; xpbd has `restitution` in the
     place of the first three.
@@ -114,15 +117,18 @@ class Ground:
     kf: float
     mu: float
     restitution: float
+    wall: float | None = None
 
     def add(self, builder: Any) -> None:
         """Add it to a model."""
-        how = {name: getattr(self, name) for name in self.__dataclass_fields__}
-        builder.add_ground_plane(cfg=newton.ModelBuilder.ShapeConfig(**how))
+        cfg = newton.ModelBuilder.ShapeConfig(**{name: getattr(self, name) for name in MATERIAL})
+        builder.add_ground_plane(cfg=cfg)
+        if self.wall is not None:
+            builder.add_shape_plane(plane=(-1.0, 0.0, 0.0, self.wall), width=0.0, length=0.0, cfg=cfg)
 
     def tell(self, model: Any) -> None:
         """Tell a model that its particles are as its ground is: Newton takes the mean of both."""
-        for name in self.__dataclass_fields__:
+        for name in MATERIAL:
             setattr(model, f"soft_contact_{name}", getattr(self, name))
 
 
@@ -138,21 +144,26 @@ class Settings:
 
 
 def touch(model: Any) -> Any:
-    """Return contacts of all particles with the plane that is the only shape, once for all.
+    """Return contacts of all particles with the planes that are the only shapes, once for all.
 
-    They hold points of the plane and its normal, which serve wherever the particles are: those under where they start.
-    It is what Newton's own pipeline finds, to the bit, whose kernels take as long to compile as all else.
+    They hold points of a plane and its normal, which serve wherever the particles are: those under where they start.
+    Of one plane it is what Newton's own pipeline finds, to the bit, whose kernels take as long to compile as all else.
     """
-    contacts = newton.Contacts(0, model.particle_count, requires_grad=True, device="cpu")
-    plane: Any = wp.transform(*model.shape_transform.numpy()[0].tolist())
+    count, shapes = model.particle_count, model.shape_count
+    contacts = newton.Contacts(0, count * shapes, requires_grad=True, device="cpu")
     up: Any = wp.vec3(0.0, 0.0, 1.0)
     places = [wp.vec3(*place) for place in model.particle_q.numpy().tolist()]
-    local = [wp.transform_point(wp.transform_inverse(plane), place) for place in places]
-    contacts.soft_contact_count.fill_(model.particle_count)
-    contacts.soft_contact_particle.assign(range(model.particle_count))
-    contacts.soft_contact_shape.zero_()
-    contacts.soft_contact_body_pos.assign([wp.transform_point(plane, at - up * wp.dot(up, at)) for at in local])
-    contacts.soft_contact_normal.fill_(wp.transform_vector(plane, up))
+    points, normals = list[Any](), list[Any]()
+    for turned in model.shape_transform.numpy().tolist():
+        plane: Any = wp.transform(*turned)
+        local = [wp.transform_point(wp.transform_inverse(plane), place) for place in places]
+        points += [wp.transform_point(plane, at - up * wp.dot(up, at)) for at in local]
+        normals += [wp.transform_vector(plane, up)] * count
+    contacts.soft_contact_count.fill_(count * shapes)
+    contacts.soft_contact_particle.assign([*range(count)] * shapes)
+    contacts.soft_contact_shape.assign([shape for shape in range(shapes) for _ in range(count)])
+    contacts.soft_contact_body_pos.assign(points)
+    contacts.soft_contact_normal.assign(normals)
     return contacts
 
 
@@ -186,33 +197,33 @@ class Rollout:
         faces: Any = self.model.tri_indices
         self.faces = to_torch(faces)[: one.tri_count] if one.tri_count else None
 
-    def ends(self, velocity: Float[Tensor, "row 3"]) -> Float[Tensor, "row point 3"]:
-        """Return where points are at the end [m] of episodes that begin with one velocity [m/s] each."""
+    def ends(self, velocity: Float[Tensor, "row start"]) -> Float[Tensor, "row point 3"]:
+        """Return where points are at the end [m] of episodes that begin with one velocity [m/s] each, or more."""
         with TAPE:
             self._play(velocity)
             return self._places(-1)
 
-    def frames(self, velocity: Float[Tensor, "row 3"]) -> Float[Tensor, "frame row point 3"]:
+    def frames(self, velocity: Float[Tensor, "row start"]) -> Float[Tensor, "frame row point 3"]:
         """Return where points are [m] before each step and at the end."""
         with TAPE:
             self._play(velocity)
             return torch.stack([self._places(number) for number in range(len(self.states))])
 
     def pull_back(
-        self, velocity: Float[Tensor, "row 3"], adjoint: Callable[[Tensor], Tensor]
-    ) -> tuple[Float[Tensor, "row point 3"], Float[Tensor, "row 3"]]:
-        """Return where points are at the end, and the gradient by velocities of what `adjoint` is one of by places."""
+        self, velocity: Float[Tensor, "row start"], adjoint: Callable[[Tensor], Tensor]
+    ) -> tuple[Float[Tensor, "row point 3"], Float[Tensor, "row start"]]:
+        """Return where points are at the end, and the gradient by starts of what `adjoint` is one of by places."""
         with TAPE:
             tape = wp.Tape()
             try:
                 self._play(velocity, tape)
                 end = self._places(-1)
                 tape.backward(grads=self._seed(adjoint(end)))
-                return end, self._slope(len(velocity))
+                return end, self._slope(*velocity.shape)
             finally:
                 tape.zero()
 
-    def _play(self, velocity: Float[Tensor, "row 3"], tape: Any = None) -> None:
+    def _play(self, velocity: Float[Tensor, "row start"], tape: Any = None) -> None:
         self._begin(velocity)
         with tape or nullcontext():
             for number in range(self.settings.steps):
@@ -223,13 +234,18 @@ class Rollout:
         state.clear_forces()
         self.solver.step(state, following, self.control, self.contacts, self.settings.dt)
 
-    def _begin(self, velocity: Float[Tensor, "row 3"]) -> None:
-        """Set the first state: as the model has it, moving as a whole; rows that nobody asked for rest."""
+    def _begin(self, velocity: Float[Tensor, "row start"]) -> None:
+        """Set the first state: as the model has it, moving as a whole; rows that nobody asked for rest.
+
+        Of particles a start may hold, after the velocity, by what they are moved [m].
+        """
         first, rows = self.states[0], self.settings.rows
-        given = torch.zeros(rows, 3)
-        given[: len(velocity)] = velocity
+        start = torch.zeros(rows, 6)
+        start[: len(velocity), : velocity.shape[1]] = velocity
+        given = start[:, :3]
         if self.model.particle_count:
             wp.copy(first.particle_q, self.model.particle_q)
+            to_torch(first.particle_q).view(rows, -1, 3).add_(start[:, None, 3:])
             to_torch(first.particle_qd).view(rows, -1, 3).copy_(given[:, None])
             return
         wp.copy(first.body_q, self.model.body_q)
@@ -261,9 +277,12 @@ class Rollout:
         to_torch(seed).view(self.settings.rows, -1, self._width)[:, :, :3].copy_(adjoint)
         return {last: seed}
 
-    def _slope(self, rows: int) -> Float[Tensor, "row 3"]:
+    def _slope(self, rows: int, size: int) -> Float[Tensor, "row start"]:
         first, whole = self.states[0], self.settings.rows
         if self.model.particle_count:
-            return to_torch(first.particle_qd.grad).view(whole, -1, 3).double().sum(dim=1)[:rows]
+            both = [
+                to_torch(of.grad).view(whole, -1, 3).double().sum(dim=1) for of in (first.particle_qd, first.particle_q)
+            ]
+            return torch.cat(both, dim=1)[:rows, :size]
         slopes = [to_torch(one.grad).view(whole, 6)[:rows, :3].double() for one in self._speeds(first)]
         return torch.stack(slopes).sum(dim=0)
