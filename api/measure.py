@@ -78,9 +78,11 @@ def card(
 ) -> Card:
     """Check the gradients of several engines in the same scenes, and show their landscapes side by side.
 
-    Every installed engine, ours included, goes through `landscape check` and is sampled on one small plane. The folder
-    then holds card.json (findings, versions and commands) and card.png. All of it is measured, so another release of
-    an engine is measured again. Stop at any time: the same command continues with the next engine. The exit code is
+    Every installed engine, ours included, goes through the same `landscape check` and is sampled on one small plane.
+    The folder then holds card.html, a page of its own with a table and a panel for each engine, card.json, card.npz
+    (the slices) and card.png. The table says at which share of the points gradients are wrong, with its interval, the
+    cause, and, in scenes with a closed form, how far gradients are from that. All of it is measured, so another release
+    of an engine is measured again. Stop at any time: the same command continues with the next engine. The exit code is
     always 0.
 
     Raises ValueError for a scene that the card does not have, StoreMismatchError where the folder holds a card of other

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from ..landscapes.measures.card import describe_error
 from .terminal import Console, table
 
 if TYPE_CHECKING:
@@ -11,9 +12,10 @@ if TYPE_CHECKING:
 
 
 def show(found: Card, console: Console) -> None:
-    """Print a row for each engine in each scene: its outcome and its first finding."""
-    shown = table("scene", "engine", "", "finding")
+    """Print a row for each engine in each scene: verdict, share of points wrong, cause, finding, closed form."""
+    shown = table("scene", "engine", "verdict", "points wrong", "finding", "against the closed form")
     for one in found.grades:
-        count = "" if one.outcome == "not installed" else f" {sum(one.counts.values()) - one.counts.get('skip', 0)}"
-        shown.add_row(one.scene, one.engine, one.outcome + count, one.finding)
+        said = f"{one.cause}: {one.finding}" if one.cause else one.finding
+        error = describe_error(one.closed_form) if one.closed_form is not None else ""
+        shown.add_row(one.scene, one.engine, one.verdict, one.wrong, said, error)
     console.print(shown)

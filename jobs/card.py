@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
+from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,11 +16,16 @@ import torch
 from ..envs.engines import installed_version
 from ..envs.registry import EXTRAS, entries, environment_class, installs
 from ..landscapes.capacity import require
-from ..landscapes.checks.finding import FAIL, UNEXPECTED
+from ..landscapes.checks.diagnosis import Diagnosis
+from ..landscapes.checks.examination import Share
+from ..landscapes.checks.suite import POWER
+from ..landscapes.convert import from_json, to_json
 from ..landscapes.identity import PACKAGE
-from ..landscapes.measures.card import Card, CardSlice, Grade, Outcome, count_outcomes, first_finding
+from ..landscapes.measures.card import Card, CardSlice, ClosedFormError, FailedCheck, Grade
 from ..landscapes.storage.arrays import need_of
 from ..landscapes.storage.checkpoint import Checkpoint
+from ..landscapes.storage.files import replacing
+from ..landscapes.storage.records import read_json
 from .check import CheckJob
 from .folder import CARD, ROOT, folder_named
 from .job import CheckpointedJob
@@ -31,9 +37,12 @@ if TYPE_CHECKING:
 
     from ..envs.base import Environment
 
-OURS = (PACKAGE, "warp-lang")  # what our own scenes are simulated by
-POINTS = 3  # that are checked
+LIBRARIES = {"warp": ("warp-lang",), "torch": ("torch",)}  # of our own scenes, by engine
+CLOSED_FORM_POINTS = 63  # at random, at which gradients are held against a closed form, and the centre
 LARGEST = 400  # parameters, of a chain
+PAGE, SLICES = "card.html", "card.npz"
+SAMPLED = ("u", "v", "loss", "slope", "status")  # arrays of a slice
+SPEEDS = ("velocity x", "velocity y")
 
 
 @dataclass(frozen=True)
@@ -43,7 +52,7 @@ class Entrant:
     scene: str
     engine: str
     env: str
-    dims: tuple[int | str, int | str] = ("velocity x", "velocity y")
+    dims: tuple[int | str, int | str] = SPEEDS
     options: Mapping[str, Any] = field(default_factory=dict)
 
     @property
@@ -60,14 +69,40 @@ class Entrant:
         """Its options as a command takes them."""
         return "".join(f" --set {name}={value}" for name, value in self.options.items())
 
+    @property
+    def packages(self) -> tuple[str, ...]:
+        """The packages that its environment is simulated by."""
+        extra = EXTRAS.get(entries()[self.env].extra, ())
+        engine = "torch" if self.scene == CONTROL else environment_class(self.env).engines[0]
+        return extra or (PACKAGE, *LIBRARIES[engine])
 
-def _newton(scene: str, env: str, *solvers: str) -> tuple[Entrant, ...]:
-    return tuple(Entrant(scene, f"Newton, {solver}", env, options={"solver": solver}) for solver in solvers)
+
+CONTROL = "control"
 
 
+def _newton(scene: str, env: str, *solvers: str, dims: tuple[str, str] = SPEEDS) -> tuple[Entrant, ...]:
+    return tuple(Entrant(scene, f"Newton, {solver}", env, dims, {"solver": solver}) for solver in solvers)
+
+
+def _ours(scene: str, env: str, dims: tuple[str, str]) -> tuple[Entrant, ...]:
+    """Return our scene of a closed form, by the three ways of meeting a touch."""
+    said = {"touch": "time of touch", "shift": "places shifted", "step": "whole steps"}
+    return tuple(Entrant(scene, f"gradscape, {name}", env, dims, {"contacts": how}) for how, name in said.items())
+
+
+HEIGHTS, LIFTED = ("position y", "velocity y"), ("position z", "velocity z")
+PUSHES = ("push x", "push y")
 ENTRANTS = (
-    Entrant("control", "torch, Branin's function", "branin", (0, 1)),  # the control: its gradient is known
+    Entrant(CONTROL, "torch, Branin's function", "branin", (0, 1)),  # its gradient is known
     *_newton("flight", "newton-flight", "semi-implicit", "featherstone", "xpbd"),
+    *_ours("bounce once", "bounce-once", HEIGHTS),
+    Entrant("bounce once", "MJX", "mjx-bounce-once", LIFTED),
+    *_newton("bounce once", "newton-bounce-once", "semi-implicit", "xpbd", dims=HEIGHTS),
+    *_ours("ground and wall", "ground-wall", SPEEDS),
+    Entrant("ground and wall", "MJX", "mjx-ground-wall", ("velocity x", "velocity z")),
+    *_newton("ground and wall", "newton-ground-wall", "semi-implicit", "xpbd"),
+    *_ours("two balls", "two-balls", PUSHES),
+    Entrant("two balls", "MJX", "mjx-two-balls", PUSHES),
     Entrant("drop", "MJX", "mjx-drop"),
     Entrant("drop", "MJX, one iteration", "mjx-drop", options={"iterations": 1}),
     Entrant("bounce", "gradscape", "bounce"),
@@ -114,7 +149,7 @@ class CardJob(CheckpointedJob[Card]):
             raise ValueError(f"the card has no scene {unknown[0]!r}; it has {', '.join(known)}")
         require("resolution", resolution, lambda points: need_of((points, points), LARGEST, grad=True))
         chosen = [one for one in ENTRANTS if not scenes or one.scene in scenes]
-        packages = dict.fromkeys([*OURS, *(package for extra in EXTRAS.values() for package in extra)])
+        packages = dict.fromkeys(package for one in ENTRANTS for package in one.packages)
         versions = {package: installed_version(package) for package in packages if package != PACKAGE}
         identity = {"resolution": resolution, "device": device, "versions": versions, "model_versions": _models()}
         folder = out or folder_named(["card"], identity, root)
@@ -135,17 +170,28 @@ class CardJob(CheckpointedJob[Card]):
             for number, one in enumerate(self.entrants):
                 advance(number, f"{one.scene}: {one.engine}")
                 if missing := installs(entries()[one.env]):
-                    grades.append(_grade(one, "not installed", missing, self.resolution))
+                    grades.append(_grade(one, None, self.resolution, missing))
                     continue
                 arrays = self._arrays(one)
-                about = json.loads(str(arrays["about"]))
-                device = about["device"]
-                grades.append(_graded(one, about, self.resolution))
+                about = from_json(Measured, json.loads(str(arrays["about"])))
+                device = about.device
+                grades.append(_grade(one, about, self.resolution))
                 if arrays["loss"].size:
                     slices[number] = _slice_of(arrays, about)
             advance(len(self.entrants))
         created = datetime.now(UTC).strftime("%Y-%m-%d")
         return Card(tuple(grades), created, device, self.command, slices)
+
+    def write(self, found: Card) -> list[str]:
+        """Draw and write the card, its page, and the slices, by which the page's panels are drawn elsewhere."""
+        with replacing(self.folder / PAGE) as partial:
+            partial.write_text(found.page(), encoding="utf-8")
+        save_slices(self.folder / SLICES, found.slices)
+        return super().write(found)
+
+    def outcome(self, found: Card) -> str:
+        """Say how many engines in scenes have which verdict."""
+        return found.tally()
 
     def _arrays(self, one: Entrant) -> dict[str, NDArray[Any]]:
         """Return what is found of an entrant, from what is kept of it where that is there."""
@@ -167,59 +213,110 @@ def _models() -> dict[str, int]:
     return {name: kind.version_on(kind.engines[0]) for name, kind in kinds.items()}
 
 
+@dataclass(frozen=True)
+class Measured:
+    """What the check of an entrant came to, what its slice is drawn with, and how long the check took [s]."""
+
+    fidelity: str
+    device: str
+    power: float
+    seconds: float
+    share: Share | None
+    failed: tuple[FailedCheck, ...]
+    diagnosis: Diagnosis | None
+    closed_form: ClosedFormError | None
+    labels: tuple[str, str]
+    loss_unit: str
+
+
 def _measure(one: Entrant, resolution: int, device: str) -> tuple[Environment, dict[str, NDArray[Any]]]:
     """Check an entrant, and sample its slice unless its evaluations are of the wrong form; return both."""
     from ..landscapes.sampling.fill import sample
 
-    job = CheckJob.open(one.spec(device), points=POINTS)
-    report, env = job.run(Watch()).record(), job.env
+    began = perf_counter()
+    job = CheckJob.open(one.spec(device))
+    report, env = job.run(Watch()), job.env
+    seconds = perf_counter() - began
     plane = plane_through(env, one.dims, through="center", window=None, resolution=resolution)
-    about = {name: report[name] for name in ("checks", "fidelity", "device")}
-    about |= {"labels": plane.labels, "loss_unit": env.loss_unit}
-    if report["checks"][0]["outcome"] == FAIL:
-        return env, {"about": np.array(json.dumps(about)), "loss": np.empty((0, 0))}
+    about = Measured(
+        fidelity=report.fidelity,
+        device=report.device,
+        power=report.power,
+        seconds=seconds,
+        share=report.share,
+        failed=tuple(FailedCheck(bad.check, bad.figure, bad.why) for bad in report.findings if bad.bad),
+        diagnosis=next(iter(report.diagnoses), None),
+        closed_form=_against_closed_form(env),
+        labels=(plane.labels[0], plane.labels[1]),
+        loss_unit=env.loss_unit,
+    )
+    kept = {"about": np.array(json.dumps(to_json(about)))}
+    if report.findings[0].bad:
+        return env, {**kept, "loss": np.empty((0, 0))}
     dataset = sample(env, plane)
     sides = (plane.upper - plane.lower).numpy()
     slope = plane.slope(torch.from_numpy(dataset["grad"].transpose("v", "u", "dim").to_numpy())).numpy() * sides
     axes = {name: dataset[name].to_numpy() for name in ("u", "v")}
     values = {name: dataset[name].transpose("v", "u").to_numpy() for name in ("loss", "status")}
-    return env, {"about": np.array(json.dumps(about)), "slope": slope, **axes, **values}
+    return env, {**kept, "slope": slope, **axes, **values}
 
 
-def _slice_of(arrays: Mapping[str, NDArray[Any]], about: Mapping[str, Any]) -> CardSlice:
-    kept = {name: arrays[name] for name in ("u", "v", "loss", "slope", "status")}
-    first, second = about["labels"]
-    return CardSlice(**kept, labels=(first, second), loss_unit=about["loss_unit"])
+def _against_closed_form(env: Environment) -> ClosedFormError | None:
+    x = torch.cat([env.space.center[None], env.space.uniform(CLOSED_FORM_POINTS, seed=0)])
+    exact = env.closed_form(x)
+    return None if exact is None else ClosedFormError.of(env.evaluate(x), exact)
 
 
-def _graded(one: Entrant, about: Mapping[str, Any], resolution: int) -> Grade:
-    """Return the grade that an entrant's checks give it."""
-    counts = count_outcomes(about["checks"])
-    outcome: Outcome = "fails" if counts.keys() & {FAIL, UNEXPECTED} else "passes"
-    return _grade(one, outcome, first_finding(about["checks"]), resolution, counts, about["fidelity"])
+def _slice_of(arrays: Mapping[str, NDArray[Any]], about: Measured) -> CardSlice:
+    kept = {name: arrays[name] for name in SAMPLED}
+    return CardSlice(**kept, labels=about.labels, loss_unit=about.loss_unit)
 
 
-def _grade(
-    one: Entrant,
-    outcome: Outcome,
-    finding: str,
-    resolution: int,
-    counts: Mapping[str, int] | None = None,
-    fidelity: str = "",
-) -> Grade:
+def _grade(one: Entrant, about: Measured | None, resolution: int, missing: str = "") -> Grade:
+    """Return the grade of an entrant, by what its check came to; None where it is not installed."""
     dims = " ".join(f'"{dim}"' if isinstance(dim, str) else str(dim) for dim in one.dims)
-    packages = (*OURS, *EXTRAS.get(entries()[one.env].extra, ()))
     return Grade(
         scene=one.scene,
         engine=one.engine,
         env=one.env,
-        fidelity=fidelity,
+        fidelity=about.fidelity if about else "",
         options=dict(one.options),
         dims=list(map(str, one.dims)),
-        versions={package: installed_version(package) or ABSENT for package in packages},
-        outcome=outcome,
-        finding=finding,
-        counts=dict(counts or {}),
-        check=f"landscape check {one.env}{one.settings} --points {POINTS}",
+        versions={package: installed_version(package) or ABSENT for package in one.packages},
+        missing=missing,
+        power=about.power if about else POWER,
+        share=about.share if about else None,
+        failed=about.failed if about else (),
+        diagnosis=about.diagnosis if about else None,
+        closed_form=about.closed_form if about else None,
+        seconds=about.seconds if about else 0.0,
+        check=f"landscape check {one.env}{one.settings}",
         slice=f"landscape slice {one.env} --dims {dims} --resolution {resolution}{one.settings}",
     )
+
+
+# ---- The slices of a card in a file beside it.
+
+
+def save_slices(path: Path, slices: Mapping[int, CardSlice]) -> None:
+    """Write slices as arrays by number and name; what they are called is in them too."""
+    arrays: dict[str, NDArray[Any]] = {}
+    for number, cut in slices.items():
+        arrays |= {f"{number} {name}": np.asarray(getattr(cut, name), np.float32) for name in SAMPLED}
+        arrays[f"{number} said"] = np.array([*cut.labels, cut.loss_unit])
+    with replacing(path) as partial, partial.open("wb") as file:
+        np.savez_compressed(file, **arrays)
+
+
+def read_card(record: Path) -> Card:
+    """Return a card with its slices, of the folder that holds its record.
+
+    Raises an error of any kind for what is no such record, or no such slices.
+    """
+    card, slices = from_json(Card, read_json(record)), dict[int, CardSlice]()
+    with np.load(record.with_name(SLICES)) as kept:
+        for number in sorted({int(name.split()[0]) for name in kept.files}):
+            first, second, unit = kept[f"{number} said"].tolist()
+            arrays = {name: kept[f"{number} {name}"] for name in SAMPLED}
+            slices[number] = CardSlice(**arrays, labels=(first, second), loss_unit=unit)
+    return replace(card, slices=slices)

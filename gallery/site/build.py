@@ -24,7 +24,9 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from ... import __version__
 from ...envs.registry import entries
+from ...landscapes.checks.examination import percent
 from ...landscapes.convert import to_json
+from ...landscapes.draw.card import TEMPLATES, card_scenes, colour_stops
 from ...landscapes.identity import plane_of
 from ...landscapes.measures.card import Card
 from ...landscapes.measures.classify import WORDS
@@ -116,7 +118,7 @@ def build_site(
             tiles = make_tiles(shown, data, new, studio)
             draw_wall(tiles, data, new)
         if card is not None:
-            site.write_page(CARD_PAGE, card=card)
+            site.write_page(CARD_PAGE, card=card, scenes=card_scenes(card), colours=colour_stops())
         if league is not None:
             site.write_page(LEAGUE_PAGE, page=league)
         return site.write_index(shown, [one.id for one in figures if one not in there], tiles, card, league)
@@ -142,10 +144,11 @@ def _has_samples(store: Path) -> bool:
 
 def _templates() -> Environment:
     pages = Environment(
-        loader=FileSystemLoader(HERE / "templates"), autoescape=True, undefined=StrictUndefined,
+        loader=FileSystemLoader([HERE / "templates", TEMPLATES]), autoescape=True, undefined=StrictUndefined,
         trim_blocks=True, lstrip_blocks=True,
     )  # fmt: skip
     pages.filters["number"] = _number
+    pages.filters["percent"] = percent
     pages.filters["dark"] = dark_name
     pages.filters["beside"] = _describe_companion
     pages.filters["size"] = size_class

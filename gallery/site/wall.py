@@ -8,6 +8,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
+from ...jobs.card import read_card
 from ...landscapes.convert import from_json
 from ...landscapes.measures.card import Card
 from ...landscapes.measures.census import Census
@@ -153,7 +154,8 @@ def place_card(data: Path, out: Path, studio: Studio) -> Card | None:
     if not source.there():
         return None
     with reading(source.record, REMAKE_CARD.format(data / CARD)):
-        card = from_json(Card, read_json(source.record))
+        card = read_card(source.record)
     studio.place(source, target)
-    save_table([asdict(one) for one in card.grades], target.table)
+    rows = card.table().reset_index()
+    save_table(rows.where(rows.notna(), "").to_dict("records"), target.table)
     return card

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
-from ..checks.finding import FAIL, UNEXPECTED, WARN
+import numpy as np
+
+from ..checks.diagnosis import Diagnosis
+from ..checks.examination import Share, percent
 from ..convert import NOT_JSON
 
 if TYPE_CHECKING:
@@ -15,18 +18,62 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from ..draw.figure import Picture
+    from ..objective import Evaluation
 
-Outcome = Literal["passes", "fails", "not installed"]
-Checks = Sequence[Mapping[str, Any]]
+Verdict = Literal["passes", "fails", "not decided", "not installed"]
+VERDICTS: tuple[Verdict, ...] = ("passes", "fails", "not decided", "not installed")
+Answer = Literal["yes", "no", "not decided"]
+UPPER = 0.95  # quantile of the errors against a closed form that is said beside their median
+
+
+@dataclass(frozen=True)
+class FailedCheck:
+    """Say which check failed, what it measured and why that is wrong."""
+
+    check: str
+    figure: str
+    why: str
+
+    def __str__(self) -> str:
+        return f"{self.check}: {self.figure}{f': {self.why}' if self.why else ''}"
+
+
+@dataclass(frozen=True)
+class ClosedFormError:
+    """Say how far gradients are from those of the physics, as shares of these: at the box's centre and at random.
+
+    `median` and `upper`, the 95 % quantile, are of `points`; they are NaN where a gradient is not finite. `loss` is the
+    median error of the losses, as a share of their range: engines whose contact is soft solve another problem.
+    """
+
+    points: int
+    centre: float
+    median: float
+    upper: float
+    loss: float
+
+    @classmethod
+    def of(cls, found: Evaluation, exact: Evaluation) -> ClosedFormError | None:
+        """Hold an evaluation against the closed form's, the centre being the first row; None without gradients."""
+        if found.grad is None or exact.grad is None:
+            return None
+        length = exact.grad.norm(dim=1).numpy()
+        apart = (found.grad - exact.grad).norm(dim=1).numpy() / np.where(length > 0, length, np.nan)
+        spread = float(exact.loss.max() - exact.loss.min()) or 1.0
+        off = float((found.loss - exact.loss).abs().nanmedian()) / spread
+        median, upper = (float(np.quantile(apart, share)) for share in (0.5, UPPER))  # NaN where one is
+        return cls(len(apart), float(apart[0]), median, upper, off)
 
 
 @dataclass(frozen=True)
 class Grade:
-    """Say what was found of one engine in one scene.
+    """Say what was measured of one engine in one scene; its verdict is computed from that.
 
     `env`, `fidelity` and `options` make the environment, `dims` span its slice. `versions` are those of the packages
-    that it is simulated by, `counts` how many checks ended how, and `finding` is the first that failed, or warns, in
-    a sentence. `check` and `slice` are the commands that make both again.
+    that it is simulated by. `missing` is the line that installs it, empty where it is there. `power` is the share of
+    the box that a defect fills which the check finds with 95 %, `share` how many points are wrong, `failed` the checks
+    that failed, and `diagnosis` the most certain one. `closed_form` is None where the scene has none. `seconds` is what
+    the check took; `check` and `slice` are the commands that make both again.
     """
 
     scene: str
@@ -36,11 +83,60 @@ class Grade:
     options: dict[str, Any]
     dims: list[str]
     versions: dict[str, str]
-    outcome: Outcome
-    finding: str
-    counts: dict[str, int]
+    missing: str
+    power: float
+    share: Share | None
+    failed: tuple[FailedCheck, ...]
+    diagnosis: Diagnosis | None
+    closed_form: ClosedFormError | None
+    seconds: float
     check: str
     slice: str
+
+    derived: ClassVar[tuple[str, ...]] = ("verdict", "margin", "unjudged")
+
+    @property
+    def verdict(self) -> Verdict:
+        """Whether its gradients are right: not decided where a defect of that power may not have been met."""
+        if self.missing:
+            return "not installed"
+        if self.failed:
+            return "fails"
+        return "passes" if self.share is not None and self.share.missed <= self.power else "not decided"
+
+    @property
+    def margin(self) -> Answer:
+        """Whether gradients are wrong in more of the box than `power`: not decided where the interval holds both."""
+        if self.share is None or self.share.judged == 0:
+            return "not decided"
+        if self.share.low > self.power:
+            return "yes"
+        most = self.share.high if self.share.wrong else self.share.missed  # without a wrong one the bound is one-sided
+        return "no" if most <= self.power else "not decided"
+
+    @property
+    def unjudged(self) -> float:
+        """Share of the points at which nothing could be said."""
+        if self.share is None or self.share.points == 0:
+            return np.nan
+        return 1 - self.share.judged / self.share.points
+
+    @property
+    def cause(self) -> str:
+        """The cause of what is wrong, as far as one is known."""
+        return self.diagnosis.cause if self.diagnosis is not None else ""
+
+    @property
+    def finding(self) -> str:
+        """What is worst, in a sentence: the first diagnosis, else the first check that failed."""
+        if self.diagnosis is not None:
+            return self.diagnosis.what
+        return str(self.failed[0]) if self.failed else self.missing
+
+    @property
+    def wrong(self) -> str:
+        """The share of points that are wrong, with its interval."""
+        return self.share.describe() if self.share is not None and self.share.judged else ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,12 +163,12 @@ class Card:
     slices: Mapping[int, CardSlice] = field(default_factory=dict, metadata=NOT_JSON)
 
     def table(self) -> pd.DataFrame:
-        """Return a row for each engine in each scene: `outcome`, `finding`, `check`."""
+        """Return a row for each engine in each scene: verdict, shares, cause, finding, error against a closed form."""
         import pandas as pd
 
-        rows = [(one.scene, one.engine, one.outcome, one.finding, one.check) for one in self.grades]
-        columns = ["scene", "engine", "outcome", "finding", "check"]
-        return pd.DataFrame(rows, columns=columns).set_index(["scene", "engine"])
+        columns = ["scene", "engine", "verdict", "wrong", "low", "high", "judged", "points", "cause", "finding"]
+        columns += ["closed_form", "seconds", "check"]
+        return pd.DataFrame(map(_row, self.grades), columns=columns).set_index(["scene", "engine"])
 
     def _repr_html_(self) -> str:
         """Show the table in a notebook."""
@@ -84,28 +180,53 @@ class Card:
 
         return figure_of(self, width)
 
-    @property
-    def failed(self) -> int:
-        """How many engines in scenes fail."""
-        return sum(one.outcome == "fails" for one in self.grades)
+    def page(self) -> str:
+        """Return the card as a page of its own, with a panel of each slice."""
+        from ..draw.card import card_page
+
+        return card_page(self)
+
+    def count(self, verdict: Verdict) -> int:
+        """How many engines in scenes have a verdict."""
+        return sum(one.verdict == verdict for one in self.grades)
+
+    def tally(self) -> str:
+        """Say how many engines in scenes have which verdict."""
+        counts = {verdict: self.count(verdict) for verdict in VERDICTS}
+        plural = {"passes": "pass", "fails": "fail"}
+        said = (f"{n} {verdict if n == 1 else plural.get(verdict, verdict)}" for verdict, n in counts.items() if n)
+        return ", ".join(said)
 
     def engines(self) -> list[str]:
         """Return what was measured, packages with their versions."""
         return list(dict.fromkeys(f"{name} {at}" for one in self.grades for name, at in one.versions.items()))
 
-
-def first_finding(checks: Checks) -> str:
-    """Say in a sentence what is worst of the checks: the first that failed, else the first that warns."""
-    bad = [one for one in checks if one["outcome"] in (FAIL, UNEXPECTED)]
-    found = bad or [one for one in checks if one["outcome"] == WARN]
-    if not found:
-        return ""
-    others = f" (and {len(bad) - 1} more)" if len(bad) > 1 else ""
-    why = f": {found[0]['why']}" if found[0]["why"] else ""
-    return f"{found[0]['check']}: {found[0]['figure']}{why}{others}"
+    def scenes(self) -> list[tuple[str, list[int]]]:
+        """Return each scene with the places of its grades."""
+        names = dict.fromkeys(one.scene for one in self.grades)
+        return [(name, [place for place, one in enumerate(self.grades) if one.scene == name]) for name in names]
 
 
-def count_outcomes(checks: Checks) -> dict[str, int]:
-    """Count how many checks ended how."""
-    ends = [str(one["outcome"]) for one in checks]
-    return {end: ends.count(end) for end in dict.fromkeys(ends)}
+def _row(one: Grade) -> Sequence[Any]:
+    share = one.share or Share(0, 0, 0, np.nan, np.nan, np.nan)
+    off = one.closed_form.median if one.closed_form is not None else np.nan
+    counts = (share.wrong, share.low, share.high, share.judged, share.points)
+    return (one.scene, one.engine, one.verdict, *counts, one.cause, one.finding, off, round(one.seconds, 1), one.check)
+
+
+def describe_error(one: ClosedFormError) -> str:
+    """Say how far gradients are from the closed form's."""
+    if not np.isfinite(one.median):
+        return "not finite"
+    if one.upper < 1e-9:
+        return "0 to rounding"
+    return f"{_plainly(one.median)} (95 % of points: below {_plainly(one.upper)}; centre {_plainly(one.centre)})"
+
+
+def _plainly(value: float) -> str:
+    """Write a share in percent, and one that is more than ten times the whole as a factor."""
+    if not np.isfinite(value):
+        return "not finite"
+    if value > 10:
+        return f"{value:.2g} times"
+    return percent(value) if value >= 1e-3 else f"{100 * value:.0e} %"

@@ -200,13 +200,19 @@ def _draw_alone(ax: Axes, dataset: xr.Dataset, *, linewidth: float) -> AxesImage
     return _map(ax, loss, style.Scale.of_loss(loss))
 
 
-CARD_PITCH, CARD_ACROSS, SHAPE = 2.5, 6, 1.35  # room of a map on a screen [inch]; maps in a row; its height for that
+CARD_PITCH, CARD_ACROSS, SHAPE = 3.2, 4, 1.3  # room of a map on a screen [inch]; maps in a row; its height for that
 MIN_COLUMNS = 3  # for the legend below
 MIN_CARD_MAP = 27.0  # room of a map in print [mm]
+PANEL = 3.0  # side of a panel that stands alone [inch]
 ARROWS = 9  # most along each axis of a map
 LENGTH = 0.09  # of an arrow, as a share of a side
 OPPOSED = "#ff6b3d"  # legible on all of the map
-OUTCOMES = {"passes": "#1b7837", "fails": "#b2182b", "not installed": style.QUIET}  # and the words themselves
+VERDICTS = {  # and the words themselves
+    "passes": "#1b7837",
+    "fails": "#b2182b",
+    "not decided": style.QUIET,
+    "not installed": style.QUIET,
+}
 
 
 def card_figure(card: Card, *, width: float | None = None) -> page.Picture:
@@ -231,6 +237,17 @@ def card_figure(card: Card, *, width: float | None = None) -> page.Picture:
     return picture
 
 
+def card_panel(cut: CardSlice, scale: style.Scale, pixels: int) -> page.Picture:
+    """Draw the map of a slice alone, with its arrows, over the whole of a square picture."""
+    picture = page.Picture(style.Sheet.of(None, pitch=PANEL), PANEL)
+    picture.set_dpi(pixels / PANEL)
+    ax = picture.add_axes((0, 0, 1, 1))
+    _frame(ax, shape=1.0, linewidth=0)
+    _map(ax, cut.loss, scale, (0, 1, 0, 1))
+    _draw_arrows(ax, cut, opposing(cut)[0])
+    return picture
+
+
 def _rows(card: Card, columns: int) -> list[list[int]]:
     """Return the numbers of the grades in each row of maps; every scene begins one."""
     scenes = [list(group) for _, group in groupby(range(len(card.grades)), key=lambda k: card.grades[k].scene)]
@@ -252,9 +269,9 @@ def _draw_scene(scene: str, places: Sequence[tuple[int | None, Axes]], card: Car
 
 
 def _draw_map(ax: Axes, grade: Grade, cut: CardSlice | None, scale: style.Scale) -> None:
-    sheet, look = page.sheet_of(ax), OUTCOMES[grade.outcome]
+    sheet, look = page.sheet_of(ax), VERDICTS[grade.verdict]
     _frame(ax, shape=1.0, color=look, linewidth=1.6 * sheet.weight)
-    said = grade.engine.replace(", ", ",\n") + f"\n{grade.outcome}"
+    said = grade.engine.replace(", ", ",\n") + f"\n{grade.verdict}"
     if cut is not None:
         opposed, share = opposing(cut)
         said += f"; {share:.0%} oppose" if np.isfinite(share) else ""

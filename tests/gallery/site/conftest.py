@@ -16,6 +16,7 @@ from gradscape.gallery.files import DATA, RUN_SUFFIX, RUNS, LeagueFiles
 from gradscape.gallery.paper import PaperCaption
 from gradscape.gallery.records import save_run
 from gradscape.gallery.site.build import build_site
+from gradscape.jobs.card import save_slices
 from gradscape.jobs.report import PaperWords, Report
 from gradscape.landscapes.convert import to_json
 from gradscape.landscapes.measures.classify import Verdict
@@ -38,6 +39,7 @@ from gradscape.studies.kept import file_name
 from gradscape.studies.samples import Bootstrap, Comparison, GradientError, LossError, Seconds
 
 from ...command import PATIENCE
+from ...landscapes.draw.figures.records import card
 from ...made_studies import NONE, fidelities, study
 from .browsing import DRAWN
 from .ledges import build_ledges, keep_ledges
@@ -113,16 +115,7 @@ CONVERGENCE = ConvergenceRecord(
 )  # fmt: skip
 
 
-GRADE = {
-    "scene": "drop", "engine": "an engine", "env": "bowl", "fidelity": "draft", "options": {"solver": "fast"},
-    "dims": ["0", "1"], "versions": {"engine": "1.2.3"}, "counts": {"pass": 20, "fail": 1}, "outcome": "fails",
-    "finding": "special places: 1 of 9 slopes < all are wrong", "check": "landscape check bowl --set solver=fast",
-    "slice": "landscape slice bowl --dims 0 1",
-}  # fmt: skip
-CARD = {
-    "created": "2030-01-01", "device": "cpu", "command": "landscape card",
-    "grades": [GRADE, {**GRADE, "outcome": "not installed", "finding": "", "counts": {}}],
-}  # fmt: skip
+CARD = card()
 
 
 class Bowl(Objective):
@@ -248,7 +241,8 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
         path.write_text(json.dumps(to_json(found)))
         picture(path.with_suffix(".png"))
     (folder / "card").mkdir()
-    (folder / "card/card.json").write_text(json.dumps(CARD))
+    write_record(folder / "card/card.json", to_json(CARD))
+    save_slices(folder / "card/card.npz", CARD.slices)
     picture(folder / "card/card.png")
     league(folder)
     census(folder)

@@ -117,11 +117,18 @@ def test_a_page_shows_the_same_cut_elsewhere_where_that_was_sampled(site: Path) 
 
 def test_the_report_card_says_what_was_found_of_which_version(site: Path) -> None:
     page = " ".join((site / "card.html").read_text().split())
-    assert "2 engines in scenes, measured on 2030-01-01 on cpu by the same checks, ours included: 1 fail." in page
+    assert (
+        "4 engines in scenes went through the same check on 2030-01-01, on cpu, ours included: 1 passes, 1 fails"
+        in page
+    )
     assert "engine 1.2.3" in page
-    assert "special places: 1 of 9 slopes &lt; all are wrong" in page
-    assert "landscape check bowl --set solver=fast" in page
+    assert "33 % (22 to 46 %) of 64 points" in page
+    assert "<strong>sign</strong>: the gradient has the wrong sign at 21 of 64 points" in page
+    assert page.count('src="data:image/png;base64,') == 3  # a panel of each that has a slice
     assert 'href="card.html"' in (site / "index.html").read_text()
+    rows = list(csv.DictReader((site / "card/card.csv").read_text().splitlines()))
+    assert [one["verdict"] for one in rows] == ["passes", "not installed", "fails", "not decided"]
+    assert [one["wrong"] for one in rows] == ["0", "0", "21", "0"]
 
 
 def test_the_league_holds_claims_against_pairs_and_says_what_did_not_run(site: Path, data: Path) -> None:

@@ -1,26 +1,83 @@
-"""The report card: what is said of an engine, and where its gradients oppose its losses."""
+"""The report card: which verdict follows from what was measured, and where gradients oppose losses."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from gradscape.landscapes.convert import from_json, to_json
 from gradscape.landscapes.draw.figures.multiples import opposing
-from gradscape.landscapes.measures.card import Card, Grade, count_outcomes, first_finding
+from gradscape.landscapes.measures.card import Card, ClosedFormError, Grade, describe_error
+from gradscape.landscapes.objective import Evaluation
 
-from ..draw.figures.records import card
-
-
-def checked(*ends: str) -> list[dict[str, str]]:
-    return [{"check": f"check {n}", "outcome": end, "figure": "3 of 4", "why": ""} for n, end in enumerate(ends)]
+from ..draw.figures.records import card, grade
 
 
-def test_the_first_failure_is_what_is_said_and_else_the_first_warning() -> None:
-    assert first_finding(checked("pass", "skip")) == ""
-    assert first_finding(checked("pass", "warn", "warn")) == "check 1: 3 of 4"
-    assert first_finding(checked("warn", "fail", "fail", "unexpected")) == "check 1: 3 of 4 (and 2 more)"
-    assert count_outcomes(checked("pass", "warn", "pass")) == {"pass": 2, "warn": 1}
+@pytest.mark.parametrize(
+    ("of", "verdict", "margin"),
+    [
+        (grade(judged=64), "passes", "no"),
+        (grade(judged=58), "not decided", "not decided"),  # 59 points find a defect in 5 % of the box
+        (grade(judged=0), "not decided", "not decided"),
+        (grade(wrong=2, judged=64), "fails", "not decided"),  # 3 %, from 0.4 to 11 %
+        (grade(wrong=3, judged=4096), "fails", "no"),
+        (grade(wrong=21, judged=64), "fails", "yes"),
+        (grade(missing="pip install it"), "not installed", "not decided"),
+        (replace(grade(), share=None), "not decided", "not decided"),
+    ],
+)  # fmt: skip
+def test_a_verdict_follows_from_what_was_measured(of: Grade, verdict: str, margin: str) -> None:
+    assert (of.verdict, of.margin) == (verdict, margin)
+
+
+def test_it_is_computed_and_not_read() -> None:
+    record = to_json(card())
+    assert [one["verdict"] for one in record["grades"]] == ["passes", "not installed", "fails", "not decided"]
+    for one in record["grades"]:
+        one["verdict"] = one["margin"] = "passes"
+    again = from_json(Card, record)
+    assert [one.verdict for one in again.grades] == [one.verdict for one in card().grades]
+    assert again.tally() == "1 passes, 1 fails, 1 not decided, 1 not installed"
+
+
+def test_what_is_said_is_the_first_diagnosis_and_else_the_first_check_that_failed() -> None:
+    wrong = grade(wrong=21)
+    assert (wrong.cause, wrong.finding) == ("sign", "the gradient has the wrong sign at 21 of 64 points")
+    undiagnosed = replace(wrong, diagnosis=None)
+    assert undiagnosed.finding.startswith("gradient: wrong at 33 % (22 to 46 %) of 64 points: ")
+    assert (grade().cause, grade().finding) == ("", "")
+    assert grade(judged=16).unjudged == 0.75
+
+
+def evaluation(loss: list[float], grad: list[list[float]]) -> Evaluation:
+    return Evaluation.from_results(torch.tensor(loss).double(), torch.tensor(grad).double())
+
+
+def test_errors_against_a_closed_form_are_shares_of_its_gradient() -> None:
+    exact = evaluation([0.0, 2.0, 1.0], [[1.0, 0.0], [0.0, 2.0], [3.0, 4.0]])
+    found = evaluation([0.0, 2.0, 1.2], [[1.0, 0.1], [0.0, -2.0], [3.0, 4.0]])
+    off = ClosedFormError.of(found, exact)
+    assert off is not None
+    assert (off.points, off.centre, off.median) == (3, pytest.approx(0.1), pytest.approx(0.1))
+    assert 1.5 < off.upper < 2.0
+    assert off.loss == 0.0
+    assert describe_error(off).startswith("10 % (95 % of points: below ")
+    assert ClosedFormError.of(replace(found, grad=None), exact) is None
+    itself = ClosedFormError.of(exact, exact)
+    assert itself is not None
+    assert describe_error(itself) == "0 to rounding"
+
+
+def test_a_gradient_that_is_no_number_has_no_finite_error() -> None:
+    exact = evaluation([0.0, 2.0], [[1.0, 0.0], [0.0, 2.0]])
+    lost = replace(exact, grad=torch.tensor([[torch.nan, 0.0], [0.0, 2.0]]).double())
+    off = ClosedFormError.of(lost, exact)
+    assert off is not None
+    assert describe_error(off) == "not finite"
+    again = from_json(ClosedFormError, json.loads(json.dumps(to_json(off))))
+    assert np.isnan(again.median)
 
 
 def test_gradients_oppose_the_slope_where_they_point_uphill() -> None:
@@ -35,11 +92,11 @@ def test_a_card_is_read_again_as_it_was_written() -> None:
     found = card()
     again = from_json(Card, json.loads(json.dumps(to_json(found))))
     assert to_json(again) == to_json(found)
-    assert (again.failed, again.engines()) == (1, ["engine 1.2.3"])
-    assert list(found.table()["outcome"]) == ["passes", "not installed", "fails", "passes"]
+    assert (again.count("fails"), again.engines()) == (1, ["engine 1.2.3"])
+    assert list(found.table()["verdict"]) == ["passes", "not installed", "fails", "not decided"]
 
 
-@pytest.mark.parametrize("change", [{"outcome": "good"}, {"dims": 3}, {"counts": {"pass": "many"}}, {"engine": None}])
+@pytest.mark.parametrize("change", [{"power": "much"}, {"dims": 3}, {"share": {"wrong": "many"}}, {"engine": None}])
 def test_a_record_of_something_else_is_refused(change: dict[str, object]) -> None:
     record = to_json(card())["grades"][0]
     with pytest.raises(Exception, match=r".+"):

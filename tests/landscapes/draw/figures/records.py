@@ -1,5 +1,6 @@
 """Records of studies that fill their figures: each setting there is, in each precision, long names, many rows."""
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -7,11 +8,14 @@ import xarray as xr
 
 from gradscape.envs.records import Fidelity
 from gradscape.jobs.league import simulated_scenes
+from gradscape.landscapes.checks.diagnosis import Diagnosis, Region
+from gradscape.landscapes.checks.examination import Share, could_be_missed
 from gradscape.landscapes.draw import style
-from gradscape.landscapes.measures.card import Card, CardSlice, Grade
+from gradscape.landscapes.measures.card import Card, CardSlice, ClosedFormError, FailedCheck, Grade
 from gradscape.landscapes.measures.census import MEASURES, Census, CensusDesign, SurveyedSlice, conclude
 from gradscape.landscapes.measures.classify import WORDS
 from gradscape.landscapes.space import ParameterSpace
+from gradscape.landscapes.statistics import share
 from gradscape.optim.registry import methods
 from gradscape.studies.convergence import (
     ConvergenceRecord,
@@ -147,14 +151,26 @@ def card() -> Card:
     }
     slices = {n: CardSlice(**where, slope=(1 - n) * slope, loss_unit="m²") for n in (0, 2, 3)}  # type: ignore[arg-type] # each of its kind
     names = (("drop", "an engine"), ("drop", "another"), ("flight", "an engine"), ("a slide on a rough floor", "third"))
-    ends = ("passes", "not installed", "fails", "passes")
-    grades = [
-        Grade(
-            scene, engine, "bowl", "draft", {}, ["0", "1"], {"engine": "1.2.3"}, end, "", {}, "landscape", "landscape"
-        )  # type: ignore[arg-type] # each of its kind
-        for (scene, engine), end in zip(names, ends, strict=True)
-    ]
+    held = {0: grade(judged=64), 1: grade(missing="pip install another"), 2: grade(wrong=21), 3: grade(judged=20)}
+    grades = [replace(held[n], scene=scene, engine=engine) for n, (scene, engine) in enumerate(names)]
     return Card(tuple(grades), "2030-01-01", "cpu", "landscape card", slices)
+
+
+def grade(wrong: int = 0, judged: int = 64, missing: str = "") -> Grade:
+    """Return a grade by how many of so many points are wrong, of 64 that were drawn."""
+    found = share(wrong, judged)
+    counted = Share(wrong, judged, 64, found.low, found.high, could_be_missed(judged))
+    region = Region("speed x below 0.3", ("speed x",), 0.03, 64)
+    what = f"the gradient has the wrong sign at {wrong} of {judged} points"
+    told = Diagnosis("sign", "fail", "certain", what, "Look for a minus that is one too many.", ("speed x",), region)
+    broken = FailedCheck("gradient", f"wrong at {counted.describe()}", what)
+    return Grade(
+        scene="drop", engine="an engine", env="bowl", fidelity="draft", options={"solver": "fast"}, dims=["0", "1"],
+        versions={} if missing else {"engine": "1.2.3"}, missing=missing, power=0.05,
+        share=None if missing else counted, failed=(broken,) if wrong else (), diagnosis=told if wrong else None,
+        closed_form=ClosedFormError(64, 0.013, 0.4, 2.1, 0.006) if wrong else None, seconds=12.3,
+        check="landscape check bowl --set solver=fast", slice="landscape slice bowl --dims 0 1",
+    )  # fmt: skip
 
 
 def census() -> Census:
