@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 Verdict = Literal["passes", "fails", "not decided", "not installed"]
 VERDICTS: tuple[Verdict, ...] = ("passes", "fails", "not decided", "not installed")
 Answer = Literal["yes", "no", "not decided"]
+WRONG_PHYSICS = 0.1  # median error against a closed form from which a gradient is not that of the physics
 UPPER = 0.95  # quantile of the errors against a closed form that is said beside their median
 
 
@@ -93,7 +94,7 @@ class Grade:
     check: str
     slice: str
 
-    derived: ClassVar[tuple[str, ...]] = ("verdict", "margin", "unjudged")
+    derived: ClassVar[tuple[str, ...]] = ("verdict", "margin", "unjudged", "program_only")
 
     @property
     def verdict(self) -> Verdict:
@@ -120,6 +121,11 @@ class Grade:
         if self.share is None or self.share.points == 0:
             return np.nan
         return 1 - self.share.judged / self.share.points
+
+    @property
+    def program_only(self) -> bool:
+        """Whether gradients are right of the program, and not of the physics."""
+        return self.verdict == "passes" and self.closed_form is not None and self.closed_form.median > WRONG_PHYSICS
 
     @property
     def cause(self) -> str:

@@ -51,6 +51,13 @@ def test_what_is_said_is_the_first_diagnosis_and_else_the_first_check_that_faile
     assert grade(judged=16).unjudged == 0.75
 
 
+def test_a_gradient_that_is_far_from_the_closed_form_may_be_right_of_the_program() -> None:
+    far, near = (ClosedFormError(64, off, off, off, 0.0) for off in (0.4, 0.004))
+    assert replace(grade(), closed_form=far).program_only
+    assert not replace(grade(), closed_form=near).program_only
+    assert not replace(grade(wrong=21), closed_form=far).program_only  # it is wrong of the program too
+
+
 def evaluation(loss: list[float], grad: list[list[float]]) -> Evaluation:
     return Evaluation.from_results(torch.tensor(loss).double(), torch.tensor(grad).double())
 
