@@ -247,6 +247,10 @@ class Objective(abc.ABC):
         """Return the standard error of the loss at each point [loss unit]; None where repeats have to tell."""
         return None
 
+    def nan_origin(self, x: Float[Tensor, " dim"]) -> str:
+        """Return which operation makes the gradient at a point not finite, where the loss is; "" where unknown."""
+        return ""
+
     def observe(self, x: Float[Tensor, "batch dim"], decision: int) -> Float[Tensor, "batch feature"]:
         """Return what a policy sees before a decision: here no more than that nothing has happened yet."""
         return x.new_zeros(len(x), 1)
@@ -279,8 +283,11 @@ class ObjectiveWrapper(Objective):
         self.whole_batches = objective.whole_batches
 
 
-PASSED_ON = "threads preferred_batch precision packages identity prepare shrink memory events energy noise observe"
-for _part in PASSED_ON.split():
+PASSED_ON = (
+    *("threads", "preferred_batch", "precision", "packages", "identity", "prepare", "shrink", "memory"),
+    *("events", "energy", "noise", "nan_origin", "observe"),
+)
+for _part in PASSED_ON:
     setattr(ObjectiveWrapper, _part, property(attrgetter(f"objective.{_part}")))
 
 
