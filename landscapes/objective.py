@@ -231,6 +231,9 @@ class Objective(abc.ABC):
     def shrink(self, rows: int) -> None:  # noqa: B027 -- most hold no memory between evaluations
         """Take at most `rows` points at once from now on."""
 
+    def release(self) -> None:  # noqa: B027 -- most hold no memory between evaluations
+        """Give back the memory that is held between evaluations."""
+
     def memory(self) -> int:
         """Estimate the bytes that the evaluation of one point takes."""
         return 0
@@ -284,8 +287,8 @@ class ObjectiveWrapper(Objective):
 
 
 PASSED_ON = (
-    *("threads", "preferred_batch", "precision", "packages", "identity", "prepare", "shrink", "memory"),
-    *("events", "energy", "noise", "nan_origin", "observe"),
+    *("threads", "preferred_batch", "precision", "packages", "identity", "prepare", "shrink"),
+    *("release", "memory", "events", "energy", "noise", "nan_origin", "observe"),
 )
 for _part in PASSED_ON:
     setattr(ObjectiveWrapper, _part, property(attrgetter(f"objective.{_part}")))
