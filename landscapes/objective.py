@@ -242,6 +242,14 @@ class Objective(abc.ABC):
         """Count what happens at each point, name -> shape (batch,); where a count changes, losses may jump."""
         return {}
 
+    def special_places(self) -> Mapping[str, Float[Tensor, " dim"]]:
+        """Return points by name at which a check is to look: a contact begins, two bodies meet, a motor stalls."""
+        return {}
+
+    def nan_origin(self, x: Float[Tensor, " dim"]) -> str:
+        """Say which operation makes the first NaN of the gradient at one point; empty where nothing tells."""
+        return ""
+
     def energy(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch step"] | None:
         """Return the mechanical energy [J] over time of a motion that nothing drives; None where there is none."""
         return None
@@ -249,10 +257,6 @@ class Objective(abc.ABC):
     def noise(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, " batch"] | None:
         """Return the standard error of the loss at each point [loss unit]; None where repeats have to tell."""
         return None
-
-    def nan_origin(self, x: Float[Tensor, " dim"]) -> str:
-        """Return which operation makes the gradient at a point not finite, where the loss is; "" where unknown."""
-        return ""
 
     def observe(self, x: Float[Tensor, "batch dim"], decision: int) -> Float[Tensor, "batch feature"]:
         """Return what a policy sees before a decision: here no more than that nothing has happened yet."""
@@ -287,10 +291,10 @@ class ObjectiveWrapper(Objective):
 
 
 PASSED_ON = (
-    *("threads", "preferred_batch", "precision", "packages", "identity", "prepare", "shrink"),
-    *("release", "memory", "events", "energy", "noise", "nan_origin", "observe"),
+    "threads preferred_batch precision packages identity prepare shrink release memory events special_places "
+    "nan_origin energy noise observe"
 )
-for _part in PASSED_ON:
+for _part in PASSED_ON.split():
     setattr(ObjectiveWrapper, _part, property(attrgetter(f"objective.{_part}")))
 
 
