@@ -35,8 +35,8 @@ class MemoryGrowth:
     """Say how much more memory is held after evaluations than before.
 
     `per_evaluation` is the median slope [bytes], which a jump, such as a cache, leaves at zero. `total` is its growth
-    over all `evaluations` after the warm-up [bytes], and `rising` the share of blocks of evaluations after which there was more. `missed` is what a growth by each
-    evaluation may be [bytes] without being found.
+    over all `evaluations` after the warm-up [bytes], and `rising` the share of blocks of evaluations after which there
+    was more. `missed` is what a growth by each evaluation may be [bytes] without being found.
     """
 
     where: Where
