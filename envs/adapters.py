@@ -103,13 +103,22 @@ class FunctionEnvironment(Environment):
         found = self.evaluate(x[None])
         if int(found.status[0]) != Status.NO_GRADIENT:
             return ""
-        values, backend = self.space.to_values(self._check_points(x[None])), self.function.backend
-        said = ""
+        return self._first_said(self.function.backend.nan_origin, x)
+
+    def wrong_origin(self, x: Float[Tensor, " dim"]) -> str:
+        """Return which operation's own derivative is wrong at a point, where it is finite; "" where none is known.
+
+        A sentence's end, such as `kernel step in line 12 of my.py`.
+        """
+        return self._first_said(self.function.backend.wrong_origin, x)
+
+    def _first_said(self, ask: Callable[..., str], x: Float[Tensor, " dim"]) -> str:
+        """Return what a library says of the function at a point, for the first seed of which it says something."""
+        values, precision = self.space.to_values(self._check_points(x[None])), self.fidelity.precision
+        said = (ask(self.function, self._settings_of(seed), precision, self.device, values) for seed in self._seeds)
         with torch.inference_mode(False), torch.enable_grad(), suppress(Exception):  # it is no more than a hint
-            for seed in self._seeds:
-                settings = self._settings_of(seed)
-                said = said or backend.nan_origin(self.function, settings, self.fidelity.precision, self.device, values)
-        return said
+            return next(filter(None, said), "")
+        return ""
 
     def named(self, name: str) -> FunctionEnvironment:
         """Return the same environment by another name."""

@@ -250,6 +250,10 @@ class Objective(abc.ABC):
         """Say which operation makes the first NaN of the gradient at one point; empty where nothing tells."""
         return ""
 
+    def wrong_origin(self, x: Float[Tensor, " dim"]) -> str:
+        """Say which operation's own derivative is wrong at one point, where it is finite; empty where nothing tells."""
+        return ""
+
     def energy(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch step"] | None:
         """Return the mechanical energy [J] over time of a motion that nothing drives; None where there is none."""
         return None
@@ -292,7 +296,7 @@ class ObjectiveWrapper(Objective):
 
 PASSED_ON = (
     "threads preferred_batch precision packages identity prepare shrink release memory events special_places "
-    "nan_origin energy noise observe"
+    "nan_origin wrong_origin energy noise observe"
 )
 for _part in PASSED_ON.split():
     setattr(ObjectiveWrapper, _part, property(attrgetter(f"objective.{_part}")))

@@ -18,7 +18,7 @@ from ...landscapes.objective import SimulatorError
 from ..base import check_shape
 from ..user_functions import Backend, Compute, Function
 from .runtime import cuda_available, precision
-from .warp_origins import warp_origin
+from .warp_origins import warp_origin, wrong_kernel
 
 CORRUPTS = "This may corrupt gradient computation"  # how Warp ends what it says of an array that is overwritten
 
@@ -44,7 +44,16 @@ class WarpBackend(Backend):
         self, call: Function, settings: Mapping[str, Any], precision: str, device: str, x: Float[Tensor, "one dim"]
     ) -> str:
         """Return which kernel makes the gradient at a point not finite, and by which argument."""
-        return WarpFunction(partial(call.fn, **settings), call.name, precision, device, unchecked=False).nan_origin(x)
+        return self._looked_at(call, settings, precision, device).nan_origin(x)
+
+    def wrong_origin(
+        self, call: Function, settings: Mapping[str, Any], precision: str, device: str, x: Float[Tensor, "one dim"]
+    ) -> str:
+        """Return which kernel's adjoint differs from its differences at a point."""
+        return self._looked_at(call, settings, precision, device).wrong_origin(x)
+
+    def _looked_at(self, call: Function, settings: Mapping[str, Any], precision: str, device: str) -> WarpFunction:
+        return WarpFunction(partial(call.fn, **settings), call.name, precision, device, unchecked=False)
 
 
 @dataclass(eq=False)
@@ -80,14 +89,25 @@ class WarpFunction:
 
     def nan_origin(self, x: Float[Tensor, "one dim"]) -> str:
         """Return which kernel makes the gradient at a point not finite, and by which argument."""
+        with self._recorded(x) as (tape, losses):
+            return warp_origin(tape, losses)
+
+    def wrong_origin(self, x: Float[Tensor, "one dim"]) -> str:
+        """Return which kernel's adjoint differs from its differences at a point."""
+        with self._recorded(x) as (tape, _):
+            return wrong_kernel(tape)
+
+    @contextmanager
+    def _recorded(self, x: Float[Tensor, "one dim"]) -> Iterator[tuple[Any, Any]]:
+        """Give the tape of a point and its loss."""
         with wp.ScopedDevice(self.device):
             points: Any = wp.array(x.numpy(), dtype=self.real, requires_grad=True)
             with wp.Tape() as tape:
                 losses = self._losses(points)
             try:
-                return warp_origin(tape, losses)
+                yield tape, losses
             finally:
-                tape.zero()
+                tape.zero()  # of arrays that the function keeps
 
     def _losses(self, points: Any) -> Any:
         """Return what the function makes of points, held against what it must be."""
