@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,9 +14,10 @@ from .diagnosis import CERTAINTIES, Diagnosis, Region
 from .evidence import Evidence, Samples
 from .examination import Examination, percent
 from .finding import FAIL
-from .history import ROWS, History
+from .history import ROWS, SAME, History
 from .probe import EPS
 from .slopes import TOLERANCE, UNJUDGED, Kind
+from .usefulness import Usefulness
 
 NAMED = 6  # parameters that are named, at most
 MANY_LINES = 20  # from which an average is told
@@ -27,24 +28,26 @@ STEEP_SHARE = 0.2
 
 @dataclass(frozen=True)
 class Calls:
-    """What checks of calls have found: of rows in a batch, of losses with and without gradients, of two backwards."""
+    """What checks of calls have found: the names of those that failed, and what they measured."""
 
     history: History | None = None
-    leaks: bool = False
-    depends: bool = False
+    broken: tuple[str, ...] = ()
     second_backward: float = 0.0
 
     def evidence(self) -> Evidence:
         """Return it as numbers."""
-        found: Evidence = {"leaks": self.leaks, "depends": self.depends, "random": 0.0, "hidden": 0.0}
+        depends = "loss without gradient" in self.broken
+        found: Evidence = {"leaks": 0.0, "depends": depends, "random": 0.0, "hidden": 0.0}
         if (one := self.history) is not None:
-            hidden = one.loss > 1e-9 and not one.random
+            hidden = one.loss > SAME and not one.random
             found |= {
                 "random": one.random,
+                "leaks": one.leak > max(SAME, 10 * one.loss),
                 "hidden": hidden,
                 "stale": one.stale,
                 "grows": one.grows,
                 "batch": one.batch,
+                "alike": one.alike,
                 "rows": ROWS,
                 "loss_moves": one.loss,
                 "gradient_moves": one.gradient,
@@ -68,7 +71,9 @@ def conclude(
     found += list(_of_nan(seen, origin))
     if not explained:
         found += list(_of_wrong(seen, calls, length or {}))
-    found += [one for judge in (_of_zero, _of_steep, _of_noise, _of_length) for one in judge(seen)]
+    found += [*_of_zero(seen), *_of_length(seen)]
+    if not any(one.outcome == FAIL for one in found):  # nothing is the landscape's while a gradient is wrong
+        found += [*_of_steep(seen), *_of_noise(seen)]
     return tuple(sorted(found, key=lambda one: (one.outcome != FAIL, CERTAINTIES.index(one.certainty))))
 
 
@@ -102,8 +107,10 @@ def _where(region: Region | None) -> str:
 def _of_calls(seen: Examination, calls: Calls) -> Iterator[Diagnosis]:
     evidence = calls.evidence()
     how = "they add up from call to call" if evidence.get("grows") else "a call returns the gradient of the one before"
+    short = f"{evidence.get('batch', 1.0):.3g} times shorter"
+    how_batch = "all rows have the same" if evidence.get("alike") else short
     if (known := recognise("calls", evidence)) is not None:
-        yield _make(*known, evidence, {"how": how})
+        yield _make(*known, evidence, {"how": how, "how_batch": how_batch})
 
 
 def _of_grain(seen: Examination, calls: Calls) -> Iterator[Diagnosis]:
@@ -171,6 +178,9 @@ def _of_wrong(seen: Examination, calls: Calls, length: Evidence) -> Iterator[Dia
         "by": _by(names),
         "where": _where(region),
         "length": f" (wrong from {length['first_wrong']:.3g} of its length on)" if "first_wrong" in length else "",
+        "unit_text": "its ratio to the slope is the range of each parameter, or one over it"
+        if evidence.get("units", 0) > 0.5
+        else f"it is {evidence.get('ratio', 1):.4g} times the slope",
         "moved_text": percent(evidence.get("moved", 0.0)),
     }
     if (known := recognise("wrong", evidence)) is not None:
@@ -259,6 +269,18 @@ def _of_noise(seen: Examination) -> Iterator[Diagnosis]:
     }
     if (known := recognise("noise", evidence)) is not None:
         yield _make(*known, evidence, {})
+
+
+def conclude_jumps(curve: Sequence[Usefulness]) -> tuple[Diagnosis, ...]:
+    """Say that the loss jumps so regularly that means of gradients are not the slope of the smoothed loss."""
+    for one in sorted(curve, key=lambda one: -one.step):
+        evidence = {"step": one.step, "bias": one.bias.value, "low": one.bias.low, "high": one.bias.high}
+        evidence["least_bias"] = max(one.bias.low, -one.bias.high)
+        interval = f"{percent(one.bias.low, bare=True)} to {percent(one.bias.high)}"
+        texts = {"lacks": percent(one.bias.value), "interval": interval, "width": percent(one.step)}
+        if (known := recognise("jumps", evidence)) is not None:
+            return (_make(*known, evidence, texts),)
+    return ()
 
 
 def _of_length(seen: Examination) -> Iterator[Diagnosis]:

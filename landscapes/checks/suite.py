@@ -18,7 +18,7 @@ from ..sampling.memory import ADVICE, is_out_of_memory
 from . import examination, extremes, growth
 from . import parameters as by_parameter
 from .causes import causes
-from .conclude import Calls, conclude
+from .conclude import Calls, conclude, conclude_jumps
 from .diagnosis import Diagnosis
 from .examination import Examination, examine, percent
 from .extremes import ExtremeCase
@@ -136,7 +136,7 @@ def _other(subject: Subject, twin: Callable[[], Objective] | None) -> Callable[[
 def _checks(subject: Subject, how: Settings, results: Results) -> Iterator[tuple[str, Callable[[], Finding]]]:
     other = _other(subject, how.twin)
     for name, run in PROMISES.items():
-        yield name, partial(run, subject)
+        yield name, partial(_keep_promise, name, run, subject, results)
     yield "order of calls", partial(_check_calls, subject, results)
     exact = other if subject.precision == "float32" else None
     best = exact or (lambda: subject)
@@ -148,6 +148,14 @@ def _checks(subject: Subject, how: Settings, results: Results) -> Iterator[tuple
     yield "forward against reverse", lambda: _check_modes(subject, how.other_mode)
     yield "growth over horizons", lambda: growth.check_growth(best(), how.horizons)
     yield from extremes.checks(subject, other, how.variants)
+
+
+def _keep_promise(name: str, run: Callable[[Subject], Finding], subject: Subject, results: Results) -> Finding:
+    """Make a check of calls, and keep what it says of causes."""
+    found = run(subject)
+    if found.outcome == FAIL:
+        results.calls = replace(results.calls, broken=(*results.calls.broken, name))
+    return found
 
 
 def _check_calls(subject: Subject, results: Results) -> Finding:
@@ -251,6 +259,8 @@ def _check_usefulness(results: Results) -> Finding:
     if seen is None or seen.found.grad is None:
         return skip("no gradient")
     results.usefulness = usefulness(seen.probe, seen.random)
+    if not any(one.outcome == FAIL for one in results.diagnoses):
+        results.diagnoses += conclude_jumps(results.usefulness)
     at = next((one for one in results.usefulness if one.step == OPTIMISER_STEP), None)
     if at is None or at.compared < LEAST_SHARE * len(seen.u):
         return skip("no slope to compare", "all are flat, lost in noise, or failed")
@@ -260,7 +270,13 @@ def _check_usefulness(results: Results) -> Finding:
         f"{percent(at.sign.high)}), median relative error {at.error:.2g}"
     )
     why = f"slopes do not hold that far: wanted are sign right {SIGNS:.0%} and an error of {USEFUL:g} for a search"
-    numbers = {"step": at.step, "sign": at.sign.value, "error": at.error, "cosine": at.cosine.value, "bias": at.bias}
+    numbers = {
+        "step": at.step,
+        "sign": at.sign.value,
+        "error": at.error,
+        "cosine": at.cosine.value,
+        "bias": at.bias.value,
+    }
     return Finding("", PASS if useful else WARN, figure, "" if useful else why, numbers)
 
 
