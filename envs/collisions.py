@@ -98,10 +98,9 @@ class CollisionScene(Environment):
         return self._drawn(time, pad(frames[:, 0], (0, 1)))
 
     def _drawn(self, time: Float[Tensor, " frame"], at: Float[Tensor, "frame disc 3"]) -> Episode:
-        radius, colours = self.table.radius, ("rubber", "steel")
+        radius = self.table.radius
         balls = [
-            Part("sphere", material, at[:, k : k + 1], (radius,))
-            for k, material in zip(range(at.shape[1]), colours, strict=False)
+            Part("sphere", "rubber" if k == 0 else "steel", at[:, k : k + 1], (radius,)) for k in range(at.shape[1])
         ]
         trails = [Part("trail", "rubber", at[:, k : k + 1], (radius / 6,)) for k in range(at.shape[1])]
         room, (low, high) = 3 * radius, torch.aminmax(at.flatten(0, 1), dim=0)
@@ -188,7 +187,8 @@ class GroundWall(_OneBall):
         return missed(end[:, 0])
 
     def _closed_form(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, " batch"]:
-        return missed(closed_forms.ground_wall(*x.view(-1, 3, 2).unbind(dim=1), self.time))
+        place, speed, push = x.view(-1, 3, 2).unbind(dim=1)
+        return missed(closed_forms.ground_wall(place, speed, push, self.time))
 
 
 class TwoBalls(CollisionScene):

@@ -300,7 +300,7 @@ def _grade(one: Entrant, about: Measured | None, resolution: int, missing: str =
 
 def save_slices(path: Path, slices: Mapping[int, CardSlice]) -> None:
     """Write slices as arrays by number and name; what they are called is in them too."""
-    arrays: dict[str, NDArray[Any]] = {}
+    arrays: dict[str, Any] = {}
     for number, cut in slices.items():
         arrays |= {f"{number} {name}": np.asarray(getattr(cut, name), np.float32) for name in SAMPLED}
         arrays[f"{number} said"] = np.array([*cut.labels, cut.loss_unit])
