@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
     from ..envs.base import Environment
 
-LIBRARIES = {"warp": ("warp-lang",), "torch": ("torch",)}  # of our own scenes, by engine
+LIBRARIES = {"warp": ("warp-lang",), "torch": ("torch",), "newton": ("newton", "warp-lang")}  # by engine
 CLOSED_FORM_POINTS = 63  # at random, at which gradients are held against a closed form, and the centre
 LARGEST = 400  # parameters, of a chain
 PAGE, SLICES = "card.html", "card.npz"
@@ -72,9 +72,10 @@ class Entrant:
     @property
     def packages(self) -> tuple[str, ...]:
         """The packages that its environment is simulated by."""
-        extra = EXTRAS.get(entries()[self.env].extra, ())
+        extra = entries()[self.env].extra
         engine = "torch" if self.scene == CONTROL else environment_class(self.env).engines[0]
-        return extra or (PACKAGE, *LIBRARIES[engine])
+        libraries = LIBRARIES.get(engine, EXTRAS.get(extra, ()))
+        return libraries if extra else (PACKAGE, *libraries)
 
 
 CONTROL = "control"

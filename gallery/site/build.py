@@ -24,9 +24,8 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from ... import __version__
 from ...envs.registry import entries
-from ...landscapes.checks.examination import percent
 from ...landscapes.convert import to_json
-from ...landscapes.draw.card import TEMPLATES, card_scenes, colour_stops
+from ...landscapes.draw.card import FILTERS, TEMPLATES, card_scenes, colour_stops
 from ...landscapes.identity import plane_of
 from ...landscapes.measures.card import Card
 from ...landscapes.measures.classify import WORDS
@@ -148,7 +147,7 @@ def _templates() -> Environment:
         trim_blocks=True, lstrip_blocks=True,
     )  # fmt: skip
     pages.filters["number"] = _number
-    pages.filters["percent"] = percent
+    pages.filters |= FILTERS
     pages.filters["dark"] = dark_name
     pages.filters["beside"] = _describe_companion
     pages.filters["size"] = size_class

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
@@ -13,7 +13,7 @@ import numpy as np
 from PIL import Image
 
 from ..checks.examination import percent
-from ..measures.card import Card, CardSlice, Grade, describe_error
+from ..measures.card import Card, CardSlice, Grade, describe_share
 from . import style
 from .style import number
 
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 TEMPLATES = Path(__file__).parent / "templates"
 PIXELS = 360  # of a panel, along each side
 COLOURS = 96  # of a panel
+FILTERS: dict[str, Callable[..., str]] = {"percent": percent, "off": describe_share}  # of the table's template
 STOPS = 9  # of the gradient that stands for the colour map
 
 
@@ -36,7 +37,6 @@ class CardRow:
     panel: str
     axes: tuple[str, str]
     opposing: str
-    error: str
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ def templates() -> jinja2.Environment:
         loader=FileSystemLoader(TEMPLATES), autoescape=True, undefined=StrictUndefined,
         trim_blocks=True, lstrip_blocks=True,
     )  # fmt: skip
-    pages.filters["percent"] = percent
+    pages.filters |= FILTERS
     return pages
 
 
@@ -90,15 +90,14 @@ def _scene(card: Card, name: str, places: Sequence[int]) -> CardScene:
 
 
 def _card_row(grade: Grade, cut: CardSlice | None, scale: style.Scale) -> CardRow:
-    error = describe_error(grade.closed_form) if grade.closed_form is not None else ""
     if cut is None:
-        return CardRow(grade, "", ("", ""), "", error)
+        return CardRow(grade, "", ("", ""), "")
     from .figures.multiples import card_panel, opposing
 
     _, share = opposing(cut)
     panel = _embedded(card_panel(cut, scale, PIXELS))
     axes = tuple(f"{label}, {_ends(ticks)}" for label, ticks in zip(cut.labels, (cut.u, cut.v), strict=True))
-    return CardRow(grade, panel, (axes[0], axes[1]), percent(share) if np.isfinite(share) else "", error)
+    return CardRow(grade, panel, (axes[0], axes[1]), percent(share) if np.isfinite(share) else "")
 
 
 def _embedded(picture: Picture) -> str:

@@ -24,6 +24,7 @@ Verdict = Literal["passes", "fails", "not decided", "not installed"]
 VERDICTS: tuple[Verdict, ...] = ("passes", "fails", "not decided", "not installed")
 Answer = Literal["yes", "no", "not decided"]
 WRONG_PHYSICS = 0.1  # median error against a closed form from which a gradient is not that of the physics
+ROUNDED = 1e-7  # an error that is rounding
 UPPER = 0.95  # quantile of the errors against a closed form that is said beside their median
 
 
@@ -222,17 +223,17 @@ def _row(one: Grade) -> Sequence[Any]:
 
 def describe_error(one: ClosedFormError) -> str:
     """Say how far gradients are from the closed form's."""
-    if not np.isfinite(one.median):
-        return "not finite"
-    if one.upper < 1e-9:
-        return "0 to rounding"
-    return f"{_plainly(one.median)} (95 % of points: below {_plainly(one.upper)}; centre {_plainly(one.centre)})"
+    most = f" (95 % of points: below {describe_share(one.upper)})" if one.upper >= ROUNDED else ""
+    return f"{describe_share(one.median)}{most}"
 
 
-def _plainly(value: float) -> str:
-    """Write a share in percent, and one that is more than ten times the whole as a factor."""
+def describe_share(value: float) -> str:
+    """Write a share in percent, with a digit where it is small, and one of more than ten times the whole as a factor.
+
+    What rounding makes is "none".
+    """
     if not np.isfinite(value):
         return "not finite"
     if value > 10:
-        return f"{value:.2g} times"
-    return percent(value) if value >= 1e-3 else f"{100 * value:.0e} %"
+        return f"{value:,.0f} times"
+    return percent(value) if value >= 1e-3 else f"{100 * value:.1g} %" if value >= ROUNDED else "none"

@@ -9,7 +9,7 @@ import torch
 
 from gradscape.landscapes.convert import from_json, to_json
 from gradscape.landscapes.draw.figures.multiples import opposing
-from gradscape.landscapes.measures.card import Card, ClosedFormError, Grade, describe_error
+from gradscape.landscapes.measures.card import Card, ClosedFormError, Grade, describe_error, describe_share
 from gradscape.landscapes.objective import Evaluation
 
 from ..draw.figures.records import card, grade
@@ -74,7 +74,18 @@ def test_errors_against_a_closed_form_are_shares_of_its_gradient() -> None:
     assert ClosedFormError.of(replace(found, grad=None), exact) is None
     itself = ClosedFormError.of(exact, exact)
     assert itself is not None
-    assert describe_error(itself) == "0 to rounding"
+    assert describe_error(itself) == "none"
+
+
+@pytest.mark.parametrize(
+    ("value", "said"),
+    [
+        (134.1, "134 times"), (1.51, "151 %"), (0.013, "1 %"), (2e-6, "0.0002 %"), (1e-15, "none"),
+        (np.nan, "not finite"),
+    ],
+)  # fmt: skip
+def test_errors_are_written_to_be_read(value: float, said: str) -> None:
+    assert describe_share(value) == said
 
 
 def test_a_gradient_that_is_no_number_has_no_finite_error() -> None:
