@@ -29,7 +29,7 @@ SMALL = 120  # height of a test's pictures [pixel]
 
 @cache
 def scene(name: str, *, horizon: float = 1.0) -> tuple[Environment, Episode]:
-    env = make(name, fidelity="draft", device="cpu", horizon=horizon)
+    env = make(name, device="cpu", horizon=horizon)  # at its cheapest fidelity
     x = env.example(next(iter(env.examples))) if env.examples else env.space.center
     return env, env.episode(x)
 
