@@ -140,7 +140,8 @@ def _program(jaxpr: Any, consts: Values, values: Values, place: Place | None) ->
     """Return the equations of a jaxpr as steps; `place` is where they stand, None where each says so itself."""
     known = dict(zip((*jaxpr.constvars, *jaxpr.invars), (*consts, *values), strict=True))
     atoms: list[Any] = [*jaxpr.outvars, *(atom for equation in jaxpr.eqns for atom in equation.invars)]
-    numbers = {_key(one): jnp.asarray(one.val, one.aval.dtype) for one in atoms if isinstance(one, core.Literal)}
+    literals: list[Any] = [one for one in atoms if isinstance(one, core.Literal)]
+    numbers = {_key(one): jnp.asarray(one.val, one.aval.dtype) for one in literals}
     steps = [_step(jaxpr, equation, place or _place(equation)) for equation in jaxpr.eqns]
     return _Program(steps, tuple(jaxpr.invars), tuple(map(_key, jaxpr.outvars)), known | numbers)
 
