@@ -93,7 +93,11 @@ class WarpFunction:
             return warp_origin(tape, losses)
 
     def wrong_origin(self, x: Float[Tensor, "one dim"]) -> str:
-        """Return which kernel's adjoint differs from its differences at a point."""
+        """Return which kernel's adjoint differs from its differences at a point, or what is overwritten."""
+        try:
+            self._refuse_overwrites(x)
+        except SimulatorError as error:
+            return _line(error)
         with self._recorded(x) as (tape, _):
             return wrong_kernel(tape)
 
