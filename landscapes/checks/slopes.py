@@ -35,6 +35,7 @@ ROUGH = 100  # times rounding is what losses change between neighbours where the
 MOST_FINER = 24  # lines, at most, that are walked over finer steps
 BEYOND = 10  # times what losses change is what a gradient says where it is too steep to be judged
 CURVED = 1.5  # times the second difference that a larger step foresees may be that of a curved loss
+SATURATED = 0.02  # of the largest change that of the smallest step is where losses of neighbours have nothing in common
 UNEVEN = 0.003  # of what neighbours differ by is what a gradient foresees at most, where that is noise
 ROUNDED_BY = 16  # times the spacing of losses is the most that rounding changes them by, in one step
 SMALL_GRAIN = 1e-4  # of the box: losses that do not change over longer steps are flat there, and not rounded
@@ -390,9 +391,13 @@ class _Line:
     def _is_rough(self) -> bool:
         """Say whether losses change unevenly over the smallest step, in which the gradient foresees more."""
         change, next_ = np.fmax(*np.abs(self.walked - self.loss)), min(1, len(self.steps) - 1)
+        saturated = (
+            change[0] > SATURATED * np.nanmax(change) and abs(self.exact) * self.steps[0] > SATURATED * change[0]
+        )
         uneven, steepness = max(self.usual, self._unevenness()), change[next_] / self.steps[next_]
         rounding = self.eps * (abs(self.loss) + float(steepness))
-        return uneven > ROUGH * rounding and abs(self.exact) * self.steps[0] > UNEVEN * uneven
+        rough = uneven > ROUGH * rounding and abs(self.exact) * self.steps[0] > UNEVEN * uneven
+        return bool(rough or saturated)
 
 
 def counts(judged: Sequence[Judgement]) -> dict[Kind, int]:
