@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from ..landscapes.measures.card import describe_error
+from ..landscapes.measures.card import describe_share
 from .terminal import Console, table
 
 if TYPE_CHECKING:
@@ -12,10 +12,9 @@ if TYPE_CHECKING:
 
 
 def show(found: Card, console: Console) -> None:
-    """Print a row for each engine in each scene: verdict, share of points wrong, cause, finding, closed form."""
-    shown = table("scene", "engine", "verdict", "points wrong", "finding", "against the closed form")
+    """Print a row for each engine in each scene: verdict, share of points wrong, cause, median error."""
+    shown = table("scene", "engine", "verdict", "points wrong", "cause", "off the closed form")
     for one in found.grades:
-        said = f"{one.cause}: {one.finding}" if one.cause else one.finding
-        error = describe_error(one.closed_form) if one.closed_form is not None else ""
-        shown.add_row(one.scene, one.engine, one.verdict, one.wrong, said, error)
+        off = describe_share(one.closed_form.median) if one.closed_form is not None else ""
+        shown.add_row(one.scene, one.engine, one.verdict, one.wrong, one.cause or one.finding, off)
     console.print(shown)
