@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, Unpack
 
 from cyclopts import Parameter
@@ -38,6 +39,9 @@ def check(
     *,
     power: Share = 0.05,
     seed: Seed = 0,
+    figure_width_mm: FigureWidth = (),
+    out: Annotated[str | Path | None, Parameter(help="Folder of the results; without it no file is written.")] = None,
+    force: Force = False,
     **keywords: Unpack[SceneKeywords],
 ) -> CheckReport:
     """Check that the gradients of an environment are right: where they are not, why, and what to do.
@@ -46,10 +50,12 @@ def check(
     and says at which share of the box they are wrong, with its interval, in which region, by which parameters and from
     which cause. It also checks shapes, refusals, batches, determinism, growth with the horizon, corners of the box and
     beyond, long time steps, materials, horizons and precision. A warning is no failure: the gradient is right, but
-    useless over an optimiser's step. The exit code is 0 if the environment passes, else 1. It writes no file.
+    useless over an optimiser's step. The exit code is 0 if the environment passes, else 1.
 
-    Raises ValueError for what the scene does not have, TooLargeError for more points than there is memory for, and
-    Stopped where it is interrupted.
+    With --out a folder then holds check.json and check.png: over which steps gradients say how the loss changes.
+
+    Raises ValueError for what the scene does not have, TooLargeError for more points than there is memory for,
+    StoreMismatchError where the folder holds another check; Stopped where it is interrupted.
 
     Example: landscape check bounce
 
@@ -62,8 +68,12 @@ def check(
     spec = spec_of(scene, keywords)
     from ..jobs.check import CheckJob
 
-    call, share = current(), as_power(power)
-    return CheckJob.open(spec.resolve(call.watch), power=share, seed=seed, command=call.command).run(call.watch)
+    call, share, prints = current(), as_power(power), as_widths(figure_width_mm)
+    if prints and out is None:
+        raise ValueError("--figure-width-mm is of a figure in a folder; give --out, too")
+    job = CheckJob.open(spec.resolve(call.watch), power=share, seed=seed, command=call.command)
+    folder = as_path(out)
+    return (job if folder is None else job.into(folder, force=force, prints=prints)).run(call.watch)
 
 
 @verb
