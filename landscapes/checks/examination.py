@@ -163,8 +163,8 @@ def examine(probe: Probe, power: float, seed: int, say: Callable[[str], None] = 
 
 
 def _worth(ladder: Ladder) -> bool:
-    """Say whether more points would tell more: where nothing could be judged, they would not."""
-    return any(one.kind not in UNJUDGED for one in ladder.judged)
+    """Say whether more points would tell more: where most could not be judged, they would not."""
+    return Share.of(ladder.judged).judged >= len(ladder.judged) / 2
 
 
 Drawn = tuple[Tensor, Evaluation, Ladder]

@@ -53,7 +53,7 @@ def observe(objective: Objective, x: Float[Tensor, "batch dim"]) -> History:
     return History(
         loss=moved,
         gradient=max(_gap(after, repeated), _gap(first, repeated)),
-        random=moved > SAME and max(again) > moved / 10 and not drifts,
+        random=(moved > SAME and max(again) > moved / 10 and not drifts) or _varies(after, after_again, repeated),
         stale=_gap(other, repeated) < ALIKE < _gap(after, repeated),
         grows=_grows(after, repeated, after_again, repeated_again),
         batch=_ratio(repeated, batch),
@@ -66,6 +66,12 @@ def _drifts(losses: list[float]) -> bool:
     """Say whether losses of the same call go one way, or come nearer to something: chance does neither for so long."""
     steps = [late - early for early, late in pairwise(losses)]
     return all(step > 0 for step in steps) or all(step < 0 for step in steps)
+
+
+def _varies(found: Evaluation, again: Evaluation, other: Evaluation) -> bool:
+    """Say whether gradients at one point differ, and the same order of calls does not give the same."""
+    same_loss = _apart(found.loss, other.loss) <= SAME
+    return same_loss and SAME < _gap(found, other) < 10 * _gap(found, again) and not _grows(found, again)
 
 
 def _is_alike(batch: Evaluation) -> bool:
