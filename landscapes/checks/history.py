@@ -25,7 +25,7 @@ class History:
     reproduced by the same calls, and do not drift. `stale` says that a call returns the gradient of the one before,
     `grows` that gradients add up from call to call. `batch` is a gradient alone over that within a batch of `ROWS`,
     and `alike` says that all gradients of a batch are the same, though alone they are not. `leak` is the relative
-    difference of the losses of a row alone and in a batch.
+    difference of the losses of a row alone and in a batch, and `gradient_leak` that of its gradients.
     """
 
     loss: float
@@ -36,6 +36,7 @@ class History:
     batch: float
     alike: bool
     leak: float
+    gradient_leak: float
 
 
 def observe(objective: Objective, x: Float[Tensor, "batch dim"]) -> History:
@@ -58,6 +59,7 @@ def observe(objective: Objective, x: Float[Tensor, "batch dim"]) -> History:
         grows=_grows(after, repeated, after_again, repeated_again),
         batch=_ratio(repeated, batch),
         leak=_apart(repeated.loss, batch.loss[:1]),
+        gradient_leak=max(_gap(repeated, batch.rows(slice(0, 1))), _gap(other, batch.rows(slice(1, 2)))),
         alike=_is_alike(batch) and _gap(repeated, other) > ALIKE,
     )
 

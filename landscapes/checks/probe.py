@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -79,7 +80,7 @@ class Probe:
     @property
     def _different(self) -> Float[Tensor, " some"]:
         """Return the different losses that were seen, but for 0."""
-        loss = torch.cat(self.seen).unique() if self.seen else torch.zeros(0)
+        loss = torch.from_numpy(np.unique(torch.cat(self.seen).numpy())) if self.seen else torch.zeros(0)
         return loss[loss.isfinite() & (loss != 0)]
 
     @property
