@@ -239,6 +239,10 @@ class Objective(abc.ABC):
         """Count what happens at each point, name -> shape (batch,); where a count changes, losses may jump."""
         return {}
 
+    def special_places(self) -> Mapping[str, Float[Tensor, " dim"]]:
+        """Return points by name at which a check is to look: where a contact begins, two bodies meet, a motor stalls."""
+        return {}
+
     def energy(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch step"] | None:
         """Return the mechanical energy [J] over time of a motion that nothing drives; None where there is none."""
         return None
@@ -279,7 +283,7 @@ class ObjectiveWrapper(Objective):
         self.whole_batches = objective.whole_batches
 
 
-PASSED_ON = "threads preferred_batch precision packages identity prepare shrink memory events energy noise observe"
+PASSED_ON = "threads preferred_batch precision packages identity prepare shrink memory events special_places energy noise observe"
 for _part in PASSED_ON.split():
     setattr(ObjectiveWrapper, _part, property(attrgetter(f"objective.{_part}")))
 

@@ -1,0 +1,285 @@
+"""Conclude from what was measured what is wrong with gradients: a diagnosis for each kind of finding."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from . import evidence as numbers_of
+from .causes import Cause, Signature, recognise
+from .diagnosis import CERTAINTIES, Diagnosis, Region
+from .evidence import Evidence, Samples
+from .examination import Examination, percent
+from .finding import FAIL, WARN
+from .history import ROWS, History
+from .probe import EPS
+from .slopes import TOLERANCE, UNJUDGED, Kind
+
+NAMED = 6  # parameters that are named, at most
+MANY_LINES = 20  # from which an average is told
+CLEAR_ERRORS = 3  # standard errors
+UNCLEAR = 0.05  # relative error of a slope that counts for the average
+STEEP_SHARE = 0.2
+
+
+@dataclass(frozen=True)
+class Calls:
+    """What checks of calls have found: of rows in a batch, of losses with and without gradients, of two backwards."""
+
+    history: History | None = None
+    leaks: bool = False
+    depends: bool = False
+    second_backward: float = 0.0
+
+    def evidence(self) -> Evidence:
+        """Return it as numbers."""
+        found: Evidence = {"leaks": self.leaks, "depends": self.depends, "random": 0.0, "hidden": 0.0}
+        if (one := self.history) is not None:
+            hidden = one.loss > 1e-9 and not one.random
+            found |= {
+                "random": one.random,
+                "hidden": hidden,
+                "stale": one.stale,
+                "grows": one.grows,
+                "batch": one.batch,
+                "rows": ROWS,
+                "loss_moves": one.loss,
+                "gradient_moves": one.gradient,
+            }
+        return {name: float(value) for name, value in found.items()}
+
+
+Texts = dict[str, str]
+
+
+def conclude(
+    seen: Examination, calls: Calls, origin: Callable[[int], str] = lambda row: "", length: Evidence | None = None
+) -> tuple[Diagnosis, ...]:
+    """Return a diagnosis for each kind of finding, what fails and is certain first.
+
+    `origin` says where the first NaN at one of the random points begins, and `length` holds what is known of the
+    horizon.
+    """
+    found = [one for judge in (_of_calls, _of_grain) for one in judge(seen, calls)]
+    explained = any(one.outcome == FAIL for one in found)
+    found += list(_of_nan(seen, origin))
+    if not explained:
+        found += list(_of_wrong(seen, calls, length or {}))
+    found += [one for judge in (_of_zero, _of_steep, _of_noise, _of_length) for one in judge(seen)]
+    return tuple(sorted(found, key=lambda one: (one.outcome != FAIL, CERTAINTIES.index(one.certainty))))
+
+
+def _make(
+    cause: Cause, signature: Signature, evidence: Evidence, texts: Texts, names: tuple[str, ...] = (),
+    region: Region | None = None,
+) -> Diagnosis:  # fmt: skip
+    what = cause.says.format_map({**evidence, **texts})
+    return Diagnosis(
+        cause.name, signature.outcome, signature.certainty, what, cause.remedy, names, region, numbers=dict(evidence)
+    )
+
+
+def _named(seen: Examination, axes: set[int] | None) -> tuple[str, ...]:
+    return () if axes is None else tuple(seen.names[axis] for axis in sorted(axes))
+
+
+def _by(names: tuple[str, ...]) -> str:
+    if not names:
+        return ""
+    more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
+    return f" by {', '.join(names[:NAMED])}{more}"
+
+
+def _where(region: Region | None) -> str:
+    if region is None:
+        return ""
+    return f", {'all' if region.error == 0 else 'nearly all'} with {region.rule}"
+
+
+def _of_calls(seen: Examination, calls: Calls) -> Iterator[Diagnosis]:
+    evidence = calls.evidence()
+    how = "they add up from call to call" if evidence.get("grows") else "a call returns the gradient of the one before"
+    if (known := recognise("calls", evidence)) is not None:
+        yield _make(*known, evidence, {"how": how})
+
+
+def _of_grain(seen: Examination, calls: Calls) -> Iterator[Diagnosis]:
+    probe, loss = seen.probe, seen.found.loss[seen.found.loss.isfinite()]
+    if probe.eps != EPS["float32"] or not probe.grain or not len(loss):
+        return
+    grad = seen.found.grad
+    zero = float((grad[seen.found.has_gradient] == 0).all(dim=1).double().mean()) if grad is not None else 0.0
+    evidence = {
+        "grain": probe.grain,
+        "levels": float(loss.max() - loss.min()) / probe.grain,
+        "zero_gradients": zero if math.isfinite(zero) else 0.0,
+        "limit": _limit(seen),
+        **(numbers_of.roughness(probe, seen.u[:16]) if seen.rows(Kind.WRONG) else {}),
+    }
+    consequence = f": gradients cannot be judged below {percent(evidence['limit'])} of the slope"
+    if evidence["zero_gradients"] >= 0.5 or evidence.get("rough", 0) > 0.01:
+        consequence = ": differences over small steps are 0, or multiples of that"
+    if (known := recognise("grain", evidence)) is not None:
+        exponent = round(math.log2(probe.grain))
+        yield _make(*known, evidence, {"grain_text": f"2^{exponent}", "consequence": consequence})
+
+
+def _limit(seen: Examination) -> float:
+    """Return the relative error of a gradient that would have been found at half of the points."""
+    limits = [one.limit for one in seen.random.judged if math.isfinite(one.limit) and one.kind not in UNJUDGED]
+    return float(np.median(limits)) if limits else 1.0
+
+
+def _of_nan(seen: Examination, origin: Callable[[int], str]) -> Iterator[Diagnosis]:
+    rows = seen.rows(Kind.NAN)
+    names, ladder = seen.places
+    places = [row for row, one in enumerate(ladder.judged) if one.kind == Kind.NAN]
+    if not rows and not places:
+        return
+    region = seen.region if rows else None
+    evidence = {
+        "nan_points": float(len(rows)),
+        "nan_places": float(len({names[row] for row in places})),
+        "region": float(region is not None),
+        "loss": float(ladder.lines.loss[places[0]]) if places else math.nan,
+    }
+    begins = origin(rows[0] if rows else -1 - places[0])
+    texts = {
+        "share": seen.share.describe().partition(" of ")[0],
+        "where": _where(region),
+        "where_place": " and ".join(dict.fromkeys(names[row] for row in places)),
+        "origin": f"; the first NaN comes from {begins}" if begins else "",
+    }
+    if (known := recognise("nan", evidence)) is not None:
+        yield _make(*known, evidence, texts, region.parameters if region else (), region)
+
+
+def _of_wrong(seen: Examination, calls: Calls, length: Evidence) -> Iterator[Diagnosis]:
+    rows, place = seen.rows(Kind.WRONG), _wrong_place(seen)
+    axes = [one for one in seen.axes.ladder.judged if one.kind == Kind.WRONG]
+    if not rows and not axes:
+        if place:
+            yield Diagnosis("", FAIL, "certain", place, "Look at what divides by zero or chooses a branch there.")
+        return
+    names = _named(seen, seen.blamed)
+    region = seen.region if rows and not seen.rows(Kind.NAN) else None
+    evidence = _wrong_numbers(seen) | calls.evidence() | length | {"second_backward": calls.second_backward}
+    texts = {
+        "by": _by(names),
+        "where": _where(region),
+        "length": f" (wrong from {length['first_wrong']:.3g} of its length on)" if "first_wrong" in length else "",
+        "moved_text": percent(evidence.get("moved", 0.0)),
+    }
+    if (known := recognise("wrong", evidence)) is not None:
+        found = _make(*known, evidence, texts, names, region)
+    else:
+        what = f"the gradient{texts['by']} is not the slope of the loss{texts['where']}; no known cause fits"
+        found = Diagnosis("", FAIL, "certain", what, REMEDY, names, region, evidence)
+    yield found
+
+
+REMEDY = "Compare the gradient with differences along one parameter, at one of these points, step by step."
+
+
+def _wrong_place(seen: Examination) -> str:
+    from .places import describe
+
+    names, ladder = seen.places
+    for row, one in enumerate(ladder.judged):
+        if one.kind == Kind.WRONG:
+            axis = int(ladder.lines.direction[row].abs().argmax())
+            return describe(names[row], one, seen.names[axis], float(ladder.lines.loss[row]))
+    return ""
+
+
+def _wrong_numbers(seen: Examination) -> Evidence:
+    """Return what wrong gradients have in common: along axes where these are known, else along all at once."""
+    axes = seen.at_wrong or seen.axes
+    wrong, known = Samples.of(axes, wrong=True), Samples.of(axes, wrong=False)
+    space, dim = seen.probe.objective.space, len(seen.names)
+    single = seen.probe.eps == EPS["float32"]
+    found: Evidence = {"single": float(single), "best_step": 1e-3 if single else 1e-5}
+    if not len(wrong):
+        return found | numbers_of.of_lines(seen.random.judged)
+    found |= numbers_of.ratios(wrong.exact, wrong.slope, wrong.error) | numbers_of.per_parameter(wrong, space)
+    exact, slope = known.matrix(dim)
+    found |= numbers_of.exchanged(exact, slope) | numbers_of.cosine(exact, slope)
+    found |= numbers_of.cut_off(seen.probe, wrong, Samples.of(seen.axes, wrong=False))
+    if seen.found.grad is not None:
+        found |= numbers_of.same_length(seen.found.grad[seen.found.has_gradient])
+    lines = [row for row, one in enumerate(axes.ladder.judged) if one.kind == Kind.WRONG]
+    if found.get("zero", 0) < 1:
+        found |= numbers_of.as_difference(seen.probe, axes, lines)
+        found |= numbers_of.roughness(seen.probe, seen.u[:16])
+    noise = [one.noise / (seen.probe.eps * abs(float(seen.found.loss[row])) or 1) for row, one in _lines(seen)]
+    return found | ({"noise_ratio": float(np.median(noise))} if noise else {})
+
+
+def _lines(seen: Examination) -> list[tuple[int, object]]:
+    return [(row, one) for row, one in enumerate(seen.random.judged) if math.isfinite(one.noise)]
+
+
+def _of_zero(seen: Examination) -> Iterator[Diagnosis]:
+    if not seen.stepped:
+        return
+    names = _named(seen, seen.stepped)
+    others = {axis for axis, row in enumerate(seen.parameters()) if row.zero < 1}
+    evidence = {"others_move": float(bool(others)), "stepped": float(len(names))}
+    if (known := recognise("zero", evidence)) is not None:
+        yield _make(*known, evidence, {"parameters": _by(names).removeprefix(" by ")}, names)
+
+
+def _of_steep(seen: Examination) -> Iterator[Diagnosis]:
+    steep = seen.rows(Kind.STEEP)
+    evidence = {"steep_share": len(steep) / max(1, len(seen.random.judged))}
+    if steep:
+        slopes = np.abs([seen.random.judged[row].exact for row in steep])
+        evidence |= {"gradient": float(np.median(slopes))}
+        loss = seen.found.loss[seen.found.loss.isfinite()]
+        evidence["reach"] = float(loss.max() - loss.min()) / evidence["gradient"] if evidence["gradient"] else 0.0
+    if (known := recognise("steep", evidence)) is not None:
+        yield _make(*known, evidence, {"share": percent(evidence["steep_share"])})
+
+
+def _of_noise(seen: Examination) -> Iterator[Diagnosis]:
+    lines = [one for one in seen.random.judged if math.isfinite(one.noise)]
+    if not lines:
+        return
+    loss = float(seen.found.loss[seen.found.loss.isfinite()].abs().median())
+    noise = float(np.median([one.noise for one in lines]))
+    evidence = {
+        "single": float(seen.probe.eps == EPS["float32"]),
+        "noise": noise,
+        "noise_ratio": noise / (seen.probe.eps * loss) if loss else 0.0,
+        "noise_share": len(seen.rows(Kind.NOISE)) / len(seen.random.judged),
+        "limit": _limit(seen),
+    }
+    if (known := recognise("noise", evidence)) is not None:
+        yield _make(*known, evidence, {})
+
+
+def _of_length(seen: Examination) -> Iterator[Diagnosis]:
+    """Say that gradients are too long or too short on average, though no single point shows it."""
+    lines = [one for one in seen.random.judged if one.slope is not None and one.kind in (Kind.AGREES, Kind.WRONG)]
+    clear = [one for one in lines if one.slope and abs(one.slope.error) < UNCLEAR * abs(one.slope.value)]
+    if len(clear) < MANY_LINES or any(one.kind == Kind.WRONG for one in lines):
+        return
+    ratio = np.array([one.exact / one.slope.value for one in clear if one.slope])
+    middle = float(np.median(ratio))
+    spread = 1.4826 * float(np.median(np.abs(ratio - middle))) * 1.2533 / math.sqrt(len(ratio))
+    single = seen.probe.eps == EPS["float32"]
+    room = TOLERANCE["float32" if single else "float64"]
+    evidence = {
+        "length": middle,
+        "length_low": middle - 2 * spread,
+        "length_high": middle + 2 * spread,
+        "length_off": abs(middle - 1) - room - CLEAR_ERRORS * spread,
+    }
+    if (known := recognise("length", evidence)) is not None:
+        yield _make(*known, evidence, {})
+
+
+__all__ = ["WARN", "Calls", "conclude"]

@@ -1,0 +1,249 @@
+"""Numbers that tell the causes of wrong gradients apart; `causes` holds them against the signatures in its files."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ..space import ParameterSpace
+from .parameters import AxisLines
+from .probe import Probe
+from .slopes import BAD, Judgement, Kind
+
+STEADY = 0.02  # of a ratio is what others may be off by, to be the same
+MATCHES = 0.02  # of the largest component is what permuted gradients may be off by
+SATURATED = 1e-4  # relative difference of components that are cut off at the same length
+TRIED = 24  # steps that are tried for the difference which a gradient may be
+SAME_DIFFERENCE = 1e-3  # relative error of a difference that a gradient is
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """Components of gradients next to slopes by differences [loss unit per side of the box], one entry per axis line."""
+
+    exact: Array
+    slope: Array
+    error: Array
+    axis: NDArray[np.int64]
+    point: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, axes: AxisLines, *, wrong: bool) -> Samples:
+        """Return the lines whose slope by differences is known; where asked, those at which gradients are wrong."""
+        rows = [
+            row
+            for row, one in enumerate(axes.ladder.judged)
+            if one.slope is not None and one.kind != Kind.NAN and (not wrong or one.kind in BAD)
+        ]
+        judged = [axes.ladder.judged[row] for row in rows]
+        numbers = np.array(
+            [(one.exact, one.slope.value, one.slope.error) for one in judged if one.slope is not None]
+        ).reshape(-1, 3)
+        index = torch.tensor(rows, dtype=torch.long)
+        axis, point = axes.axis[index].numpy(), axes.ladder.lines.point[index].numpy()
+        return cls(*numbers.T, axis=axis, point=point)
+
+    def __len__(self) -> int:
+        return len(self.exact)
+
+    def matrix(self, dim: int) -> tuple[Array, Array]:
+        """Return gradients and slopes, shape (point, dim), of the points where every component is known."""
+        exact, slope = [], []
+        for point in np.unique(self.point):
+            rows = np.flatnonzero(self.point == point)
+            at = {int(self.axis[row]): row for row in rows}
+            if len(at) == dim:
+                order = [at[axis] for axis in range(dim)]
+                exact.append(self.exact[order])
+                slope.append(self.slope[order])
+        shape = (len(exact), dim)
+        return np.array(exact).reshape(shape), np.array(slope).reshape(shape)
+
+
+Evidence = dict[str, float]
+
+
+def ratios(exact: Array, slope: Array, error: Array) -> Evidence:
+    """Return what ratios of gradients to slopes have in common: `ratio`, `steady`, `zero`, `near`, `below`."""
+    clear = np.abs(slope) > 5 * error
+    if not clear.any():
+        return {}
+    found = exact[clear] / slope[clear]
+    room = np.maximum(STEADY, 3 * error[clear] / np.abs(slope[clear]))
+    ratio = _mode(found, room)
+    return {
+        "ratio": ratio,
+        "steady": float((np.abs(found - ratio) <= room * max(abs(ratio), 0.1)).mean()),
+        "zero": float((exact == 0).mean()),
+        "near": float(np.median(np.abs(found - 1))),
+        "below": float(((found > -STEADY) & (found < 1)).mean()),
+        "clear": float(clear.sum()),
+    }
+
+
+def _mode(found: Array, room: Array) -> float:
+    """Return the ratio that most others are close to."""
+    support = [int((np.abs(found - one) <= room * max(abs(one), 0.1)).sum()) for one in found]
+    best = found[int(np.argmax(support))]
+    near = np.abs(found - best) <= room * max(abs(best), 0.1)
+    return float(np.median(found[near]))
+
+
+def per_parameter(samples: Samples, space: ParameterSpace) -> Evidence:
+    """Return whether ratios are the same for each parameter (`own`), and are its range or one over it (`units`)."""
+    clear = np.abs(samples.slope) > 5 * samples.error
+    width = (space.upper - space.lower).numpy()
+    own, units = [], []
+    for axis in np.unique(samples.axis[clear]):
+        rows = clear & (samples.axis == axis)
+        found = samples.exact[rows] / samples.slope[rows]
+        middle = float(np.median(found))
+        own.append(float((np.abs(found - middle) <= STEADY * max(abs(middle), 1e-12)).mean()))
+        spans = (width[axis], 1 / width[axis])
+        units.append([abs(middle / span - 1) <= STEADY for span in spans])
+    if not own:
+        return {}
+    different = float(np.abs(np.log(width[np.unique(samples.axis[clear])])).max())
+    return {
+        "own": float(np.mean(own)),
+        "units": float(np.mean(units, axis=0).max()) if different > STEADY else 0.0,
+    }
+
+
+def exchanged(exact: Array, slope: Array) -> Evidence:
+    """Return whether components stand in each other's places: `permuted`, and `transposed` where as in a matrix.
+
+    `exact` and `slope` have shape (point, dim), two points at least.
+    """
+    from scipy.optimize import linear_sum_assignment
+
+    count, dim = exact.shape
+    if count < 2 or dim < 2:
+        return {}
+    scale = np.abs(slope).max(axis=1, keepdims=True)
+    cost = np.abs(exact[:, :, None] - slope[:, None, :]).__truediv__(scale[:, :, None]).mean(axis=0)
+    rows, columns = linear_sum_assignment(cost)
+    fits = float((cost[rows, columns] <= MATCHES).mean())
+    moved = float((columns != rows).mean())
+    transposed = 0.0
+    for side in range(2, dim // 2 + 1):
+        if dim % side == 0:
+            order = np.arange(dim).reshape(side, dim // side).T.ravel()
+            back = np.argsort(order)
+            for one in (order, back):
+                off = cost[np.arange(dim), one]
+                if (one != np.arange(dim)).any() and (off <= MATCHES).all():
+                    transposed = 1.0
+    return {"permuted": fits if moved > 0 else 0.0, "moved": moved, "transposed": transposed}
+
+
+def cut_off(probe: Probe, samples: Samples, others: Samples) -> Evidence:
+    """Return the share of wrong components that have the same length in the parameters' units, the largest there is."""
+    width = probe.width.numpy()
+    wrong = np.abs(samples.exact) / width[samples.axis]
+    if len(wrong) < 3:
+        return {}
+    longest = float(wrong.max())
+    same = np.abs(wrong - longest) <= SATURATED * longest
+    steeper = np.abs(samples.slope) / width[samples.axis] > longest * (1 - SATURATED)
+    right = np.abs(others.exact) / width[others.axis]
+    beyond = bool(len(right)) and bool((right > longest * (1 + SATURATED)).any())
+    return {"saturated": 0.0 if beyond else float((same & steeper).mean()), "length": longest}
+
+
+def same_length(grad: Float[Tensor, "point dim"]) -> Evidence:
+    """Return the share of gradients that have the length of the longest, in the parameters' units."""
+    sizes = grad.norm(dim=1)
+    sizes = sizes[sizes.isfinite() & (sizes > 0)]
+    if len(sizes) < 3:
+        return {}
+    longest = sizes.max()
+    return {"norm_saturated": float(((sizes - longest).abs() <= SATURATED * longest).double().mean())}
+
+
+def cosine(exact: Array, slope: Array) -> Evidence:
+    """Return the median cosine of gradients and slopes, shape (point, dim), and that of the ratio of their lengths."""
+    if not len(exact):
+        return {}
+    sizes = np.linalg.norm(exact, axis=1), np.linalg.norm(slope, axis=1)
+    known = (sizes[0] > 0) & (sizes[1] > 0)
+    if not known.any():
+        return {}
+    angle = (exact * slope).sum(axis=1)[known] / (sizes[0] * sizes[1])[known]
+    return {"cosine": float(np.median(angle)), "length_ratio": float(np.median((sizes[0] / sizes[1])[known]))}
+
+
+def as_difference(probe: Probe, axes: AxisLines, rows: Sequence[int]) -> Evidence:
+    """Look for the step of the difference that a gradient may be: `difference_step`, as a share of the box.
+
+    The step is found at one line by trying many, and has to hold at others, as a share of the box or in the
+    parameters' own units.
+    """
+    lines, width = axes.ladder.lines, probe.width
+    for row in rows[:2]:
+        for side in (0, 1, 2):
+            step = _matching_step(probe, axes, row, side)
+            if step is None:
+                continue
+            others = [one for one in rows if one != row][:6]
+            for scale in (torch.ones_like(width), width[axes.axis[row]] / width):
+                errors = []
+                for other in others:
+                    own = step * float(scale[axes.axis[other]])
+                    value = _difference(probe, lines.u[other], lines.direction[other], own, side)
+                    exact = float(lines.slope[other])
+                    errors.append(abs(value - exact) <= SAME_DIFFERENCE * max(abs(exact), abs(value)))
+                if errors and np.mean(errors) >= 0.8:
+                    return {"difference_step": step, "one_sided": float(side > 0)}
+    return {}
+
+
+def _difference(probe: Probe, u: Tensor, direction: Tensor, step: float, side: int) -> float:
+    """Return a central difference, or with `side` 1 and 2 one ahead and one behind."""
+    ahead, here, behind = probe.loss(torch.stack([u + step * direction, u, u - step * direction])).tolist()
+    return float([(ahead - behind) / (2 * step), (ahead - here) / step, (here - behind) / step][side])
+
+
+def _matching_step(probe: Probe, axes: AxisLines, row: int, side: int) -> float | None:
+    """Return the step over which the difference is what the gradient says, if there is one."""
+    lines, exact = axes.ladder.lines, float(axes.ladder.lines.slope[row])
+    steps = np.geomspace(1e-4, 0.3, TRIED)
+    gaps = np.array([_difference(probe, lines.u[row], lines.direction[row], step, side) - exact for step in steps])
+    changes = np.flatnonzero(np.isfinite(gaps[:-1]) & np.isfinite(gaps[1:]) & (gaps[:-1] * gaps[1:] <= 0))
+    if not len(changes):
+        return None
+    low, high = float(steps[changes[0]]), float(steps[changes[0] + 1])
+    start = gaps[changes[0]]
+    for _ in range(TRIED):
+        middle = (low + high) / 2
+        gap = _difference(probe, lines.u[row], lines.direction[row], middle, side) - exact
+        low, high = (middle, high) if gap * start > 0 else (low, middle)
+    return (low + high) / 2
+
+
+def roughness(probe: Probe, u: Float[Tensor, "point dim"]) -> Evidence:
+    """Return by how much gradients differ between points that are next to each other: `rough`, relative to their length."""
+    near = (u + 1e-9 * torch.where(u > 0.5, -1.0, 1.0)).clamp(0, 1)
+    here, there = (probe.gradient(one).grad for one in (u, near))
+    if here is None or there is None:
+        return {}
+    sizes = torch.maximum(here.norm(dim=1), there.norm(dim=1))
+    known = sizes.isfinite() & (sizes > 0)
+    apart = ((here - there).norm(dim=1) / sizes)[known]
+    return {"rough": float(apart.quantile(0.5))} if len(apart) else {}
+
+
+def of_lines(judged: Sequence[Judgement]) -> Evidence:
+    """Return the ratios of lines along all parameters at once."""
+    known = [one for one in judged if one.kind == Kind.WRONG and one.slope is not None]
+    if not known:
+        return {}
+    numbers = np.array([(one.exact, one.slope.value, one.slope.error) for one in known if one.slope is not None])
+    return ratios(*numbers.T)

@@ -1,0 +1,240 @@
+"""Examine the gradients of an objective: at random points, at special places, by every parameter; where, and why.
+
+Points are as many as find a defect that fills a given share of the box with 95 %, spread evenly (a scrambled Sobol
+sequence), so that no slab of that width lies between them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.quasirandom import SobolEngine
+
+from ..objective import Evaluation
+from ..statistics import Estimate, share
+from . import parameters as by_parameter
+from .diagnosis import Region
+from .parameters import AxisLines, ParameterRow
+from .places import measure_places
+from .probe import Lines, Probe
+from .regions import find_region
+from .slopes import BAD, STEPS, UNJUDGED, Judgement, Kind, Ladder, directions, measure
+
+CONFIDENCE = 0.95
+FEWEST_POINTS = 4
+MOST_TIMES = 3  # as many points are drawn where some cannot be judged
+FEW_WRONG = 4  # points, of which more are drawn to see where they are
+AXIS_POINTS = 6  # at which all axes are walked where gradients are wrong
+ALL_AXES = 40  # parameters, at most, of which all are walked there
+
+
+def points_for(power: float) -> int:
+    """Return how many random points find a defect that fills a share of the box with 95 %."""
+    return max(FEWEST_POINTS, math.ceil(math.log(1 - CONFIDENCE) / math.log1p(-power)))
+
+
+def could_be_missed(judged: int) -> float:
+    """Return the largest share of the box that a defect may fill without being met by so many points with 95 %."""
+    return 1.0 if judged == 0 else 1 - (1 - CONFIDENCE) ** (1 / judged)
+
+
+@dataclass(frozen=True)
+class Share:
+    """How many of the judged points are wrong, the interval of their share of the box, and what could be missed.
+
+    `low` and `high` bound the share with 95 % (Clopper & Pearson 1934). A defect that fills less than `missed` of the
+    box may not have been met.
+    """
+
+    wrong: int
+    judged: int
+    points: int
+    low: float
+    high: float
+    missed: float
+
+    @classmethod
+    def of(cls, judged: Sequence[Judgement]) -> Share:
+        """Count points."""
+        told = [one for one in judged if one.kind not in UNJUDGED]
+        wrong = sum(one.kind in BAD for one in told)
+        found: Estimate = share(wrong, len(told))
+        return cls(wrong, len(told), len(judged), found.low, found.high, could_be_missed(len(told)))
+
+    def describe(self) -> str:
+        """Say it: "wrong at 42 % (30 to 55 %) of 64 points"."""
+        value = self.wrong / self.judged if self.judged else math.nan
+        return f"{percent(value)} ({percent(self.low, bare=True)} to {percent(self.high)}) of {self.judged} points"
+
+
+def percent(value: float, *, bare: bool = False) -> str:
+    """Write a share in percent, with a decimal below one percent."""
+    found = f"{100 * value:.1f}" if 0 < value < 0.01 else f"{100 * value:.0f}"
+    return found if bare else f"{found} %"
+
+
+@dataclass(eq=False)
+class Examination:
+    """All that was measured of the gradients of one objective."""
+
+    probe: Probe
+    seed: int
+    u: Float[Tensor, "point dim"]
+    found: Evaluation
+    random: Ladder
+    places: tuple[tuple[str, ...], Ladder]
+    axes: AxisLines
+    at_wrong: AxisLines | None = None
+    blamed: set[int] | None = field(default_factory=set)
+    stepped: set[int] = field(default_factory=set)
+    region: Region | None = None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters."""
+        return self.probe.objective.space.names
+
+    @property
+    def share(self) -> Share:
+        """How many random points are wrong."""
+        return Share.of(self.random.judged)
+
+    def rows(self, *kinds: Kind) -> list[int]:
+        """Return the random points of some kinds."""
+        return [row for row, one in enumerate(self.random.judged) if one.kind in kinds]
+
+    def parameters(self) -> tuple[ParameterRow, ...]:
+        """Return the table of parameters."""
+        return by_parameter.table(self.names, self.found, self.axes, self.blamed or set(), self.stepped)
+
+
+def examine(probe: Probe, power: float, seed: int, say: Callable[[str], None] = lambda text: None) -> Examination:
+    """Judge gradients at random points, at special places and by every parameter; look closer where some are wrong."""
+    say("gradients at random points")
+    engine = SobolEngine(probe.objective.space.dim, scramble=True, seed=seed)
+    wanted = points_for(power)
+    drawn = 2 ** math.ceil(math.log2(wanted))
+    u, found, ladder = _random(probe, engine, drawn, seed)
+    while Share.of(ladder.judged).judged < wanted and len(u) < MOST_TIMES * wanted and _worth(ladder):
+        u, found, ladder = _more(probe, engine, drawn, seed, (u, found, ladder))
+    wrong = sum(one.kind in BAD for one in ladder.judged)
+    if 0 < wrong < FEW_WRONG and len(u) < MOST_TIMES * wanted:
+        u, found, ladder = _more(probe, engine, drawn, seed, (u, found, ladder))
+    say("gradients at special places")
+    places = measure_places(probe, seed)
+    say("gradients by each parameter")
+    axes = by_parameter.walk_axes(probe, u, found, seed)
+    result = Examination(probe, seed, u, found, ladder, places, axes)
+    say("where gradients are wrong")
+    _look_closer(result)
+    return result
+
+
+def _worth(ladder: Ladder) -> bool:
+    """Say whether more points would tell more: where nothing could be judged, they would not."""
+    return any(one.kind not in UNJUDGED for one in ladder.judged)
+
+
+Drawn = tuple[Tensor, Evaluation, Ladder]
+
+
+def _random(probe: Probe, engine: SobolEngine, count: int, seed: int) -> Drawn:
+    u = engine.draw(count, dtype=torch.float64)
+    found = probe.gradient(u)
+    grad = torch.zeros_like(u) if found.grad is None else (found.grad * probe.width).nan_to_num()
+    sensitivity = grad.abs().quantile(0.5, dim=0)
+    along = directions(u.shape[1], u, sensitivity, seed)
+    return u, found, measure(probe, Lines.through(probe, u, along, torch.arange(len(u)), found), STEPS)
+
+
+def _more(probe: Probe, engine: SobolEngine, count: int, seed: int, before: Drawn) -> Drawn:
+    """Draw as many points once more."""
+    u, found, ladder = _random(probe, engine, count, seed + len(before[0]))
+    first, lines = before[2], ladder.lines
+    steps = tuple(sorted({*first.steps, *ladder.steps}))
+    joined = Lines(*(torch.cat([getattr(first.lines, one), getattr(lines, one)]) for one in lines.__dataclass_fields__))
+    joined = replace(joined, point=torch.arange(len(joined)))
+    walked = torch.cat([_on(one, steps) for one in (first, ladder)], dim=2)
+    both = Evaluation.join([before[1], found], dim=u.shape[1], grad=found.grad is not None)
+    return torch.cat([before[0], u]), both, Ladder(joined, steps, walked, first.judged + ladder.judged)
+
+
+def _on(ladder: Ladder, steps: tuple[float, ...]) -> Tensor:
+    """Return what was walked, on a ladder of more steps."""
+    walked = torch.full((2, len(steps), len(ladder.lines)), torch.nan, dtype=torch.float64)
+    walked[:, [steps.index(one) for one in ladder.steps]] = ladder.walked
+    return walked
+
+
+def _look_closer(result: Examination) -> None:
+    """Find the parameters by which gradients are wrong, and the region."""
+    probe, dim = result.probe, result.u.shape[1]
+    wrong = result.rows(Kind.WRONG)
+    detached, result.stepped = by_parameter.find_detached(probe, result.u, result.found)
+    result.stepped |= {
+        axis
+        for axis in range(dim)
+        if (lines := result.axes.of(axis)) and _is_stepped([one for _, one in lines], result.found, axis)
+    }
+    rows = {row for row, one in enumerate(result.axes.ladder.judged) if one.kind == Kind.WRONG}
+    seen = {int(result.axes.axis[row]) for row in rows}
+    if wrong and dim > ALL_AXES:
+        result.blamed = by_parameter.blame(probe, result.u, result.found, wrong)
+    elif seen or wrong:
+        result.blamed = seen
+    if result.blamed is not None:
+        result.blamed |= detached
+    if wrong or rows:
+        points = wrong[:AXIS_POINTS] or [int(result.axes.ladder.lines.point[row]) for row in rows][:AXIS_POINTS]
+        _walk_at_wrong(result, points)
+    _find_region(result)
+
+
+def _is_stepped(judged: Sequence[Judgement], found: Evaluation, axis: int) -> bool:
+    if found.grad is None or not bool(found.has_gradient.any()):
+        return False
+    zero = bool((found.grad[found.has_gradient][:, axis] == 0).all())
+    return zero and any(one.moves for one in judged) and all(one.kind not in BAD for one in judged)
+
+
+def _walk_at_wrong(result: Examination, points: Sequence[int]) -> None:
+    """Walk along axes at points whose gradient is wrong: all, or those that are blamed, or some."""
+    dim = result.u.shape[1]
+    generator = torch.Generator().manual_seed(result.seed)
+    axes = torch.arange(dim)
+    if dim > ALL_AXES:
+        blamed = sorted(result.blamed or [])
+        axes = torch.tensor(blamed[:ALL_AXES]) if blamed else torch.randperm(dim, generator=generator)[:ALL_AXES]
+    rows = torch.tensor(list(points)).repeat_interleave(len(axes))
+    found = by_parameter.along(result.probe, result.u, result.found, rows, axes.repeat(len(points)))
+    result.at_wrong = found
+    if dim <= ALL_AXES:
+        seen = {int(found.axis[row]) for row, one in enumerate(found.ladder.judged) if one.kind == Kind.WRONG}
+        result.blamed = None if len(seen) == dim else (result.blamed or set()) | seen
+    elif result.blamed is not None and len(result.blamed) == dim:
+        result.blamed = None
+
+
+def _find_region(result: Examination) -> None:
+    objective, judged = result.probe.objective, result.random.judged
+    kind = Kind.NAN if result.rows(Kind.NAN) else Kind.WRONG
+    known = [row for row, one in enumerate(judged) if one.kind not in (*UNJUDGED, *BAD) or one.kind == kind]
+    wrong = np.array([judged[row].kind == kind for row in known], dtype=bool)
+    if not wrong.any() or wrong.all():
+        return
+    x = objective.space.from_unit(result.u[known])
+    try:
+        counts = {f"the number of {name}": count.double().numpy() for name, count in objective.events(x).items()}
+    except Exception:  # what only some can say is not worth a check
+        counts = {}
+    values = objective.space.to_values(x).numpy()
+    result.region = find_region(values, result.names, wrong, counts)
+
+
+__all__ = ["Examination", "Share", "could_be_missed", "examine", "points_for"]

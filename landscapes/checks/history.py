@@ -1,0 +1,87 @@
+"""What an evaluation remembers of those before it, and of other rows: the same points, called in several orders."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ..objective import Evaluation, Objective, evaluate
+
+ROWS = 4  # points of the batch that is compared with single rows
+ALIKE = 1e-3  # relative difference of gradients that are the same
+SAME = 1e-9  # relative difference of losses that are the same
+
+
+@dataclass(frozen=True)
+class History:
+    """Say how evaluations depend on what was evaluated before, and with what.
+
+    `loss` and `gradient` are relative differences between two calls at one point; `random` says that these cannot be
+    reproduced by the same calls. `stale` says that a call returns the gradient of the one before, `grows` that
+    gradients add up from call to call, and `batch` is a gradient alone over that within a batch of `ROWS`.
+    """
+
+    loss: float
+    gradient: float
+    random: bool
+    stale: bool
+    grows: bool
+    batch: float
+
+
+def observe(objective: Objective, x: Float[Tensor, "batch dim"]) -> History:
+    """Evaluate two points alone in several orders, and both in a batch. Raises what the objective raises."""
+    a, b = x[:1], x[1:2]
+    order = [a, b, a, a, b, a, a]
+    first, other, after, repeated, _, after_again, repeated_again = [
+        evaluate(objective, one, grad=True) for one in order
+    ]
+    losses = _apart(after.loss, repeated.loss), _apart(first.loss, repeated.loss)
+    again = _apart(after.loss, after_again.loss), _apart(repeated.loss, repeated_again.loss)
+    moved = max(losses)
+    batch = evaluate(objective, x[:ROWS], grad=True)
+    return History(
+        loss=moved,
+        gradient=max(_gap(after, repeated), _gap(first, repeated)),
+        random=moved > SAME and max(again) > moved / 10,
+        stale=_gap(other, repeated) < ALIKE < _gap(after, repeated),
+        grows=_grows(after, repeated, after_again, repeated_again),
+        batch=_ratio(repeated, batch),
+    )
+
+
+def _apart(one: Tensor, other: Tensor) -> float:
+    scale = max(float(one.abs().max()), float(other.abs().max()))
+    apart = float((one - other).abs().max())
+    return apart / scale if scale > 0 and apart == apart else 0.0
+
+
+def _gap(one: Evaluation, other: Evaluation) -> float:
+    """Return how far two gradients are apart, relative to the longer."""
+    if one.grad is None or other.grad is None or not bool((one.has_gradient & other.has_gradient).all()):
+        return 0.0
+    return _apart(one.grad, other.grad)
+
+
+def _grows(*found: Evaluation) -> bool:
+    """Say whether gradients at one point, called again and again, keep on growing along one direction."""
+    grads = [one.grad for one in found if one.grad is not None and bool(one.has_gradient.all())]
+    if len(grads) < len(found):
+        return False
+    sizes = [float(grad.norm()) for grad in grads]
+    return all(late > 1.1 * early for early, late in pairwise(sizes))
+
+
+def _ratio(alone: Evaluation, batch: Evaluation) -> float:
+    """Return the length of a gradient alone over that of the same row in a batch, 1 where there is none."""
+    if alone.grad is None or batch.grad is None:
+        return 1.0
+    if not bool(alone.has_gradient.all() & batch.has_gradient[0]):
+        return 1.0
+    size = float(batch.grad[0].norm())
+    ratio = float(alone.grad[0].norm()) / size if size > 0 else 1.0
+    return ratio if torch.isfinite(torch.tensor(ratio)) else 1.0

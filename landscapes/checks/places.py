@@ -1,0 +1,112 @@
+"""Special places of a box, which random points never meet: its centre, zeros, equal parameters, edges and corners."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ..objective import Objective
+from .probe import Lines, Probe
+from .slopes import BAD, Judgement, Kind, Ladder, Limits, measure
+
+STEPS = (1e-8, 1e-6, 1e-5, 1e-4, 1e-3)
+AXES = 4  # at each place, drawn from all
+NEARBY, NEAR = 8, 1e-6  # gradients around a place, and how far from it, whose range holds that at a kink
+GROWING = 1.5  # times a slope is that over a tenth of the step at least, where it grows without bounds
+CLEAR = 100  # times rounding is what a change is, to be seen
+INSIDE = 1e-9  # of the box: how far inside a bound a zero lies
+
+
+def places(objective: Objective, seed: int) -> dict[str, Float[Tensor, " dim"]]:
+    """Return the places by name, in the unit cube: those that are there, and differ."""
+    space, dim = objective.space, objective.space.dim
+    generator = torch.Generator().manual_seed(seed)
+    drawn = 0.1 + 0.8 * torch.rand(dim, generator=generator, dtype=torch.float64)
+    zero = space.to_unit(torch.zeros(dim, dtype=torch.float64))
+    inside = (zero > INSIDE) & (zero < 1 - INSIDE)
+    corner = (torch.rand(dim, generator=generator) < 0.5).double()
+    found = {"the centre": torch.full_like(drawn, 0.5), "a corner": corner, "the opposite corner": 1 - corner}
+    if bool(inside.any()):
+        found["zero"] = torch.where(inside, zero, drawn)
+        found["a zero"] = torch.where(torch.arange(dim) == int(inside.nonzero()[0]), zero, drawn)
+    if dim > 1:
+        value = space.from_unit(drawn)[0]
+        alike = space.to_unit(value.expand(dim).clone())
+        found["equal parameters"] = torch.where((alike > 0) & (alike < 1), alike, drawn)
+        edge = drawn.clone()
+        edge[0] = corner[0]
+        found["an edge"] = edge
+    for name, x in objective.special_places().items():
+        found[name] = space.to_unit(torch.as_tensor(x, dtype=torch.float64))
+    kept: dict[str, Tensor] = {}
+    for name, u in found.items():
+        if not any(torch.equal(u, other) for other in kept.values()):
+            kept[name] = u.clamp(0, 1)
+    return kept
+
+
+def measure_places(probe: Probe, seed: int) -> tuple[tuple[str, ...], Ladder]:
+    """Judge gradients at special places along some axes; returns the name of the place of each line, and the lines.
+
+    At a kink several gradients are as good: one is none too, where it lies within the range of those around it.
+    """
+    found = places(probe.objective, seed)
+    u, dim = torch.stack(list(found.values())), probe.objective.space.dim
+    generator = torch.Generator().manual_seed(seed)
+    axes = torch.randperm(dim, generator=generator)[:AXES].sort().values
+    point = torch.arange(len(u)).repeat_interleave(len(axes))
+    direction = torch.eye(dim, dtype=torch.float64)[axes].repeat(len(u), 1)
+    lines = Lines.through(probe, u, direction, point, probe.gradient(u))
+    ladder = measure(probe, lines, STEPS)
+    wrong = [row for row, one in enumerate(ladder.judged) if one.kind == Kind.WRONG]
+    judged = list(ladder.judged)
+    for row in wrong:
+        if _is_within_neighbours(probe, lines, row):
+            judged[row] = Judgement(Kind.KINK, judged[row].exact)
+    infinite = {int(point[row]) for row in range(len(judged)) if _is_infinite(probe, ladder, row)}
+    for row, one in enumerate(judged):
+        if one.kind == Kind.NAN and int(point[row]) in infinite:
+            judged[row] = Judgement(Kind.STEEP, one.exact)
+    names = tuple(list(found)[one] for one in point.tolist())
+    return names, Ladder(ladder.lines, ladder.steps, ladder.walked, tuple(judged))
+
+
+def _is_within_neighbours(probe: Probe, lines: Lines, row: int) -> bool:
+    """Say whether gradients around a place differ along a line, and that of the place lies within their range."""
+    generator = torch.Generator().manual_seed(row)
+    off = torch.randn(NEARBY, lines.u.shape[1], generator=generator, dtype=torch.float64)
+    found = probe.gradient((lines.u[row] + NEAR * off).clamp(0, 1))
+    if found.grad is None:
+        return False
+    slopes = (found.grad * probe.width * lines.direction[row]).sum(dim=1)
+    slopes = slopes[slopes.isfinite()]
+    if not len(slopes):
+        return False
+    low, high, exact = float(slopes.min()), float(slopes.max()), float(lines.slope[row])
+    room = Limits.of(probe).relative * max(abs(low), abs(high))
+    return high - low > room and low - room <= exact <= high + room
+
+
+def _is_infinite(probe: Probe, ladder: Ladder, row: int) -> bool:
+    """Say whether the loss's own slope grows without bounds towards a place, as that of a square root at 0."""
+    loss = ladder.lines.loss[row]
+    change = torch.fmax(*(ladder.walked[:, :, row] - loss).abs())
+    known = change.isfinite()
+    change, steps = change[known], torch.tensor(ladder.steps, dtype=torch.float64)[known]
+    if len(change) < 3 or float(change[0]) <= CLEAR * probe.eps * abs(float(loss)):
+        return False
+    slopes = change / steps
+    return bool((slopes[:-1] > GROWING * slopes[1:]).all())
+
+
+def describe(name: str, one: Judgement, parameter: str, loss: float) -> str:
+    """Say what is wrong at a place."""
+    if one.kind == Kind.NAN:
+        return f"the gradient is NaN at {name}, where the loss is {loss:.4g}"
+    sides = [side.value for side in (one.behind, one.ahead) if side is not None]
+    rises = " and ".join(f"{value:.3g}" for value in sides) or f"{one.slope.value:.3g}" if one.slope else "otherwise"
+    return f"at {name}, by {parameter}, the gradient is {one.exact:.3g} and the loss rises by {rises} to either side"
+
+
+__all__ = ["BAD", "describe", "measure_places", "places"]

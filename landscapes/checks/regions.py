@@ -1,0 +1,117 @@
+"""Describe where gradients are wrong, by the simplest rule that holds: an interval of one parameter, or of two."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import permutations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .diagnosis import Region
+
+FEWEST = 3  # points, wrong or right, from which a rule is told
+WORST = 0.3  # of the rarer kind is what a rule may put on the wrong side
+CANDIDATES = 6  # features whose pairs are tried
+Points = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class _Interval:
+    """An interval of a feature that holds most of the wrong points and few of the others."""
+
+    feature: int
+    low: float
+    high: float
+    score: int
+
+    def holds(self, values: Points) -> NDArray[np.bool_]:
+        """Say which points lie in it."""
+        found: NDArray[np.bool_] = (values[:, self.feature] >= self.low) & (values[:, self.feature] <= self.high)
+        return found
+
+
+def find_region(
+    values: Points, names: Sequence[str], wrong: NDArray[np.bool_], events: Mapping[str, Points] | None = None
+) -> Region | None:
+    """Return the simplest rule that tells wrong points from others; None where all are wrong, or no rule holds.
+
+    `values` has shape (point, parameter), in the parameters' own units. `events` are counts of what happens at each
+    point, features like parameters.
+    """
+    few = min(int(wrong.sum()), int((~wrong).sum()))
+    if few < FEWEST:
+        return None
+    features, labels, spans = _features(values, names, events or {})
+    single = sorted((_best_interval(features, one, wrong) for one in range(len(labels))), key=lambda one: -one.score)
+    best: tuple[float, list[_Interval]] = (_error(features, single[:1], wrong), single[:1])
+    if best[0] > WORST * few / len(wrong) / 3:
+        for first, other in permutations(single[:CANDIDATES], 2):
+            inside = first.holds(features)
+            second = _best_interval(features[inside], other.feature, wrong[inside])
+            error = _error(features, [first, second], wrong)
+            if error < best[0] - 1.5 / len(wrong):  # a second condition has to be worth it
+                best = (error, [first, second])
+    error, intervals = best
+    if error > WORST * few / len(wrong):
+        return None
+    rule = " and ".join(_describe(one, features, labels, wrong, spans) for one in intervals)
+    return Region(rule, tuple(labels[one.feature] for one in intervals), error, len(wrong))
+
+
+def _features(
+    values: Points, names: Sequence[str], events: Mapping[str, Points]
+) -> tuple[Points, list[str], NDArray[np.float64]]:
+    """Return parameters and events as columns, their labels, and how far each reaches."""
+    columns, labels = [values, *(count[:, None] for count in events.values())], [*names, *events]
+    features = np.concatenate(columns, axis=1)
+    return features, labels, np.ptp(features, axis=0)
+
+
+def _best_interval(features: Points, feature: int, wrong: NDArray[np.bool_]) -> _Interval:
+    """Return the interval in which wrong points outnumber right ones the most (the largest sum of a run)."""
+    order = np.argsort(features[:, feature], kind="stable")
+    gains = np.where(wrong[order], 1, -1)
+    best, low, high, total, start = 0, 0, -1, 0, 0
+    for place, gain in enumerate(gains.tolist()):
+        if total <= 0:
+            total, start = 0, place
+        total += gain
+        if total > best:
+            best, low, high = total, start, place
+    if high < low:
+        return _Interval(feature, np.inf, -np.inf, 0)
+    found = features[order, feature]
+    return _Interval(feature, float(found[low]), float(found[high]), best)
+
+
+def _error(features: Points, intervals: Sequence[_Interval], wrong: NDArray[np.bool_]) -> float:
+    inside = np.ones(len(wrong), dtype=bool)
+    for one in intervals:
+        inside &= one.holds(features)
+    return float((inside != wrong).mean())
+
+
+def _describe(
+    one: _Interval, features: Points, labels: Sequence[str], wrong: NDArray[np.bool_], spans: NDArray[np.float64]
+) -> str:
+    """Write an interval; an end at which no right point lies beyond is none."""
+    values, label = features[:, one.feature], labels[one.feature]
+    right = values[~wrong]
+    below, above = right[right < one.low], right[right > one.high]
+    span = float(spans[one.feature]) or 1.0
+    low, high = (_rounded(value, span) for value in (one.low, one.high))
+    if not len(above) and not len(below):
+        return f"{label} between {low} and {high}"
+    if not len(above):
+        return f"{label} > {_rounded((float(below.max()) + one.low) / 2, span)}"
+    if not len(below):
+        return f"{label} < {_rounded((float(above.min()) + one.high) / 2, span)}"
+    return f"{label} between {low} and {high}"
+
+
+def _rounded(value: float, span: float) -> str:
+    """Write a number to a hundredth of the range it lies in."""
+    digits = max(0, 2 - int(np.floor(np.log10(span))))
+    return f"{value:z.{digits}f}" if digits <= 9 and abs(value) < 1e6 else f"{value:.3g}"

@@ -1,0 +1,393 @@
+"""Hold the slopes that gradients give against differences of losses, by a model of the error of each difference.
+
+A difference over a step h of losses that are known to +-noise is off by noise / h, and by its truncation. The second
+is told from the next larger step: over a ladder of steps differences form a plateau, where two that follow each other
+agree within both. A gradient is wrong where the plateau of the smallest steps differs from it by more than its error.
+Steps are shares of the box, slopes [loss unit per side of the box].
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy.typing import NDArray
+from torch import Tensor
+
+from .probe import EPS, Lines, Probe
+
+STEPS = (1e-8, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 3e-1)
+BETWEEN_STEPS = (1e-7, 3e-6, 3e-5, 3e-4, 3e-3, 3e-2)  # for slopes that the others leave undecided
+FINER_STEPS = (1e-13, 1e-12, 1e-11, 1e-10, 1e-9)  # where the gradient says that losses change within the smallest step
+TOLERANCE = {"float64": 1e-3, "float32": 3e-3}  # relative error of a gradient that is no defect
+ROUNDED = 1e3  # times the precision is what rounding makes of a gradient's components
+PLATEAU = 0.2  # of the larger is what two differences that agree may be apart
+RELIABLE = 0.1  # of the larger of both slopes is what the error of a difference may be, to be judged by
+NOISE_MARGIN = 3  # times the typical noise is what one difference may show
+ROUGH = 100  # times rounding is what losses change between neighbours where they are rough, not rounded
+MOST_FINER = 24  # lines, at most, that are walked over finer steps
+BEYOND = 10  # times what losses change is what a gradient says where it is too steep to be judged
+UNEVEN = 0.003  # of what neighbours differ by is what a gradient foresees at most, where that is noise
+ROUNDED_BY = 16  # times the spacing of losses is the most that rounding changes them by, in one step
+SMALL_GRAIN = 1e-4  # of the box: losses that do not change over longer steps are flat there, and not rounded
+FLAT = 1e-6  # of the typical slope along such lines is none
+
+
+class Kind(StrEnum):
+    """Say how the gradient's slope along a line compares with differences of losses."""
+
+    AGREES = "agrees"
+    KINK = "kink"  # slopes to both sides differ, and the gradient is one of them or between
+    JUMP = "jump"  # the loss jumps here, and the gradient is the slope to one side
+    FLAT = "flat"  # neither shows a slope
+    ZERO = "exactly zero"  # the gradient is 0, and losses do not change over the smallest steps
+    NOISE = "lost in noise"  # no step shows a slope that could be compared
+    STEEP = "too steep to judge"  # losses change by less than the gradient says over the smallest step, and not evenly
+    NAN = "NaN"  # the loss is finite, and the gradient is not
+    WRONG = "wrong"
+    FAILED = "failed"  # there is no loss
+
+
+BAD = (Kind.WRONG, Kind.NAN)
+UNJUDGED = (Kind.NOISE, Kind.STEEP, Kind.FAILED)
+
+
+class Slope(NamedTuple):
+    """A slope by differences: over a step, and its error."""
+
+    step: float
+    value: float
+    error: float
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """Say how a line was judged: the slope by differences, its error and step, and what lies to both sides.
+
+    `moves` says that the loss changes along the line by more than its noise, `limit` what would have been found.
+    """
+
+    kind: Kind
+    exact: float
+    slope: Slope | None = None
+    behind: Slope | None = None
+    ahead: Slope | None = None
+    moves: bool = False
+    limit: float = np.nan
+    noise: float = np.nan
+
+
+@dataclass(frozen=True, eq=False)
+class Ladder:
+    """Losses along lines over a ladder of steps: `walked` has shape (2, step, line), ahead first."""
+
+    lines: Lines
+    steps: tuple[float, ...]
+    walked: Float[Tensor, "2 step line"]
+    judged: tuple[Judgement, ...]
+
+    @property
+    def differences(self) -> Float[Tensor, "step line"]:
+        """Central differences, one-sided where the box ends, NaN where neither is there."""
+        steps = torch.tensor(self.steps, dtype=torch.float64)[:, None]
+        ahead, behind = (self.walked[0] - self.lines.loss) / steps, (self.lines.loss - self.walked[1]) / steps
+        central = (ahead + behind) / 2
+        return torch.where(central.isfinite(), central, torch.where(ahead.isfinite(), ahead, behind))
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What tells a wrong slope from a right one: the precision of losses, what repeats differ by, and tolerances."""
+
+    eps: float
+    repeats: float
+    relative: float
+
+    @classmethod
+    def of(cls, probe: Probe) -> Limits:
+        """Return those of an objective, by what was seen of it so far."""
+        single = probe.eps == EPS["float32"]
+        return cls(probe.eps, probe.repeats, TOLERANCE["float32" if single else "float64"])
+
+
+def measure(probe: Probe, lines: Lines, steps: Sequence[float] = STEPS) -> Ladder:
+    """Walk along lines over a ladder of steps, and over more where that leaves a line undecided, and judge them."""
+    ladder = _judge(probe, lines, tuple(steps), lines.walk(probe, list(steps)))
+    open_ = [one for one, found in enumerate(ladder.judged) if _undecided(found)]
+    further = [step for step in BETWEEN_STEPS if step not in steps]
+    if open_ and further:
+        ladder = _extend(probe, ladder, open_, further)
+    rough = [one for one, found in enumerate(ladder.judged) if _needs_finer(found, probe, lines, one, ladder.steps[0])]
+    if not rough:
+        return ladder
+    ladder = _extend(probe, ladder, rough[:MOST_FINER], list(FINER_STEPS))
+    judged = list(ladder.judged)
+    for row in rough[MOST_FINER:]:
+        judged[row] = replace(judged[row], kind=Kind.STEEP)
+    return replace(ladder, judged=tuple(judged))
+
+
+def _undecided(found: Judgement) -> bool:
+    return found.kind in (Kind.NOISE, Kind.STEEP) or (found.kind == Kind.WRONG and found.slope is None)
+
+
+def _needs_finer(found: Judgement, probe: Probe, lines: Lines, row: int, smallest: float) -> bool:
+    """Say whether a disagreement may be that of losses which change within the smallest step."""
+    rounding = _rounding(probe.eps, lines, row)
+    rough = found.noise > ROUGH * rounding
+    return (
+        rough and found.kind in (Kind.WRONG, Kind.NOISE, Kind.STEEP) and abs(found.exact) * smallest > ROUGH * rounding
+    )
+
+
+def _rounding(eps: float, lines: Lines, row: int) -> float:
+    return eps * abs(float(lines.loss[row]))
+
+
+def _extend(probe: Probe, ladder: Ladder, rows: Sequence[int], more: Sequence[float]) -> Ladder:
+    """Walk along some of the lines over further steps, and judge these once more."""
+    chosen = torch.tensor(rows)
+    steps = tuple(sorted({*ladder.steps, *more}))
+    order = torch.tensor([steps.index(step) for step in ladder.steps])
+    added = torch.tensor([steps.index(step) for step in more if step not in ladder.steps])
+    walked = torch.full((2, len(steps), len(ladder.lines)), torch.nan, dtype=torch.float64)
+    walked[:, order] = ladder.walked
+    part = ladder.lines.rows(chosen)
+    walked[:, added[:, None], chosen[None]] = part.walk(probe, [steps[one] for one in added.tolist()])
+    again = _judge(probe, part, steps, walked[:, :, chosen])
+    judged = list(ladder.judged)
+    for row, found in zip(rows, again.judged, strict=True):
+        judged[row] = found
+    return Ladder(ladder.lines, steps, walked, tuple(judged))
+
+
+def _judge(probe: Probe, lines: Lines, steps: tuple[float, ...], walked: Float[Tensor, "2 step line"]) -> Ladder:
+    """Judge lines by what was walked."""
+    limits = Limits.of(probe)
+    loss, slope = lines.loss.numpy(), lines.slope.numpy()
+    rounding = _rounding_of(probe, lines, limits.eps)
+    noise = _typical_noise(loss, walked.numpy())
+    typical = _typical_slope(slope, lines)
+    allowed = ROUNDED * limits.eps * lines.parts.numpy() + FLAT * typical
+    judged = []
+    for row in range(len(lines)):
+        found = walked[:, :, row].numpy()
+        known = np.isfinite(found).any(axis=0)
+        line = _Line(
+            np.array(steps)[known], found[:, known], float(loss[row]), float(slope[row]), limits.eps,
+            float(rounding[row]), float(noise[row]) + NOISE_MARGIN * limits.repeats, limits.relative,
+            float(allowed[row]),
+        )  # fmt: skip
+        judged.append(Judgement(Kind.NAN, np.nan) if bool(lines.missing[row]) else line.judge())
+    return Ladder(lines, steps, walked, tuple(judged))
+
+
+def _rounding_of(probe: Probe, lines: Lines, eps: float) -> NDArray[np.float64]:
+    """Return what rounding of the loss, and of the point, changes of each loss [loss unit]."""
+    space = probe.objective.space
+    places = (lines.u + space.lower / probe.width).abs() + 1
+    parts = torch.where(lines.direction == 0, 0.0, (lines.grad * places).abs()).nan_to_num().sum(dim=1)
+    point = EPS["float32"] if probe.precision == "float32" else EPS["float64"]
+    found: NDArray[np.float64] = (eps * lines.loss.abs() + point * parts).numpy()
+    return found
+
+
+def _typical_noise(loss: NDArray[np.float64], walked: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return what is usual among lines: half of a second difference over the smallest step.
+
+    By size and as a share of the loss: losses of several decades, and small differences of large numbers.
+    """
+    second = np.abs(walked[0, 0] + walked[1, 0] - 2 * loss) / 2
+    known = np.isfinite(second)
+    if not known.any():
+        return np.zeros(len(loss))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        shares = (second / np.abs(loss))[known & (loss != 0)]
+    usual = float(np.median(second[known]))
+    share = float(np.median(shares)) if len(shares) else 0.0
+    found: NDArray[np.float64] = NOISE_MARGIN * np.minimum(usual, share * np.abs(loss))
+    return found
+
+
+def _typical_slope(slope: NDArray[np.float64], lines: Lines) -> NDArray[np.float64]:
+    """Return the median |slope| among lines along the same parameter, or among those along several."""
+    moved = (lines.direction != 0).sum(dim=1).numpy()
+    axis = np.where(moved == 1, lines.direction.abs().argmax(dim=1).numpy(), -1)
+    found = np.zeros(len(slope))
+    for one in np.unique(axis):
+        sizes = np.abs(slope[(axis == one) & np.isfinite(slope)])
+        found[axis == one] = np.median(sizes) if len(sizes) else 0.0
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class _Line:
+    """One line: losses ahead and behind over steps, smallest first, NaN where there is none."""
+
+    steps: NDArray[np.float64]
+    walked: NDArray[np.float64]
+    loss: float
+    exact: float
+    eps: float
+    rounding: float
+    usual: float
+    relative: float
+    allowed: float
+
+    def judge(self) -> Judgement:
+        """Compare the gradient's slope with the plateaus of differences: central ones, and to both sides."""
+        if not np.isfinite(self.loss) or not len(self.steps):
+            return Judgement(Kind.FAILED, self.exact)
+        if not np.isfinite(self.exact):
+            return Judgement(Kind.NAN, self.exact)
+        noise = self._noise()
+        ahead, behind = self.walked - self.loss
+        with np.errstate(invalid="ignore"):
+            halves, error = (ahead - behind) / (2 * self.steps), noise / self.steps
+            central = self._plateau(zip(self.steps, halves, error, strict=True))
+            front = self._plateau(zip(self.steps, ahead / self.steps, 2 * error, strict=True))
+            back = self._plateau(zip(self.steps, -behind / self.steps, 2 * error, strict=True))
+        change = np.fmax(np.abs(ahead), np.abs(behind))
+        moves = bool(np.nanmax(change) > max(NOISE_MARGIN * noise, self.rounding))
+        kind, slope = self._compare(central, front, back, change, noise)
+        if kind == Kind.WRONG and slope is not None and not self._holds(slope, noise):
+            kind = Kind.STEEP if abs(self.exact) > BEYOND * abs(slope.value) else Kind.NOISE
+        limit = np.nan
+        if slope is not None and max(abs(slope.value), abs(self.exact)) > 0:
+            limit = self._margin(slope) / max(abs(slope.value), abs(self.exact))
+        return Judgement(kind, self.exact, slope, back, front, moves, limit, noise)
+
+    def _noise(self) -> float:
+        """Return the noise of losses at this line.
+
+        It is what is usual, or half of the second difference over the smallest step; or the first change, where losses
+        do not change at all over smaller steps, as those of rounded numbers do.
+        """
+        ahead, behind = self.walked - self.loss
+        second = np.abs(ahead + behind) / 2
+        own = float(second[0]) if np.isfinite(second[0]) else 0.0
+        change = np.fmax(np.abs(ahead), np.abs(behind))
+        moved = np.flatnonzero(change > 0)
+        first = int(moved[0]) if len(moved) else 0
+        grain = float(change[first]) if first and self._is_grain(change) else 0.0
+        return max(self.usual, own, grain, self.rounding)
+
+    def _is_grain(self, change: NDArray[np.float64]) -> bool:
+        """Say whether the first change along a line is that of rounded losses or points, not a step of its own."""
+        moved = np.flatnonzero(change > 0)
+        if not len(moved):
+            return False
+        first = int(moved[0])
+        return bool(self.steps[first] <= SMALL_GRAIN or change[first] <= ROUNDED_BY * self.eps * abs(self.loss))
+
+    def _holds(self, slope: Slope, noise: float) -> bool:
+        """Say whether differences over steps that are smaller than a plateau's are those of it, within their noise."""
+        smaller = self.steps < slope.step
+        ahead, behind = self.walked[:, smaller] - self.loss
+        steps = self.steps[smaller]
+        central = (ahead - behind) / (2 * steps)
+        found = np.where(np.isfinite(central), central, np.where(np.isfinite(ahead), ahead, -behind) / steps)
+        allowed = 2 * (2 * noise / steps + slope.error) + PLATEAU * abs(slope.value)
+        return bool((np.abs(found - slope.value) <= allowed).all())
+
+    def _plateau(self, found: Iterator[tuple[float, float, float]]) -> Slope | None:
+        """Return the slope by the smallest steps whose differences agree, made more exact by larger ones."""
+        known = [Slope(*map(float, one)) for one in found if np.isfinite(one[1])]
+        best: Slope | None = None
+        for small, large in pairwise(known):
+            apart = abs(small.value - large.value)
+            size = max(abs(small.value), abs(large.value), abs(self.exact))
+            error = small.error + apart / 2
+            if apart > small.error + large.error + PLATEAU * size or error > RELIABLE * size:
+                if best is not None and error <= RELIABLE * size:
+                    break
+                continue
+            if best is None:
+                best = Slope(small.step, small.value, error)
+            elif abs(small.value - best.value) > error + best.error:
+                break
+            elif error < best.error:
+                best = Slope(small.step, small.value, error)
+        return best
+
+    def _margin(self, slope: Slope) -> float:
+        size = max(abs(slope.value), abs(self.exact))
+        return 2 * slope.error + self.relative * size + self.allowed
+
+    def _agrees(self, slope: Slope | None) -> bool:
+        return slope is not None and abs(slope.value - self.exact) <= self._margin(slope)
+
+    def _compare(
+        self,
+        central: Slope | None,
+        front: Slope | None,
+        back: Slope | None,
+        change: NDArray[np.float64],
+        noise: float,
+    ) -> tuple[Kind, Slope | None]:
+        first = float(change[0])
+        if self.exact == 0 and first == 0 and not self._is_grain(change):
+            return Kind.ZERO, central
+        if self._agrees(central):
+            return Kind.AGREES, central
+        if kind := self._one_sided(front, back, first, noise):
+            return kind, central
+        if np.nanmax(change) <= NOISE_MARGIN * noise and abs(self.exact) * self.steps[-1] <= NOISE_MARGIN * noise:
+            return Kind.FLAT, central
+        sides = [one for one in (front, back) if one is not None]
+        found = central or (min(sides, key=lambda one: one.error) if sides else None)
+        if self._is_rough():
+            return Kind.STEEP, found
+        if found is None:
+            flat = abs(self.exact) <= self.allowed and first <= self.allowed * self.steps[0] + NOISE_MARGIN * noise
+            return (Kind.FLAT if flat else Kind.NOISE), None
+        return Kind.WRONG, found
+
+    def _one_sided(self, front: Slope | None, back: Slope | None, first: float, noise: float) -> Kind | None:
+        """Return what a line is whose gradient is the slope to one side, or between both."""
+        jumps = first > BEYOND * (noise if np.isfinite(noise) else 0.0) + BEYOND * abs(self.exact) * self.steps[0]
+        if front is not None and back is not None:
+            low, high = sorted((front, back), key=lambda one: one.value)
+            apart = high.value - low.value > 2 * (low.error + high.error)
+            within = low.value - self._margin(low) <= self.exact <= high.value + self._margin(high)
+            return Kind.KINK if apart and within else None
+        if self._agrees(front) or self._agrees(back):
+            missing = self.walked[1 if front else 0, 0]
+            return Kind.JUMP if jumps and np.isfinite(missing) else Kind.KINK if np.isfinite(missing) else Kind.AGREES
+        return None
+
+    def _is_rough(self) -> bool:
+        """Say whether losses change unevenly over the smallest step, in which the gradient foresees more than that."""
+        second = abs(float(self.walked[:, 0].sum()) - 2 * self.loss) / 2
+        uneven = max(self.usual, second if np.isfinite(second) else 0.0)
+        return uneven > ROUGH * self.eps * abs(self.loss) and abs(self.exact) * self.steps[0] > UNEVEN * uneven
+
+
+def counts(judged: Sequence[Judgement]) -> dict[Kind, int]:
+    """Count lines by what they are."""
+    kinds = [one.kind for one in judged]
+    return {kind: kinds.count(kind) for kind in Kind}
+
+
+def directions(
+    dim: int, u: Float[Tensor, "line dim"], sensitivity: Float[Tensor, " dim"], seed: int
+) -> Float[Tensor, "line dim"]:
+    """Draw a direction through each point, all parameters at once, into the box, of no component above one.
+
+    Every other direction moves parameters the less, the more the loss depends on them, so that all count alike.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    signs = torch.randint(0, 2, u.shape, generator=generator, dtype=torch.float64) * 2 - 1
+    signs = torch.where(u < 0.3, 1.0, torch.where(u > 0.7, -1.0, signs))
+    sizes = 0.5 + 0.5 * torch.rand(u.shape, generator=generator, dtype=torch.float64)
+    live = sensitivity[sensitivity > 0]
+    if len(live) and dim > 1:
+        weight = torch.where(sensitivity > 0, float(live.median()) / sensitivity.clamp(min=1e-300), 1.0)
+        sizes[1::2] *= weight.clamp(1e-3, 1e3) / weight.clamp(1e-3, 1e3).max()
+    return signs * sizes
