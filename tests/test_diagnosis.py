@@ -8,11 +8,15 @@ from functools import cache
 
 import pytest
 import torch
+from benchmarks.diagnosis.__main__ import main, missed
 from benchmarks.diagnosis.cases import Case
 from benchmarks.diagnosis.catalogue import defects, healthy_functions
+from benchmarks.diagnosis.examine import Result, Slabs, is_placed, slabs_of
+from benchmarks.diagnosis.peers import PEERS, Peer, ask
 from torch import Tensor
 
 import gradscape as gs
+from gradscape.landscapes.checks.diagnosis import Diagnosis, Region
 from gradscape.landscapes.objective import Status
 
 DEFECTS, HEALTHY = defects(), healthy_functions()
@@ -215,3 +219,79 @@ def test_a_gradient_that_is_wrong_after_a_step_is_right_up_to_it(case: Case) -> 
         grad = env.evaluate(x).grad
         assert grad is not None
         assert (apart(case, env, x, grad).max() < RIGHT) == ok
+
+
+# ---- How answers are counted.
+
+
+def named(name: str) -> Case:
+    return next(case for case in DEFECTS if case.name == name)
+
+
+def told(*parameters: str, rule: str = "", what: str = "") -> list[Diagnosis]:
+    region = Region(rule, parameters, 0.0, 59) if rule else None
+    return [Diagnosis("sign", "fail", "certain", what, "", () if rule else parameters, region)]
+
+
+@pytest.mark.parametrize(
+    ("case", "diagnoses", "right"),
+    [
+        ("region-jax-springs-10-5%", told("stiffness 3", rule="stiffness 3 between 119 and 126 N/m"), True),
+        ("region-jax-springs-10-5%", told("stiffness 3", rule="stiffness 3 above 119 N/m"), False),
+        ("region-jax-springs-10-5%", told("stiffness 4", rule="stiffness 4 between 119 and 126 N/m"), False),
+        (
+            "region-numpy-gas-2-two",
+            told("temperature", "pressure", rule="pressure > 1.59e+05, temperature < 301"),
+            True,
+        ),
+        ("region-numpy-gas-2-two", told("pressure", rule="pressure above 1.59e+05 Pa"), False),
+        ("sign-of-one-torch-springs-10", told("stiffness 3"), True),
+        ("sign-of-one-torch-springs-10", told("stiffness 3", "stiffness 4"), False),
+        ("truncated-numpy-short-adjoint-100", told(*(f"force {k}" for k in range(57))), True),
+        ("truncated-numpy-short-adjoint-100", told(*(f"force {k}" for k in range(30))), False),
+        ("late-jax-late-2", told(what="the gradient is right up to 20 steps, and wrong after 21"), True),
+        ("late-jax-late-2", told(what="the gradient is wrong after 35 steps"), False),
+    ],
+)
+def test_a_place_is_named_where_parameters_and_edges_are(case: str, diagnoses: list[Diagnosis], right: bool) -> None:
+    chosen = named(case)
+    assert is_placed(chosen, chosen.build().space, diagnoses) == right
+
+
+def result(*, healthy: bool = False, passed: bool = False, found: bool = True, place: bool | None = True) -> Result:
+    return Result("case", "kind", "torch", healthy, passed, found, None if healthy else found, place, "", 0.0)
+
+
+def test_a_goal_is_missed_by_one_healthy_function_or_a_slab_too_few() -> None:
+    fine, well = [result()] * 97, result(healthy=True, passed=True, found=False, place=None)
+    enough = [Slabs(0.02, 0, 36, 1.0), Slabs(0.05, 34, 36, 1.0)]
+    assert missed([*fine, *[result(found=False)] * 3, well], enough) == []
+    assert len(missed([*fine, *[result(found=False)] * 4], enough)) == 1
+    assert missed([*fine, result(healthy=True, found=False, place=None)], []) == ["healthy and failed: case"]
+    assert len(missed([result(place=False)] * 16 + fine[:84], [])) == 1
+    assert len(missed(fine, [Slabs(0.05, 33, 36, 1.0)])) == 1
+
+
+@pytest.mark.parametrize("width", [0.02, 0.4])
+def test_slabs_lie_in_the_box_and_at_its_edges(width: float) -> None:
+    cuts = slabs_of(width)
+    assert len(cuts) == 36
+    assert {which for which, _, _ in cuts} == {0, 1}
+    assert min(lower for _, lower, _ in cuts) == -2
+    assert max(upper for _, _, upper in cuts) == pytest.approx(3)
+    assert all(upper - lower == pytest.approx(5 * width) for _, lower, upper in cuts)
+
+
+@pytest.mark.parametrize(
+    "peer", [peer for peer in PEERS if peer.name != "chex.assert_numerical_grads"], ids=lambda peer: peer.name
+)
+def test_a_peer_tells_a_wrong_sign_from_a_right_gradient(peer: Peer) -> None:
+    wrong = {"torch": "sign-torch-throw-2", "jax": "sign-jax-chain-100", "warp": "sign-warp-cosine-2"}
+    right = next(case for case in HEALTHY if case.framework == peer.framework and case.place is None)
+    assert ask(peer, named(wrong.get(peer.framework, "sign-numpy-cart-10"))).passed is False
+    assert ask(peer, right).passed is True
+
+
+@pytest.mark.nightly
+def test_the_check_reaches_its_goals() -> None:
+    assert main([]) == 0
