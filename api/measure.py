@@ -18,10 +18,11 @@ from .options import (
     SceneKeywords,
     Scheduler,
     Seed,
+    Share,
     at_least,
 )
 from .scene import spec_of
-from .values import as_path, as_widths
+from .values import as_path, as_power, as_widths
 
 if TYPE_CHECKING:
     from ..jobs.bench import Bench
@@ -35,15 +36,16 @@ if TYPE_CHECKING:
 def check(
     scene: Scene,
     *,
-    points: Annotated[int, at_least(2)] = 4,
+    power: Share = 0.05,
     seed: Seed = 0,
     **keywords: Unpack[SceneKeywords],
 ) -> CheckReport:
-    """Check that the gradients of an environment are right, and that it behaves at the extremes.
+    """Check that the gradients of an environment are right: where they are not, why, and what to do.
 
-    It checks shapes, refusals, batches, determinism, gradients against differences at several steps and at special
-    points, their growth with the horizon, forward against reverse differentiation if both exist, corners of the box
-    and beyond, long time steps, materials, horizons and precision. A warning is no failure: the gradient is right, but
+    It holds gradients against differences over many steps at random points, at special places and by every parameter,
+    and says at which share of the box they are wrong, with its interval, in which region, by which parameters and from
+    which cause. It also checks shapes, refusals, batches, determinism, growth with the horizon, corners of the box and
+    beyond, long time steps, materials, horizons and precision. A warning is no failure: the gradient is right, but
     useless over an optimiser's step. The exit code is 0 if the environment passes, else 1. It writes no file.
 
     Raises ValueError for what the scene does not have, TooLargeError for more points than there is memory for, and
@@ -53,14 +55,15 @@ def check(
 
     Parameters
     ----------
-    points
-        Number of random points to check at.
+    power
+        Share of the box, as 5% or 0.05: a defect that fills it is found with 95 %. A smaller one takes more points (59
+        at 5 %, 299 at 1 %, 14 at 20 %).
     """
     spec = spec_of(scene, keywords)
     from ..jobs.check import CheckJob
 
-    call = current()
-    return CheckJob.open(spec.resolve(call.watch), points=points, seed=seed, command=call.command).run(call.watch)
+    call, share = current(), as_power(power)
+    return CheckJob.open(spec.resolve(call.watch), power=share, seed=seed, command=call.command).run(call.watch)
 
 
 @verb

@@ -15,6 +15,9 @@ def as_names(given: str | Sequence[str] | None) -> list[str]:
     return [name.strip() for text in texts for name in str(text).split(",") if name.strip()]
 
 
+LEAST_POWER, MOST_POWER = 5e-4, 0.6  # of the box: what 6000 points find, and what four do
+
+
 def as_share(given: float | str | None, option: str) -> float | None:
     """Return a share that is given as 1% or 0.01. Raises ValueError where it is neither."""
     if given is None or not isinstance(given, str):
@@ -23,6 +26,14 @@ def as_share(given: float | str | None, option: str) -> float | None:
         return read_share(given)
     except ValueError:
         raise ValueError(f"{option} takes a share such as 1% or 0.01; got {given!r}") from None
+
+
+def as_power(given: float | str) -> float:
+    """Return the share of the box that a defect fills. Raises ValueError where it is none, or no check finds it."""
+    share = as_share(given, "power")
+    if share is None or not LEAST_POWER <= share <= MOST_POWER:
+        raise ValueError(f"power takes a share of the box from {LEAST_POWER:.2%} to {MOST_POWER:.0%}; got {given}")
+    return share
 
 
 def as_window(given: float | str | tuple[float, float] | None) -> float | tuple[float, float] | None:

@@ -4,12 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import cache, cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 from ..landscapes.capacity import Need, require
+from ..landscapes.checks.diagnosis import Diagnosis
+from ..landscapes.checks.examination import Share, points_for
 from ..landscapes.checks.finding import Finding
+from ..landscapes.checks.parameters import ParameterRow
+from ..landscapes.checks.suite import POWER, Results, Settings, check, episodes
+from ..landscapes.checks.usefulness import Usefulness
+from ..landscapes.convert import to_json
 from ..landscapes.cost import duration, episode_cost
 from ..landscapes.plain import jsonable
 from .scene import SceneSpec
@@ -25,6 +31,7 @@ if TYPE_CHECKING:
 
 FACTORS = (1, 2, 4, 8)  # of the fidelity's time step, and of the scene's horizon
 GROWTH = (1, 2, 4)  # of the horizon: how long gradients are held against the rise of the loss
+POINT_ROWS = 32  # rows that are held for a point: those of all steps of a ladder
 FORWARD = 64  # parameters of which both modes are compared at most
 MODES = ("forward", "reverse")  # of automatic differentiation
 
@@ -58,16 +65,22 @@ class CheckReport:
     options: dict[str, Any]
     device: str
     engine: str
-    points: int
+    power: float
     seed: int
     passed: bool
     findings: tuple[Finding, ...]
     command: str
+    diagnoses: tuple[Diagnosis, ...] = ()
+    share: Share | None = None
+    parameters: tuple[ParameterRow, ...] = ()
+    usefulness: tuple[Usefulness, ...] = ()
 
     def record(self) -> dict[str, Any]:
         """Return it as plain JSON, which knows no infinity; findings are its `checks`."""
-        found = {name: getattr(self, name) for name in self.__dataclass_fields__ if name not in ("findings", "command")}
-        return {**found, "checks": list(map(_record, self.findings)), "command": self.command}
+        left = ("findings", "command", "diagnoses", "share", "parameters", "usefulness")
+        found = {name: getattr(self, name) for name in self.__dataclass_fields__ if name not in left}
+        measured = {name: to_json(getattr(self, name)) for name in left[2:]}
+        return {**found, **measured, "checks": list(map(_record, self.findings)), "command": self.command}
 
     def table(self) -> pd.DataFrame:
         """Return a row for each check, indexed by `check`: its `outcome`, its `figure` and `why`."""
@@ -75,6 +88,14 @@ class CheckReport:
 
         rows = [(one.check, one.outcome, one.figure, one.why) for one in self.findings]
         return pd.DataFrame(rows, columns=["check", "outcome", "figure", "why"]).set_index("check")
+
+    def parameter_table(self) -> pd.DataFrame:
+        """Return a row for each parameter: `zero`, `ratio` to the slope over a hundredth of the box, `verdict`."""
+        import pandas as pd
+
+        rows = [asdict(row) for row in self.parameters]
+        columns = list(ParameterRow.__dataclass_fields__)
+        return pd.DataFrame(rows, columns=columns).set_index("parameter")
 
     def _repr_html_(self) -> str:
         """Show the table in a notebook."""
@@ -87,20 +108,21 @@ class CheckJob:
 
     env: Environment
     spec: SceneSpec
-    points: int
+    power: float
     seed: int
     command: str = ""
+    results: Results = field(default_factory=Results)
 
     @classmethod
-    def open(cls, scene: SceneSpec, *, points: int = 4, seed: int = 0, command: str = "") -> CheckJob:
-        """Make the environment; nothing is kept on disk.
+    def open(cls, scene: SceneSpec, *, power: float = POWER, seed: int = 0, command: str = "") -> CheckJob:
+        """Make the environment; nothing is kept on disk. `power` is the share of the box that a defect fills.
 
         Raises ValueError for what the scene does not have, TooLargeError for more points than there is memory for.
         """
         env = scene.make()
-        require("points", points, partial(_need, env.space.dim))
+        require("points", points_for(power), partial(_need, env.space.dim))
         known = replace(scene, fidelity=env.fidelity, tolerance=None, device=env.device, engine=env.engine)
-        return cls(env, known, points, seed, command)
+        return cls(env, known, power, seed, command)
 
     @property
     def name(self) -> str:
@@ -135,7 +157,8 @@ class CheckJob:
 
     def report(self, findings: tuple[Finding, ...]) -> CheckReport:
         """Return what was found as one record."""
-        env = self.env
+        env, seen = self.env, self.results.examination
+        seen = seen if seen and seen.found.grad is not None else None
         return CheckReport(
             env=env.name,
             fidelity=env.fidelity.name,
@@ -143,28 +166,30 @@ class CheckJob:
             options=asdict(env.options),
             device=env.device,
             engine=env.engine,
-            points=self.points,
+            power=self.power,
             seed=self.seed,
             passed=not any(finding.bad for finding in findings),
             findings=findings,
             command=self.command,
+            diagnoses=self.results.diagnoses,
+            share=seen.share if seen else None,
+            parameters=seen.parameters() if seen else (),
+            usefulness=self.results.usefulness,
         )
 
     def _run(self, follow: Callable[[str], None]) -> Iterator[Finding]:
-        from ..landscapes.checks.suite import check
-
-        yield from check(  # once the cost is known, and by that the type of the losses
-            self.env,
-            points=self.points,
+        settings = Settings(  # once the cost is known, and by that the type of the losses
+            power=self.power,
             seed=self.seed,
             precision=self.env.precision,
             twin=_twin(self),
             variants=[*_time_steps(self), *_materials(self), *_horizons(self)],
             horizons=_lengths(self),
             other_mode=_other_mode(self),
-            expected=self.env.known_failures.get(self.env.fidelity.name),
+            expected=self.env.known_failures.get(self.env.fidelity.name, {}),
             follow=follow,
         )
+        yield from check(self.env, settings, self.results)
 
     @cached_property
     def longer(self) -> dict[int, Callable[[], Environment]]:
@@ -177,9 +202,7 @@ class CheckJob:
 
     def work(self) -> list[Work]:
         """Return about how many episodes all checks take."""
-        from ..landscapes.checks.suite import episodes
-
-        losses, gradients = episodes(self.env.space.dim, self.points, tuple(_lengths(self)))
+        losses, gradients = episodes(self.env.space.dim, self.power, tuple(_lengths(self)))
         gradients += 2 * (sum(FACTORS) + 4)  # two points over longer horizons, time steps and materials
         return [Work(self.env, losses, gradients)]
 
@@ -188,7 +211,7 @@ class CheckJob:
         env, cost, (work,) = self.env, episode_cost(self.env), self.work()
         plain, sloped = work.losses, work.gradients
         seconds = (plain * cost.forward + sloped * cost.gradient) / env.threads
-        subject = f"{env.name} · {env.fidelity.name} · {env.device} · {env.engine} · {self.points} points"
+        subject = f"{env.name} · {env.fidelity.name} · {env.device} · {env.engine} · {points_for(self.power)} points"
         if env.precision != env.fidelity.precision:
             subject += f" · its losses are {env.precision}"
         return f"{subject}: some {plain} episodes and {sloped} with gradients, about {duration(seconds)}"
@@ -196,9 +219,7 @@ class CheckJob:
 
 def _need(dim: int, points: int) -> Need:
     """Return what the points and gradients of all checks take, a copy of each included."""
-    from ..landscapes.checks.suite import episodes
-
-    return Need(4.0 * 8 * dim * sum(episodes(dim, points)))
+    return Need(4.0 * 8 * dim * points * POINT_ROWS)
 
 
 def _with_option(scene: SceneSpec, option: str, value: float | str) -> Callable[[], Environment]:

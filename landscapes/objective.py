@@ -240,8 +240,12 @@ class Objective(abc.ABC):
         return {}
 
     def special_places(self) -> Mapping[str, Float[Tensor, " dim"]]:
-        """Return points by name at which a check is to look: where a contact begins, two bodies meet, a motor stalls."""
+        """Return points by name at which a check is to look: a contact begins, two bodies meet, a motor stalls."""
         return {}
+
+    def nan_origin(self, x: Float[Tensor, " dim"]) -> str:
+        """Say which operation makes the first NaN of the gradient at one point; empty where nothing tells."""
+        return ""
 
     def energy(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch step"] | None:
         """Return the mechanical energy [J] over time of a motion that nothing drives; None where there is none."""
@@ -283,7 +287,10 @@ class ObjectiveWrapper(Objective):
         self.whole_batches = objective.whole_batches
 
 
-PASSED_ON = "threads preferred_batch precision packages identity prepare shrink memory events special_places energy noise observe"
+PASSED_ON = (
+    "threads preferred_batch precision packages identity prepare shrink memory events special_places nan_origin energy "
+    "noise observe"
+)
 for _part in PASSED_ON.split():
     setattr(ObjectiveWrapper, _part, property(attrgetter(f"objective.{_part}")))
 

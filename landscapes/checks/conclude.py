@@ -13,7 +13,7 @@ from .causes import Cause, Signature, recognise
 from .diagnosis import CERTAINTIES, Diagnosis, Region
 from .evidence import Evidence, Samples
 from .examination import Examination, percent
-from .finding import FAIL, WARN
+from .finding import FAIL
 from .history import ROWS, History
 from .probe import EPS
 from .slopes import TOLERANCE, UNJUDGED, Kind
@@ -280,6 +280,3 @@ def _of_length(seen: Examination) -> Iterator[Diagnosis]:
     }
     if (known := recognise("length", evidence)) is not None:
         yield _make(*known, evidence, {})
-
-
-__all__ = ["WARN", "Calls", "conclude"]

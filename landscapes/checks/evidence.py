@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """Components of gradients next to slopes by differences [loss unit per side of the box], one entry per axis line."""
+    """Components of gradients, and slopes by differences [loss unit per side of the box]: an entry per axis line."""
 
     exact: Array
     slope: Array
@@ -229,7 +229,7 @@ def _matching_step(probe: Probe, axes: AxisLines, row: int, side: int) -> float 
 
 
 def roughness(probe: Probe, u: Float[Tensor, "point dim"]) -> Evidence:
-    """Return by how much gradients differ between points that are next to each other: `rough`, relative to their length."""
+    """Return by how much gradients of points that are next to each other differ: `rough`, relative to their length."""
     near = (u + 1e-9 * torch.where(u > 0.5, -1.0, 1.0)).clamp(0, 1)
     here, there = (probe.gradient(one).grad for one in (u, near))
     if here is None or there is None:

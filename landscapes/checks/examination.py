@@ -21,7 +21,7 @@ from ..statistics import Estimate, share
 from . import parameters as by_parameter
 from .diagnosis import Region
 from .parameters import AxisLines, ParameterRow
-from .places import measure_places
+from .places import measure_places, place_losses
 from .probe import Lines, Probe
 from .regions import find_region
 from .slopes import BAD, STEPS, UNJUDGED, Judgement, Kind, Ladder, directions, measure
@@ -30,6 +30,7 @@ CONFIDENCE = 0.95
 FEWEST_POINTS = 4
 MOST_TIMES = 3  # as many points are drawn where some cannot be judged
 FEW_WRONG = 4  # points, of which more are drawn to see where they are
+INNER_GRADIENTS = 250  # of the smoothed gradient, and around places
 AXIS_POINTS = 6  # at which all axes are walked where gradients are wrong
 ALL_AXES = 40  # parameters, at most, of which all are walked there
 
@@ -112,6 +113,30 @@ class Examination:
     def parameters(self) -> tuple[ParameterRow, ...]:
         """Return the table of parameters."""
         return by_parameter.table(self.names, self.found, self.axes, self.blamed or set(), self.stepped)
+
+    def table(self) -> tuple[dict[str, float | None], ...]:
+        """Return a row for each step of the ladder: how slopes of gradients compare with differences over it."""
+        differences, exact = self.random.differences.numpy(), self.random.lines.slope.numpy()
+        rows = []
+        for step, slope in zip(self.random.steps, differences, strict=True):
+            known = np.isfinite(slope) & np.isfinite(exact)
+            a, d = exact[known], slope[known]
+            with np.errstate(invalid="ignore", divide="ignore"):
+                cosine = float(a @ d / (np.linalg.norm(a) * np.linalg.norm(d))) if len(a) else math.nan
+                errors = np.abs(a - d) / np.maximum(np.abs(a), np.abs(d))
+            error = float(np.median(errors[np.isfinite(errors)])) if np.isfinite(errors).any() else math.nan
+            sign = float((np.sign(a) == np.sign(d)).mean()) if len(a) else math.nan
+            told = {"step": step, "compared": len(a), "failed": len(exact) - len(a), "cosine": cosine, "sign": sign}
+            row = {**told, "error": error}
+            rows.append({name: value if math.isfinite(value) else None for name, value in row.items()})
+        return tuple(rows)
+
+
+def evaluations(dim: int, power: float) -> tuple[int, int]:
+    """Return about how many losses alone, and with gradients, `examine` takes of a gradient that is right."""
+    points = 2 ** math.ceil(math.log2(points_for(power)))
+    axes = 2 * len(by_parameter.STEPS) * by_parameter.axis_lines(dim)
+    return 2 * len(STEPS) * points + axes + place_losses(dim), 2 * points + INNER_GRADIENTS
 
 
 def examine(probe: Probe, power: float, seed: int, say: Callable[[str], None] = lambda text: None) -> Examination:
@@ -235,6 +260,3 @@ def _find_region(result: Examination) -> None:
         counts = {}
     values = objective.space.to_values(x).numpy()
     result.region = find_region(values, result.names, wrong, counts)
-
-
-__all__ = ["Examination", "Share", "could_be_missed", "examine", "points_for"]

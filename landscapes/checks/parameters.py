@@ -58,13 +58,18 @@ def walk_axes(probe: Probe, u: Float[Tensor, "batch dim"], found: Evaluation, se
     if not len(usable):
         usable = torch.arange(len(u))
     dead = _never_moves(found, dim)
-    count = min(AXIS_LINES, max(2 * min(dim, AXES_AT_MOST), 8 * dim))
+    count = axis_lines(dim)
     shuffled = torch.randperm(dim, generator=generator)
     if dim > AXES_AT_MOST:  # those whose gradient is always 0 first
         shuffled = torch.cat([shuffled[dead[shuffled]], shuffled[~dead[shuffled]]])
     axis = shuffled.repeat(-(-count // dim))[:count]
     point = usable[torch.randperm(len(usable), generator=generator)].repeat(-(-count // len(usable)))[:count]
     return along(probe, u, found, point, axis)
+
+
+def axis_lines(dim: int) -> int:
+    """Return along how many lines axes are walked."""
+    return min(AXIS_LINES, max(2 * min(dim, AXES_AT_MOST), 8 * dim))
 
 
 def along(probe: Probe, u: Tensor, found: Evaluation, point: Tensor, axis: Tensor) -> AxisLines:
@@ -171,11 +176,15 @@ def table(
     return tuple(rows)
 
 
+WRONG = ("wrong", DETACHED := "gradient 0, and the loss is not flat")
+STEPPED = "gradient 0, and the loss moves in steps"
+
+
 def _verdict(judged: Sequence[Judgement], wrong: int | bool, zero: float, stepped: bool) -> str:
     if wrong:
-        return "gradient 0, and the loss is not flat" if zero == 1 else "wrong"
+        return DETACHED if zero == 1 else WRONG[0]
     if stepped or (zero == 1 and any(one.moves for one in judged)):
-        return "gradient 0, and the loss moves in steps"
+        return STEPPED
     if not judged:
         return "moved with others only"
     if zero == 1:

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ..objective import Objective
+from ..objective import Evaluation, Objective
 from .probe import Lines, Probe
-from .slopes import BAD, Judgement, Kind, Ladder, Limits, measure
+from .slopes import Judgement, Kind, Ladder, Limits, measure
 
 STEPS = (1e-8, 1e-6, 1e-5, 1e-4, 1e-3)
 AXES = 4  # at each place, drawn from all
+AXES_TRIED = 16  # along which an infinite slope is looked for
 NEARBY, NEAR = 8, 1e-6  # gradients around a place, and how far from it, whose range holds that at a kink
 GROWING = 1.5  # times a slope is that over a tenth of the step at least, where it grows without bounds
 CLEAR = 100  # times rounding is what a change is, to be seen
@@ -46,6 +47,11 @@ def places(objective: Objective, seed: int) -> dict[str, Float[Tensor, " dim"]]:
     return kept
 
 
+def place_losses(dim: int) -> int:
+    """Return how many losses `measure_places` takes, about."""
+    return 2 * len(STEPS) * 7 * min(AXES, dim)
+
+
 def measure_places(probe: Probe, seed: int) -> tuple[tuple[str, ...], Ladder]:
     """Judge gradients at special places along some axes; returns the name of the place of each line, and the lines.
 
@@ -64,12 +70,29 @@ def measure_places(probe: Probe, seed: int) -> tuple[tuple[str, ...], Ladder]:
     for row in wrong:
         if _is_within_neighbours(probe, lines, row):
             judged[row] = Judgement(Kind.KINK, judged[row].exact)
-    infinite = {int(point[row]) for row in range(len(judged)) if _is_infinite(probe, ladder, row)}
+    infinite = _infinite_points(probe, ladder)
     for row, one in enumerate(judged):
         if one.kind == Kind.NAN and int(point[row]) in infinite:
             judged[row] = Judgement(Kind.STEEP, one.exact)
     names = tuple(list(found)[one] for one in point.tolist())
     return names, Ladder(ladder.lines, ladder.steps, ladder.walked, tuple(judged))
+
+
+def have_infinite_slopes(probe: Probe, u: Float[Tensor, "place dim"]) -> Bool[Tensor, " place"]:
+    """Say at which places the loss's own slope is infinite, along some axis: no gradient there is finite."""
+    dim, count = u.shape[1], min(AXES_TRIED, u.shape[1])
+    point, axes = torch.arange(len(u)).repeat_interleave(count), torch.arange(count).repeat(len(u))
+    direction = torch.eye(dim, dtype=torch.float64)[axes]
+    nothing = Evaluation.from_results(probe.loss(u), torch.full_like(u, torch.nan))
+    lines = Lines.through(probe, u, direction, point, nothing)
+    ladder = Ladder(lines, STEPS, lines.walk(probe, list(STEPS)), ())
+    found = torch.zeros(len(u), dtype=torch.bool)
+    found[sorted(_infinite_points(probe, ladder))] = True
+    return found
+
+
+def _infinite_points(probe: Probe, ladder: Ladder) -> set[int]:
+    return {int(ladder.lines.point[row]) for row in range(len(ladder.lines)) if _is_infinite(probe, ladder, row)}
 
 
 def _is_within_neighbours(probe: Probe, lines: Lines, row: int) -> bool:
@@ -107,6 +130,3 @@ def describe(name: str, one: Judgement, parameter: str, loss: float) -> str:
     sides = [side.value for side in (one.behind, one.ahead) if side is not None]
     rises = " and ".join(f"{value:.3g}" for value in sides) or f"{one.slope.value:.3g}" if one.slope else "otherwise"
     return f"at {name}, by {parameter}, the gradient is {one.exact:.3g} and the loss rises by {rises} to either side"
-
-
-__all__ = ["BAD", "describe", "measure_places", "places"]

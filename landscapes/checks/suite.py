@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
+import gc
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from typing import Any
 
@@ -13,73 +15,113 @@ from torch import Tensor
 
 from ..objective import Evaluation, Objective, ObjectiveWrapper, Status, evaluate, failed
 from ..sampling.memory import ADVICE, is_out_of_memory
-from . import extremes
-from . import gradients as gradient_checks
+from . import examination, extremes, growth
+from . import parameters as by_parameter
+from .causes import causes
+from .conclude import Calls, conclude
+from .diagnosis import Diagnosis
+from .examination import Examination, examine, percent
 from .extremes import ExtremeCase
-from .finding import FAIL, SKIP, UNEXPECTED, Finding, one_line, skip, verdict, within
+from .finding import FAIL, PASS, SKIP, UNEXPECTED, WARN, Finding, one_line, skip, verdict, within
+from .history import observe
+from .places import describe
+from .probe import Probe
+from .slopes import BAD, UNJUDGED, Kind, counts
 from .subject import Subject, difference
+from .usefulness import Usefulness, usefulness
 
 REPEATS = 3
+PROMISE_POINTS = 8  # at which batches, repeats and refusals are checked
+POWER = 0.05  # share of the box
+CANNOT_TELL = 0.1  # of the points is what has to be judged, to say anything
+SAID_PLACES, MANY = 3, 6  # places and parameters that are named, at most
+OPTIMISER_STEP = 1e-2  # of the box: what a step of a search is long
+SIGNS = 0.75  # share of slopes whose sign has to agree over it
+USEFUL = 0.5  # what the median relative error of slopes may be over it
+LEAST_SHARE = 0.25  # share of slopes to compare for a step to be judged by
 
 
-def check(
-    objective: Objective,
-    *,
-    points: int = 4,
-    seed: int = 0,
-    precision: str = "float64",
-    twin: Callable[[], Objective] | None = None,
-    variants: Sequence[ExtremeCase] = (),
-    horizons: Mapping[float, Callable[[], Objective]] | None = None,
-    other_mode: Callable[[], Objective] | None = None,
-    expected: Mapping[str, str] | None = None,
-    follow: Callable[[str], None] | None = None,
-) -> Iterator[Finding]:
-    """Check an objective at `points` random points of its box, and yield what was found, check by check.
+@dataclass(eq=False)
+class Results:
+    """What `check` gathers besides findings, once it is done: what was measured, and what is concluded."""
 
-    `precision`, float32 or float64, is what it computes in; thresholds follow from it. `twin` makes the same objective
-    in the other precision: gradients are judged in float64 where there is one. `variants` are further ways to push it.
-    `horizons` make it with episodes so many times as long, in float64 where there is a twin; `other_mode` makes it with
-    gradients by the other mode of automatic differentiation, forward or reverse. `expected` holds the checks that are
-    known to fail, with the reason: such a failure is excused, and a pass is not. `follow` is called with the name of
-    each check before it runs.
+    examination: Examination | None = None
+    calls: Calls = dataclasses.field(default_factory=Calls)
+    diagnoses: tuple[Diagnosis, ...] = ()
+    usefulness: tuple[Usefulness, ...] = ()
 
-    Raises ValueError where there are fewer than 2 points; what the objective raises is a finding.
+
+@dataclass(frozen=True)
+class Settings:
+    """How an objective is checked, and what else can be made of it.
+
+    `power` is the share of the box that a defect fills which would be found with 95 %. `precision`, float32 or float64,
+    is what the objective computes in; `twin` makes it in the other precision: gradients are judged in float64 where
+    there is one. `variants` are further ways to push it. `horizons` make it with episodes so many times as long, in
+    float64 where there is a twin; `other_mode` makes it with gradients by the other mode of automatic differentiation,
+    forward or reverse; `finer` makes it with shorter time steps, by factor. `expected` holds the checks that are known
+    to fail, with the reason: such a failure is excused, and a pass is not. `follow` is called with the name of each
+    check before it runs.
     """
-    if points < 2:
-        raise ValueError(f"check takes at least 2 points, to compare rows of a batch; got {points}")
-    known, announce = expected or {}, follow or (lambda name: None)
-    x = objective.space.uniform(points, seed=seed)
-    announce("shapes")
+
+    power: float = POWER
+    seed: int = 0
+    precision: str = "float64"
+    twin: Callable[[], Objective] | None = None
+    variants: Sequence[ExtremeCase] = ()
+    horizons: Mapping[float, Callable[[], Objective]] = dataclasses.field(default_factory=dict)
+    other_mode: Callable[[], Objective] | None = None
+    finer: Mapping[float, Callable[[], Objective]] = dataclasses.field(default_factory=dict)
+    expected: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    follow: Callable[[str], None] = lambda name: None
+
+
+def check(objective: Objective, settings: Settings | None = None, results: Results | None = None) -> Iterator[Finding]:
+    """Check an objective and yield what was found, check by check; the rest of it is left in `results`.
+
+    What the objective raises is a finding.
+    """
+    how, results = settings or Settings(), results or Results()
+    x = objective.space.uniform(PROMISE_POINTS, seed=how.seed)
+    how.follow("shapes")
     shapes = _try("shapes", lambda: _check_shapes(objective, x))
-    yield shapes.excuse(known)
+    yield shapes.excuse(how.expected)
     if shapes.outcome == FAIL:
+        results.diagnoses = _of_error(shapes)
         yield Finding("all else", SKIP, "not checked", "evaluations of the wrong form can be judged no further")
         return
-    announce("repeats")
+    how.follow("repeats")
     try:
-        subject = Subject.observe(objective, x, precision=precision, seed=seed, repeats=REPEATS)
+        subject = Subject.observe(objective, x, precision=how.precision, seed=how.seed, repeats=REPEATS)
     except Exception as error:
-        yield _failure("determinism", error).excuse(known)
+        yield _failure("determinism", error).excuse(how.expected)
         return
-    left = dict(known)
-    for name, run in _checks(subject, _other(subject, twin), variants, horizons or {}, other_mode):
-        announce(name)
+    left = dict(how.expected)
+    for name, run in _checks(subject, how, results):
+        how.follow(name)
         left.pop(name, None)
-        yield _try(name, run).excuse(known)
+        yield _try(name, run).excuse(how.expected)
+        gc.collect()  # what a check has made may refer to itself, and holds memory of a device until then
     for name in left:
         yield Finding(name, UNEXPECTED, "not checked", "a failure is expected of it, but there is no such check")
 
 
-def episodes(dim: int, points: int, horizons: Sequence[float] = ()) -> tuple[int, int]:
+def _of_error(finding: Finding) -> tuple[Diagnosis, ...]:
+    """Return what an error says of its cause: an array that was overwritten."""
+    if "writes to what it has read" not in finding.why and "modified by an inplace operation" not in finding.why:
+        return ()
+    (cause,) = [one for one in causes() if one.name == "tape overwritten"]
+    return (Diagnosis(cause.name, FAIL, "certain", finding.why, cause.remedy),)
+
+
+def episodes(dim: int, power: float, horizons: Sequence[float] = ()) -> tuple[int, int]:
     """Return about how many episodes `check` takes without variants: losses alone, and with gradients.
 
     Those of other `horizons`, factors of the length, count by their lengths.
     """
-    plain = 2 * points * gradient_checks.SLOPES * (len(gradient_checks.DIFFERENCE_STEPS) + 1) + points
-    plain += gradient_checks.place_episodes(dim)
-    longer, sloped = (round(count * sum(horizons)) for count in gradient_checks.growth_episodes(1))
-    return plain + longer, sloped + points * (REPEATS + 8) + 3 * len(extremes.corners(dim)) + 10
+    losses, gradients = examination.evaluations(dim, power)
+    longer, sloped = (round(count * sum(horizons)) for count in growth.growth_episodes(1))
+    return losses + longer, gradients + sloped + PROMISE_POINTS * (REPEATS + 8) + 3 * len(extremes.corners(dim)) + 20
 
 
 def _other(subject: Subject, twin: Callable[[], Objective] | None) -> Callable[[], Subject] | None:
@@ -90,30 +132,143 @@ def _other(subject: Subject, twin: Callable[[], Objective] | None) -> Callable[[
     return cache(lambda: Subject.observe(twin(), subject.x, precision=precision, seed=subject.seed, repeats=2))
 
 
-def _checks(
-    subject: Subject,
-    other: Callable[[], Subject] | None,
-    variants: Sequence[ExtremeCase],
-    horizons: Mapping[float, Callable[[], Objective]],
-    other_mode: Callable[[], Objective] | None,
-) -> Iterator[tuple[str, Callable[[], Finding]]]:
+def _checks(subject: Subject, how: Settings, results: Results) -> Iterator[tuple[str, Callable[[], Finding]]]:
+    other = _other(subject, how.twin)
     for name, run in PROMISES.items():
         yield name, partial(run, subject)
-    exact = other if subject.precision == "float32" else lambda: subject
+    yield "order of calls", partial(_check_calls, subject, results)
+    exact = other if subject.precision == "float32" else None
     best = exact or (lambda: subject)
-    for name, judge in SLOPES.items():
-        yield name, lambda judge=judge: judge(best())  # type: ignore[misc]
-    yield "gradcheck", lambda: _gradcheck(subject, exact)
-    yield "second backward", lambda: gradient_checks.second_backward(subject)
-    yield "forward against reverse", lambda: _check_modes(subject, other_mode)
-    yield "growth over horizons", lambda: gradient_checks.check_growth(best(), horizons)
-    yield from extremes.checks(subject, other, variants)
+    yield "gradient", lambda: _check_gradient(best(), how, results)
+    yield "special places", partial(_check_places, results)
+    yield "parameters", partial(_check_parameters, results)
+    yield "usefulness", partial(_check_usefulness, results)
+    yield "second backward", lambda: _check_second_backward(subject, results)
+    yield "forward against reverse", lambda: _check_modes(subject, how.other_mode)
+    yield "growth over horizons", lambda: growth.check_growth(best(), how.horizons)
+    yield from extremes.checks(subject, other, how.variants)
 
 
-def _gradcheck(subject: Subject, exact: Callable[[], Subject] | None) -> Finding:
-    if exact is None:
-        return skip("not checked", f"it computes in {subject.precision} only")
-    return gradient_checks.gradcheck(exact())
+def _check_calls(subject: Subject, results: Results) -> Finding:
+    """Call the same points in several orders: what an evaluation gives depends on no other."""
+    seen = observe(subject.objective, subject.x)
+    results.calls = replace(results.calls, history=seen)
+    limits = subject.repeatable
+    figure = f"losses {seen.loss:.1e} and gradients {seen.gradient:.1e} of themselves apart"
+    ok = seen.loss <= limits[0] and seen.gradient <= limits[1] and not (seen.stale or seen.grows)
+    return verdict(ok, "same bits" if max(seen.loss, seen.gradient) == 0 else figure, "an evaluation remembers others")
+
+
+def _check_gradient(subject: Subject, how: Settings, results: Results) -> Finding:
+    """Judge gradients at random points, and conclude what is wrong with them."""
+    repeats = subject.noise[0] * subject.scale
+    probe = Probe(subject.objective, subject.precision, repeats=repeats)
+    evaluate(subject.objective, subject.x[:1], grad=False)  # the type of losses is known from now on
+    probe.precision = subject.objective.precision
+    seen = results.examination = examine(probe, how.power, how.seed, how.follow)
+    if seen.found.grad is None:
+        return skip("no gradient")
+    results.diagnoses = conclude(seen, results.calls, _origin_of(subject.objective, seen))
+    return _judge_gradient(seen, results)
+
+
+def _judge_gradient(seen: Examination, results: Results) -> Finding:
+    share, counted = seen.share, counts(seen.random.judged)
+    told = ", ".join(f"{number} {kind}" for kind, number in counted.items() if number)
+    numbers: dict[str, float | None] = {
+        "wrong": share.wrong,
+        "judged": share.judged,
+        "points": share.points,
+        "low": share.low,
+        "high": share.high,
+        "missed": share.missed,
+        "evaluations": seen.probe.losses + seen.probe.gradients,
+    }
+    failing = [one.what for one in results.diagnoses if one.outcome == FAIL and one.what]
+    if share.wrong or failing or any(one.kind == Kind.WRONG for one in seen.axes.ladder.judged):
+        figure = f"wrong at {share.describe()}: {told}" if share.wrong else f"{share.points} points: {told}"
+        return Finding("", FAIL, figure, "; ".join(failing), numbers, seen.table())
+    if share.judged < CANNOT_TELL * share.points:
+        why = f"only {share.judged} of {share.points} points could be judged, so nothing is said of the gradient"
+        return Finding("", WARN, f"cannot tell: {told}", why, numbers, seen.table())
+    figure = f"{share.points} points: {told}; a defect in less than {percent(share.missed)} of the box may be missed"
+    return Finding("", PASS, figure, "", numbers, seen.table())
+
+
+def _origin_of(objective: Objective, seen: Examination) -> Callable[[int], str]:
+    """Return what says where the first NaN begins: at a random point, or at a place, numbered from -1 down."""
+
+    def origin(row: int) -> str:
+        u = seen.u[row] if row >= 0 else seen.places[1].lines.u[-1 - row]
+        try:
+            return objective.nan_origin(objective.space.from_unit(u[None])[0])
+        except Exception:  # it is worth a word, and no error
+            return ""
+
+    return origin
+
+
+def _check_places(results: Results) -> Finding:
+    seen = results.examination
+    if seen is None or seen.found.grad is None:
+        return skip("no gradient")
+    names, ladder = seen.places
+    places = ", ".join(dict.fromkeys(names))
+    bad = [row for row, one in enumerate(ladder.judged) if one.kind in BAD]
+    if not bad:
+        told = sum(one.kind not in UNJUDGED for one in ladder.judged)
+        return verdict(True, f"{told} slopes at {places}: between those to either side") if told else skip(places)
+    said = []
+    for row in bad:
+        axis = int(ladder.lines.direction[row].abs().argmax())
+        said.append(describe(names[row], ladder.judged[row], seen.names[axis], float(ladder.lines.loss[row])))
+    figure = f"{len(bad)} of {len(ladder.judged)} slopes at {places} are wrong"
+    numbers: dict[str, float | None] = {"wrong": float(len(bad)), "compared": float(len(ladder.judged))}
+    return Finding("", FAIL, figure, "; ".join(list(dict.fromkeys(said))[:SAID_PLACES]), numbers)
+
+
+def _check_parameters(results: Results) -> Finding:
+    seen = results.examination
+    if seen is None or seen.found.grad is None:
+        return skip("no gradient")
+    rows = seen.parameters()
+    verdicts = [row.verdict for row in rows]
+    figure = ", ".join(f"{verdicts.count(one)} {one}" for one in dict.fromkeys(verdicts))
+    wrong = [row.parameter for row in rows if row.verdict in by_parameter.WRONG]
+    stepped = [row.parameter for row in rows if row.verdict == by_parameter.STEPPED]
+    if wrong:
+        return Finding("", FAIL, figure, f"wrong by {', '.join(wrong[:MANY])}{' and others' * (len(wrong) > MANY)}")
+    if stepped:
+        said = f"by {', '.join(stepped[:MANY])} the gradient is 0 at all points, and the loss moves in steps"
+        return Finding("", WARN, figure, said)
+    return verdict(True, figure)
+
+
+def _check_usefulness(results: Results) -> Finding:
+    """Say how far a gradient holds: useless over an optimiser's step is the landscape's fault, and a warning."""
+    seen = results.examination
+    if seen is None or seen.found.grad is None:
+        return skip("no gradient")
+    results.usefulness = usefulness(seen.probe, seen.random)
+    at = next((one for one in results.usefulness if one.step == OPTIMISER_STEP), None)
+    if at is None or at.compared < LEAST_SHARE * len(seen.u):
+        return skip("no slope to compare", "all are flat, lost in noise, or failed")
+    useful = at.sign.value >= SIGNS and at.error <= USEFUL
+    figure = (
+        f"over {at.step:g} of the box: sign right {percent(at.sign.value)} ({percent(at.sign.low, bare=True)} to "
+        f"{percent(at.sign.high)}), median relative error {at.error:.2g}"
+    )
+    why = f"slopes do not hold that far: wanted are sign right {SIGNS:.0%} and an error of {USEFUL:g} for a search"
+    numbers = {"step": at.step, "sign": at.sign.value, "error": at.error, "cosine": at.cosine.value, "bias": at.bias}
+    return Finding("", PASS if useful else WARN, figure, "" if useful else why, numbers)
+
+
+def _check_second_backward(subject: Subject, results: Results) -> Finding:
+    found = growth.second_backward(subject)
+    if found.outcome == FAIL and results.examination is not None and not results.diagnoses:
+        calls = replace(results.calls, second_backward=1.0)
+        results.diagnoses = conclude(results.examination, calls)
+    return found
 
 
 def _check_modes(subject: Subject, other_mode: Callable[[], Objective] | None) -> Finding:
@@ -255,11 +410,6 @@ def _check_loss_without_gradient(subject: Subject) -> Finding:
     return within(apart, subject.tolerances[0], f"{apart:.1e} of the loss range apart", "the loss depends on grad=")
 
 
-SLOPES: Mapping[str, Callable[[Subject], Finding]] = {
-    "finite differences": gradient_checks.check_slopes,
-    "an optimiser's step": gradient_checks.check_usefulness,
-    "special places": gradient_checks.check_special_places,
-}
 PROMISES: Mapping[str, Callable[[Subject], Finding]] = {
     "status": _check_status,
     "refusal of a wrong shape": _check_refusal_of_shapes,

@@ -6,13 +6,13 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
+from gradscape.landscapes.checks.gradients import check_special_places
 from scipy.stats import spearmanr
 
 import gradscape as gs
 from gradscape.envs.engines.jax_functions import compiled, computing_in
 from gradscape.envs.mjx.scene import MjxScene, Parameter
 from gradscape.envs.mjx.scenes import Drop, Push
-from gradscape.landscapes.checks.gradients import check_special_places
 from gradscape.landscapes.checks.subject import Subject
 
 from .scenes import made_once

@@ -1,0 +1,112 @@
+"""How far a gradient holds: against the loss's change over steps of many lengths, and against the smoothed gradient."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ..statistics import Estimate, share
+from .probe import Lines, Probe
+from .slopes import Ladder
+
+SHORTEST, LONGEST = 1e-6, 0.3  # of the box
+OPTIMISER_STEPS = {"gradient descent": 1e-2, "Adam": 3e-2, "CMA-ES": 0.2}  # of the box, at first
+SMOOTHED = (1e-3, 1e-2, 1e-1)  # widths that the loss is smoothed over, as shares of the box
+SMOOTHED_LINES = 24  # at which the smoothed gradient is computed
+INNER = 3  # gradients along each
+RESAMPLED = 200
+CONFIDENT = (0.025, 0.975)
+CLEAR = 10  # times the noise is what a change is, to have a sign
+
+
+@dataclass(frozen=True)
+class Usefulness:
+    """What a gradient says of the loss over one step, a share of the box.
+
+    `sign` is the share of slopes whose sign is right, `cosine` that of all slopes with differences over the step,
+    `error` the median relative error, `compared` how many changes were clear of the noise. `bias` is what the mean of
+    gradients within the width lacks of the slope of the smoothed loss, as a share of the latter; NaN where it was not
+    computed. The first has no part of what jumps add to the loss, the second has.
+    """
+
+    step: float
+    compared: int
+    sign: Estimate
+    cosine: Estimate
+    error: float
+    bias: float
+
+
+def usefulness(probe: Probe, ladder: Ladder) -> tuple[Usefulness, ...]:
+    """Return the curve, a record for each step of the ladder from 1e-6 to 0.3 of the box."""
+    differences, exact = ladder.differences.numpy(), ladder.lines.slope.numpy()
+    noise = np.array([one.noise for one in ladder.judged])
+    curve = []
+    for number, step in enumerate(ladder.steps):
+        if not SHORTEST <= step <= LONGEST:
+            continue
+        slope = differences[number]
+        with np.errstate(invalid="ignore"):
+            clear = np.maximum(np.abs(slope), np.abs(exact)) * step > CLEAR * np.nan_to_num(noise)
+        seen = np.isfinite(slope) & np.isfinite(exact) & clear
+        if step in SMOOTHED or seen.sum() >= len(exact) / 4:
+            curve.append(_at(probe, ladder.lines, step, slope, exact, seen))
+    return tuple(curve)
+
+
+def _at(
+    probe: Probe,
+    lines: Lines,
+    step: float,
+    slope: NDArray[np.float64],
+    exact: NDArray[np.float64],
+    seen: NDArray[np.bool_],
+) -> Usefulness:
+    a, d = exact[seen], slope[seen]
+    bias = _bias(probe, lines, step, slope, seen) if step in SMOOTHED else np.nan
+    with np.errstate(invalid="ignore", divide="ignore"):
+        error = np.abs(a - d) / np.maximum(np.abs(a), np.abs(d))
+    right = share(int((np.sign(a) == np.sign(d)).sum()), len(a))
+    middle = float(np.nanmedian(error)) if len(error) else np.nan
+    return Usefulness(step, len(a), right, _cosine(a, d), middle, bias)
+
+
+def _cosine(a: NDArray[np.float64], d: NDArray[np.float64]) -> Estimate:
+    """Return the cosine of gradients' slopes with differences over all lines, with its interval by resampling lines."""
+    if len(a) < 2 or not (a.any() and d.any()):
+        return Estimate(np.nan, np.nan, np.nan)
+    drawn = np.random.default_rng(0).integers(len(a), size=(RESAMPLED, len(a)))
+    values = [_cosine_of(a[rows], d[rows]) for rows in (np.arange(len(a)), *drawn)]
+    low, high = np.nanquantile(values, CONFIDENT)
+    return Estimate(values[0], float(low), float(high))
+
+
+def _cosine_of(a: NDArray[np.float64], d: NDArray[np.float64]) -> float:
+    size = float(np.linalg.norm(a) * np.linalg.norm(d))
+    return float(a @ d) / size if size > 0 else np.nan
+
+
+def _bias(
+    probe: Probe, lines: Lines, step: float, slope: NDArray[np.float64], seen: NDArray[np.bool_]
+) -> float:  # fmt: skip
+    """Compare the mean of gradients along a line with the slope of the loss over all of it."""
+    rows = torch.from_numpy(np.flatnonzero(seen)[:SMOOTHED_LINES])
+    if not len(rows):
+        return float("nan")
+    generator = torch.Generator().manual_seed(len(rows))
+    at = (torch.rand(INNER, len(rows), generator=generator, dtype=torch.float64) + torch.arange(INNER)[:, None]) / INNER
+    ahead, behind = (lines.u[rows] + side * step * lines.direction[rows] for side in (1, -1))
+    reach = [((one >= 0) & (one <= 1)).all(dim=1).double()[None] for one in (ahead, behind)]
+    offset = (at * (reach[0] + reach[1]) - reach[1]) * step  # of the part of the line that lies in the box
+    points = lines.u[rows] + offset[..., None] * lines.direction[rows]
+    found = probe.gradient(points.reshape(-1, points.shape[-1]).clamp(0, 1))
+    if found.grad is None:
+        return float("nan")
+    slopes = (found.grad * probe.width).reshape(points.shape)
+    mean = (slopes * lines.direction[rows]).sum(dim=2).nanmean(dim=0).numpy()
+    wanted = slope[rows.numpy()]
+    scale = float(np.nanmean(np.abs(wanted)))
+    return float(np.nanmean(np.abs(mean - wanted))) / scale if scale > 0 else float("nan")
