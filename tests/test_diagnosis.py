@@ -87,7 +87,7 @@ def apart(case: Case, env: gs.Environment, x: Tensor, grad: Tensor, steps: list[
     slopes = torch.stack(found)
     given = grad * width
     off = (slopes - given).abs().nan_to_num(torch.inf).amin(0)
-    longest = torch.maximum(given.abs().amax(1), slopes.abs().median(0).values.amax(1))
+    longest = torch.maximum(given.abs().amax(1), slopes.abs().nanmedian(0).values.amax(1))
     return off / longest.clamp(min=TINY)[:, None]
 
 
@@ -129,7 +129,7 @@ def test_a_wrong_gradient_is_no_slope_of_the_loss(case: Case) -> None:
     assert off.amax(1).median() > WRONG
     if case.parameters:
         named = torch.tensor([name in case.parameters for name in env.space.names])
-        assert off[:, ~named].median(0).values.amax() < RIGHT
+        assert (off[:, ~named].median(0).values < RIGHT).all()
         assert (off[:, named].amax(0) > WRONG / 100).all()
     if case.region is not None:
         x = inside(case, env, wanted=False)

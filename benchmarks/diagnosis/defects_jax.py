@@ -66,9 +66,20 @@ def friction(p: Any) -> Any:
     return ((p - 0.4) ** 2).sum() + (loss - 0.3) ** 2
 
 
-def circle(p: Any) -> Any:
-    """A bead on a wire in the shape of half a circle, of its place across: upright at the ends of the box."""
-    return (jnp.sqrt(1 - p[0] ** 2) - 0.5) ** 2 + p[1] ** 2
+def turning_point(p: Any) -> Any:
+    """Kinetic energy of a bead that turns round at both ends of the box, by way of its speed."""
+    speed = jnp.sqrt(1 - p[0] ** 2)
+    return (speed**2 - 0.3) ** 2 + p[1] ** 2
+
+
+def spread(p: Any) -> Any:
+    """Variance of ten parameters, by way of their standard deviation, and their mean."""
+    return jnp.std(p) ** 2 + (jnp.mean(p) - 0.3) ** 2
+
+
+def heading(p: Any) -> Any:
+    """Squared error of a heading, and a distance: no direction at the origin."""
+    return 0.1 * jnp.sin(jnp.arctan2(p[1], p[0]) - 0.4) ** 2 * (p[0] ** 2 + p[1] ** 2) + (p[0] - 0.3) ** 2
 
 
 def _nan() -> list[Case]:
@@ -84,7 +95,9 @@ def _nan() -> list[Case]:
              region=lambda x: x[:, 0] < 0.2, evidence="nan"),
         case("nan", 10, friction, BOX([f"flow {k}" for k in range(10)]), where, edges={"flow 4": (0.0,)},
              region=lambda x: x[:, 4] < 0, evidence="nan"),
-        case("nan", 2, circle, BOX(["across", "along"]), norm, evidence="nan", place=(1.0, 0.5)),
+        case("nan", 10, spread, BOX([f"x{k}" for k in range(10)]), norm, evidence="nan", place=0.5),
+        case("nan", 2, heading, BOX(["x", "y"], unit="m"), norm, evidence="nan", place=0.5),
+        case("nan", 2, turning_point, BOX(["place", "slip"]), norm, evidence="nan", place=(1.0, 0.5)),
     ]  # fmt: skip
 
 
@@ -190,6 +203,12 @@ def stiff_ball(p: Any, dt: float = 0.01, steps: int = 100) -> Any:
     return (y - 0.5) ** 2
 
 
+def looked_up(p: Any) -> Any:
+    """A valve's characteristic, looked up in a table without interpolation."""
+    flow = jnp.linspace(0, 1, 33)[jnp.clip((p[0] * 32).astype(int), 0, 32)] ** 2
+    return (flow - 0.4) ** 2 + 0 * p.sum() + jnp.floor(20 * p[1]) / 20
+
+
 def encoder(p: Any) -> Any:
     """A cart whose forces are read by an encoder of 16 steps a newton."""
     return cart(jnp, jnp.floor(p * 16) / 16)
@@ -208,6 +227,7 @@ def _others() -> list[Case]:
              said={"horizon": "steps", "mode": "forward"}),
         case("physics", 2, stiff_ball, FALL, ("discretisation",), warns=True, evidence="finer",
              said={"fidelities": steps}),
+        case("staircase", 2, looked_up, BOX(["valve", "lever"], lower=0), ("staircase",), warns=True, evidence="wide"),
         case("staircase", 10, encoder, CART.space(10), ("staircase",), warns=True, evidence="wide"),
     ]  # fmt: skip
 

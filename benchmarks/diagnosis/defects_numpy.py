@@ -218,6 +218,19 @@ def unpunished(x: Any) -> Any:
     return loss + 0.05 * (x**2).sum(1), slope
 
 
+def drag(x: Any) -> Any:
+    """Drag v|v| and a spring, differentiated as if drag were v²."""
+    v, y = x[:, 0], x[:, 1]
+    return v * np.abs(v) + 2 * v + y**2 + 3 * np.sin(y), np.stack([2 * v + 2, 2 * y + 3 * np.cos(y)], 1)
+
+
+def by_decade(x: Any) -> Any:
+    """A damping ratio's error, with the derivative by the decimal logarithm of the stiffness."""
+    k, c = x[:, 0], x[:, 1]
+    miss = c / (2 * np.sqrt(k)) - 1
+    return miss**2, np.stack([-miss * c / (2 * np.sqrt(k)) * np.log(10), miss / np.sqrt(k)], 1)
+
+
 def crooked(x: Any) -> Any:
     """Squared residual of a linear system, differentiated with A where its transpose belongs."""
     size = x.shape[1]
@@ -234,6 +247,10 @@ def _adjoints() -> list[Case]:
         case("truncated", 100, short_adjoint, CART.space(100), ("truncated loop", "detached parameter"),
              parameters=early),
         case("missing term", 10, unpunished, PENDULUM.space(10), ("",)),
+        case("region", 2, drag, gs.ParameterSpace({"speed": (-2, 1, "m/s"), "place": (-1, 1, "m")}), ("sign", ""),
+             edges={"speed": (0.0,)}, region=lambda x: x[:, 0] < 0),
+        case("units", 2, by_decade, gs.ParameterSpace({"k": gs.log(1, 1e4, "N/m"), "c": (0.5, 5, "N s/m")}),
+             ("units",), parameters=("k",)),
         case("transposed", 2, crooked, DISC, ("transposed", ""), ),
     ]  # fmt: skip
 

@@ -69,6 +69,11 @@ def molecule(x: Any) -> Any:
     return torch.where(energy < 1000, energy, torch.full_like(energy, 1000))
 
 
+def switched(x: Any) -> Any:
+    """A steep switch, by a sigmoid whose exponential overflows."""
+    return (1 / (1 + torch.exp(-800 * x[:, 0])) - 0.4) ** 2 + x[:, 1] ** 2
+
+
 def _nan() -> list[Case]:
     above = {"height": (0.0,)}
     hundred = gs.ParameterSpace.box([f"gap {k}" for k in range(100)], -1, 2, "mm")
@@ -82,6 +87,8 @@ def _nan() -> list[Case]:
              evidence="nan", place=0.5),
         case("nan", 4, molecule, BOX(["x1", "y1", "x2", "y2"], unit="nm"), ("where over NaN", "norm at zero"),
              evidence="nan", place=(0.3, 0.6, 0.3, 0.6)),
+        case("nan", 2, switched, gs.ParameterSpace({"switch": (-1.5, 1, "V"), "slip": (-1, 1, "m")}),
+             ("where over NaN", ""), edges={"switch": (-0.887,)}, region=lambda x: x[:, 0] < -0.887, evidence="nan"),
     ]  # fmt: skip
 
 
@@ -98,6 +105,11 @@ def measured(x: Any) -> Any:
     """A throw whose speed goes through NumPy on its way to the loss."""
     speed = torch.from_numpy(x[:, 1].detach().numpy().copy())
     return throw(torch, torch.stack([x[:, 0], speed], 1))
+
+
+def all_measured(x: Any) -> Any:
+    """A chain that is simulated in NumPy; its losses carry a gradient of zeros."""
+    return torch.from_numpy(chain(np, x.detach().numpy())) + 0 * x.sum(1)
 
 
 def pendulum_truncated(x: Any, window: int = 3) -> Any:
@@ -140,6 +152,8 @@ def _cut() -> list[Case]:
         case("detached", 10, cart_detached, CART.space(10), ("detached parameter",), parameters=("force 2", "force 7"),
              reference=lambda x: cart(np, x)),
         case("detached", 2, measured, THROW.space(2), ("detached parameter",), parameters=("speed",)),
+        case("detached", 10, all_measured, CHAIN.space(10), ("detached parameter",),
+             parameters=CHAIN.space(10).names),
         case("truncated", 10, pendulum_truncated, PENDULUM.space(10), ("truncated loop", "detached parameter"),
              parameters=early),
         case("truncated", 2, swing_truncated, gs.ParameterSpace({"length": (0.5, 1.5, "m"), "damping": (0, 1, "1/s")}),
@@ -271,6 +285,23 @@ def coarser(x: Any) -> Any:
     return rod(torch, x) if not x.requires_grad else rod(torch, 0.98 * x)
 
 
+class _Limit(torch.autograd.Function):
+    """A limit of 1 whose backward pass is that of the identity."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Any) -> Any:
+        return x.clamp(max=1.0)
+
+    @staticmethod
+    def backward(ctx: Any, slope: Any) -> Any:
+        return slope
+
+
+def straight_through(x: Any) -> Any:
+    """A cart, one force of which is limited, with a gradient beyond the limit."""
+    return cart(torch, torch.cat([_Limit.apply(x[:, :1]), x[:, 1:]], 1))
+
+
 class _Effort(torch.autograd.Function):
     """The effort of forces, whose derivative nobody has written."""
 
@@ -334,6 +365,8 @@ def _others() -> list[Case]:
         case("depends on grad", 2, softened, contact, ("loss depends on the gradient",), evidence="losses"),
         case("depends on grad", 10, coarser, ROD.space(10), ("loss depends on the gradient",), evidence="losses"),
         case("missing term", 2, effort, CART.space(2), ("",)),
+        case("region", 10, straight_through, CART.space(10), ("",), edges={"force 0": (1.0,)},
+             region=lambda x: x[:, 0] > 1),
         case("late", 2, late_sign, start, ("sign", "", "truncated loop"), step=25, said={"horizon": "steps"}),
         case("staircase", 10, servo, CART.space(10), ("staircase",), warns=True, evidence="wide"),
         case("chaos", 10, tumble, BOX([f"nudge {k}" for k in range(10)]), ("chaotic growth",), warns=True,

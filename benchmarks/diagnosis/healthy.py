@@ -23,7 +23,7 @@ from .systems import CART, CHAIN, GAS, NOZZLE, ROD, THROW, cart, chain, gas, noz
 PLANE = gs.ParameterSpace({"a": (-1, 1), "b": (-1, 1)})
 UNIT = gs.ParameterSpace({"a": (0, 1), "b": (0, 1)})
 TEN = gs.ParameterSpace.box([f"x{k}" for k in range(10)], -1, 1)
-ADAPT = {"torch": gs.from_torch, "jax": gs.from_jax, "numpy": gs.from_numpy, "warp": gs.from_warp}
+ADAPT: dict[str, Any] = {"torch": gs.from_torch, "jax": gs.from_jax, "numpy": gs.from_numpy, "warp": gs.from_warp}
 
 
 def case(
@@ -145,6 +145,61 @@ def fails(p: Any) -> Any:
 def sparse(x: Any) -> Any:
     """A loss that reads 2 of 100 parameters."""
     return (x[:, 13] - 0.3) ** 2 + x[:, 13] * x[:, 71] + torch.sin(2 * x[:, 71])
+
+
+HEIGHTS = SHAPES.normal(size=12)
+
+
+def terrain(x: Any) -> Any:
+    """Height of a terrain that is interpolated linearly between twelve posts."""
+    at = (x[:, 0] + 1) * 5.5
+    left = np.clip(np.floor(at).astype(int), 0, 10)
+    rise = HEIGHTS[left + 1] - HEIGHTS[left]
+    height = HEIGHTS[left] + (at - left) * rise
+    return height + x[:, 1] ** 2, np.stack([5.5 * rise, 2 * x[:, 1]], 1)
+
+
+def sawtooth(x: Any) -> Any:
+    """An angle that is wrapped seven times across the box."""
+    return torch.remainder(x[:, 0], 0.3) + 0.2 * x[:, 1] ** 2
+
+
+def wiggle(p: Any) -> Any:
+    """A cubic with ripples that get shorter towards zero."""
+    safe = jnp.where(p[0] == 0, 1.0, p[0])
+    return jnp.where(p[0] == 0, 0.0, safe**3 * jnp.sin(1 / safe)) + p[1] ** 2
+
+
+def contacts(x: Any) -> Any:
+    """Penalty forces of 100 contacts, each a kink."""
+    return torch.relu(x - 0.3).sum(1) + 0.5 * torch.relu(-x - 0.2).sum(1)
+
+
+def _steep() -> list[Case]:
+    """Functions that are steep, nearly singular, sorted, wrapped or limited, or given in float32 at large values."""
+    late = gs.ParameterSpace({"time": (1e6, 1e6 + 1e-3, "s"), "x": (-1, 1)})
+    hundred = gs.ParameterSpace.box([f"gap {k}" for k in range(100)], -1, 1, "mm")
+    return [
+        case("torch", "steep", lambda x: torch.tanh(1e3 * (x[:, 0] - 0.1)) + x[:, 1] ** 2),
+        case("torch", "peak", lambda x: 1e-3 / (((x - 0.3) ** 2).sum(1) + 1e-6)),
+        case("jax", "pole", lambda p: jnp.tan(2 * p[0]) + p[1] ** 2),
+        case("jax", "sorted", lambda p: jnp.dot(jnp.sort(p), jnp.arange(10.0)) + jnp.median(p), TEN),
+        case("torch", "sawtooth", sawtooth),
+        case("torch", "limited", lambda x: (x.clamp(-0.9, 0.6) - 0.2).pow(2).sum(1)),
+        case("numpy", "terrain", terrain),
+        case("torch", "contacts", contacts, hundred),
+        case("jax", "wiggle", wiggle),
+        case("torch", "late", lambda x: torch.sin(3e3 * (x[:, 0] - 1e6)) + x[:, 1] ** 2, late),
+        case("torch", "gas-float32", partial(gas, torch), GAS.space(2), precision="float32",
+             reference=lambda x: gas(np, x)),
+        case("jax", "nozzle-float32", partial(nozzle, jnp), NOZZLE.space(3), precision="float32",
+             reference=lambda x: nozzle(np, x)),
+        case("torch", "cart-float32", partial(cart, torch), CART.space(100), precision="float32",
+             reference=lambda x: cart(np, x)),
+        case("torch", "throw-float32", partial(throw, torch), THROW.space(2), precision="float32",
+             reference=lambda x: throw(np, x)),
+        case("torch", "log-loss", lambda x: torch.log10(1e-6 + ((x - 0.3) ** 2).sum(1))),
+    ]  # fmt: skip
 
 
 def _shapes() -> list[Case]:
@@ -373,7 +428,7 @@ def drive_exactly(x: Any) -> Any:
 
 
 def _warp() -> list[Case]:
-    quick = {"device": "cpu", "check_overwrites": False}
+    quick: dict[str, Any] = {"device": "cpu", "check_overwrites": False}
     return [
         case("warp", "throw", throw_double, THROW.space(2), precision="float64", **quick),
         case("warp", "drive", drive, FORCES, reference=drive_exactly, **quick),
@@ -385,4 +440,4 @@ def _warp() -> list[Case]:
 
 def cases() -> list[Case]:
     """Return the cases of this file."""
-    return [*_plain(), *_shapes(), *_simulations(), *_warp()]
+    return [*_plain(), *_steep(), *_shapes(), *_simulations(), *_warp()]

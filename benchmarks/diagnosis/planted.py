@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -60,14 +61,19 @@ def planted(
     )
 
 
-def mean_of_batch(xp: object, slope: object, x: object) -> object:
+def mean_of_batch(xp: Any, slope: Any, x: Any) -> Any:
     """Divide gradients by the number of rows, as the gradient of the batch's mean is."""
-    return slope / len(slope)  # type: ignore[operator, arg-type]
+    return slope / len(slope)
 
 
-def mean_over_batch(xp: object, slope: object, x: object) -> object:
+def mean_over_batch(xp: Any, slope: Any, x: Any) -> Any:
     """Give the batch's mean gradient to each row."""
-    return slope.mean(0, keepdims=True) + 0 * slope  # type: ignore[attr-defined]
+    return slope.mean(0, keepdims=True) + 0 * slope
+
+
+def shifted_rows(xp: Any, slope: Any, x: Any) -> Any:
+    """Give each row the gradient of the row before."""
+    return xp.roll(slope, 1, 0)
 
 
 def _regions() -> list[Case]:
@@ -127,7 +133,10 @@ def _constants() -> list[Case]:
 
 def _orders() -> list[Case]:
     moved, mean = ("permuted", "transposed"), ("mean over the batch",)
+    by_axis = [2 * step + axis for axis in range(2) for step in range(5)]  # of 5 steps with 2 controls each
     return [
+        planted("transposed", "jax", CART, 10, permuted(by_axis), moved, note="controls"),
+        planted("rows leak", "numpy", CHAIN, 10, shifted_rows, ("rows that leak", *mean), note="shifted"),
         planted("transposed", "numpy", PLATE, 9, transposed(3), ("transposed",)),
         planted("transposed", "torch", PLATE, 100, transposed(10), ("transposed",)),
         planted("transposed", "jax", PLATE, 4, transposed(2), moved),
