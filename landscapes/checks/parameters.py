@@ -147,7 +147,7 @@ def _judge_groups(
 ) -> tuple[Judgement, ...]:
     """Judge lines through one point, along which all parameters of a group move and no others."""
     direction = torch.zeros(len(groups), u.shape[1], dtype=torch.float64)
-    inward = torch.where(u[row] > 0.5, -1.0, 1.0)
+    inward = torch.where(u[row] > 0.5, -1.0, 1.0).double()
     for number, group in enumerate(groups):
         direction[number, list(group)] = inward[list(group)]
     point = torch.full((len(groups),), row)

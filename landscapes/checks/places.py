@@ -8,12 +8,13 @@ from torch import Tensor
 
 from ..objective import Evaluation, Objective
 from .probe import Lines, Probe
-from .slopes import Judgement, Kind, Ladder, Limits, measure
+from .slopes import Judgement, Kind, Ladder, measure
 
 STEPS = (1e-8, 1e-6, 1e-5, 1e-4, 1e-3)
 AXES = 4  # at each place, drawn from all
 AXES_TRIED = 16  # along which an infinite slope is looked for
 NEARBY, NEAR = 8, 1e-6  # gradients around a place, and how far from it, whose range holds that at a kink
+KINKED = 0.01  # of the largest component is what gradients around a kink differ by at least
 GROWING = 1.5  # times a slope is that over a tenth of the step at least, where it grows without bounds
 CLEAR = 100  # times rounding is what a change is, to be seen
 INSIDE = 1e-9  # of the box: how far inside a bound a zero lies
@@ -96,19 +97,22 @@ def _infinite_points(probe: Probe, ladder: Ladder) -> set[int]:
 
 
 def _is_within_neighbours(probe: Probe, lines: Lines, row: int) -> bool:
-    """Say whether gradients around a place differ along a line, and that of the place lies within their range."""
+    """Say whether gradients around a place differ, as at a kink, and that of the place lies within their range.
+
+    Where several branches meet, a rule of differentiation may take any mean of them: the range is that of all
+    components.
+    """
     generator = torch.Generator().manual_seed(row)
     off = torch.randn(NEARBY, lines.u.shape[1], generator=generator, dtype=torch.float64)
     found = probe.gradient((lines.u[row] + NEAR * off).clamp(0, 1))
     if found.grad is None:
         return False
-    slopes = (found.grad * probe.width * lines.direction[row]).sum(dim=1)
-    slopes = slopes[slopes.isfinite()]
-    if not len(slopes):
+    grads = (found.grad * probe.width)[found.has_gradient]
+    if not len(grads):
         return False
-    low, high, exact = float(slopes.min()), float(slopes.max()), float(lines.slope[row])
-    room = Limits.of(probe).relative * max(abs(low), abs(high))
-    return high - low > room and low - room <= exact <= high + room
+    room, exact = KINKED * float(grads.abs().max()), float(lines.slope[row])
+    varies = float((grads.amax(dim=0) - grads.amin(dim=0)).max()) > room
+    return varies and min(0.0, float(grads.min())) - room <= exact <= max(0.0, float(grads.max())) + room
 
 
 def _is_infinite(probe: Probe, ladder: Ladder, row: int) -> bool:

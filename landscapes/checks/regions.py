@@ -13,6 +13,7 @@ from .diagnosis import Region
 
 FEWEST = 3  # points, wrong or right, from which a rule is told
 WORST = 0.3  # of the rarer kind is what a rule may put on the wrong side
+AT_END = 0.02  # of a feature's range is what an interval may lack of its end
 CANDIDATES = 6  # features whose pairs are tried
 Points = NDArray[np.float64]
 
@@ -47,16 +48,21 @@ def find_region(
     single = sorted((_best_interval(features, one, wrong) for one in range(len(labels))), key=lambda one: -one.score)
     best: tuple[float, list[_Interval]] = (_error(features, single[:1], wrong), single[:1])
     if best[0] > WORST * few / len(wrong) / 3:
-        for first, other in permutations(single[:CANDIDATES], 2):
-            inside = first.holds(features)
-            second = _best_interval(features[inside], other.feature, wrong[inside])
-            error = _error(features, [first, second], wrong)
+        for first, other in permutations(_narrowest(features, wrong), 2):
+            pair = _best_pair(features, first, other, wrong)
+            error = _error(features, pair, wrong)
             if error < best[0] - 1.5 / len(wrong):  # a second condition has to be worth it
-                best = (error, [first, second])
+                best = (error, pair)
     error, intervals = best
     if error > WORST * few / len(wrong):
         return None
-    rule = " and ".join(_describe(one, features, labels, wrong, spans) for one in intervals)
+    rules = []
+    for one in intervals:
+        kept = wrong.copy()
+        for other in intervals:
+            kept |= (other is not one) & ~other.holds(features)  # right points that another condition leaves out
+        rules.append(_describe(one, features, labels, kept, spans))
+    rule = " and ".join(rules)
     return Region(rule, tuple(labels[one.feature] for one in intervals), error, len(wrong))
 
 
@@ -67,6 +73,28 @@ def _features(
     columns, labels = [values, *(count[:, None] for count in events.values())], [*names, *events]
     features = np.concatenate(columns, axis=1)
     return features, labels, np.ptp(features, axis=0)
+
+
+def _narrowest(features: Points, wrong: NDArray[np.bool_]) -> list[int]:
+    """Return the features within whose span of wrong points the fewest right ones lie."""
+    low, high = features[wrong].min(axis=0), features[wrong].max(axis=0)
+    right = features[~wrong]
+    within = ((right >= low) & (right <= high)).sum(axis=0)
+    return [int(one) for one in np.argsort(within, kind="stable")[:CANDIDATES]]
+
+
+def _best_pair(features: Points, first: int, other: int, wrong: NDArray[np.bool_]) -> list[_Interval]:
+    """Return intervals of two features that hold wrong points and few others: the span of one, then each in turn."""
+    at = features[wrong, first]
+    one = _Interval(first, float(at.min()), float(at.max()), 0)
+    for _ in range(2):
+        inside = one.holds(features)
+        two = _best_interval(features[inside], other, wrong[inside])
+        inside = two.holds(features)
+        if not inside.any():
+            break
+        one = _best_interval(features[inside], first, wrong[inside])
+    return [one, two]
 
 
 def _best_interval(features: Points, feature: int, wrong: NDArray[np.bool_]) -> _Interval:
@@ -101,6 +129,10 @@ def _describe(
     right = values[~wrong]
     below, above = right[right < one.low], right[right > one.high]
     span = float(spans[one.feature]) or 1.0
+    if len(above) and float(values.max()) - one.high < AT_END * span:
+        above = above[:0]
+    if len(below) and one.low - float(values.min()) < AT_END * span:
+        below = below[:0]
     low, high = (_rounded(value, span) for value in (one.low, one.high))
     if not len(above) and not len(below):
         return f"{label} between {low} and {high}"

@@ -153,13 +153,13 @@ def _rounding(eps: float, lines: Lines, row: int) -> float:
 def _extend(probe: Probe, ladder: Ladder, rows: Sequence[int], more: Sequence[float]) -> Ladder:
     """Walk along some of the lines over further steps, and judge these once more."""
     chosen = torch.tensor(rows)
+    part = ladder.lines.rows(chosen)
     steps = tuple(sorted({*ladder.steps, *more}))
     order = torch.tensor([steps.index(step) for step in ladder.steps])
-    added = torch.tensor([steps.index(step) for step in more if step not in ladder.steps])
+    added = torch.tensor([steps.index(step) for step in more])
     walked = torch.full((2, len(steps), len(ladder.lines)), torch.nan, dtype=torch.float64)
     walked[:, order] = ladder.walked
-    part = ladder.lines.rows(chosen)
-    walked[:, added[:, None], chosen[None]] = part.walk(probe, [steps[one] for one in added.tolist()])
+    walked[:, added[:, None], chosen[None]] = part.walk(probe, list(more))
     again = _judge(probe, part, steps, walked[:, :, chosen])
     judged = list(ladder.judged)
     for row, found in zip(rows, again.judged, strict=True):
