@@ -13,6 +13,7 @@ from benchmarks.diagnosis.cases import Case
 from benchmarks.diagnosis.catalogue import defects, healthy_functions
 from benchmarks.diagnosis.examine import Result, Slabs, is_placed, slabs_of
 from benchmarks.diagnosis.peers import PEERS, Peer, ask
+from benchmarks.diagnosis.systems import CART
 from torch import Tensor
 
 import gradscape as gs
@@ -264,22 +265,29 @@ def result(*, healthy: bool = False, passed: bool = False, found: bool = True, p
 
 def test_a_goal_is_missed_by_one_healthy_function_or_a_slab_too_few() -> None:
     fine, well = [result()] * 97, result(healthy=True, passed=True, found=False, place=None)
-    enough = [Slabs(0.02, 0, 36, 1.0), Slabs(0.05, 34, 36, 1.0)]
+    enough = [Slabs(0.02, False, 0, 36, 1.0), Slabs(0.05, False, 34, 36, 1.0), Slabs(0.05, True, 31, 36, 1.0)]
     assert missed([*fine, *[result(found=False)] * 3, well], enough) == []
     assert len(missed([*fine, *[result(found=False)] * 4], enough)) == 1
     assert missed([*fine, result(healthy=True, found=False, place=None)], []) == ["healthy and failed: case"]
     assert len(missed([result(place=False)] * 16 + fine[:84], [])) == 1
-    assert len(missed(fine, [Slabs(0.05, 33, 36, 1.0)])) == 1
+    assert len(missed(fine, [Slabs(0.05, False, 33, 36, 1.0)])) == 1
 
 
 @pytest.mark.parametrize("width", [0.02, 0.4])
 def test_slabs_lie_in_the_box_and_at_its_edges(width: float) -> None:
     cuts = slabs_of(width)
     assert len(cuts) == 36
-    assert {which for which, _, _ in cuts} == {0, 1}
-    assert min(lower for _, lower, _ in cuts) == -2
-    assert max(upper for _, _, upper in cuts) == pytest.approx(3)
-    assert all(upper - lower == pytest.approx(5 * width) for _, lower, upper in cuts)
+    assert {cut.direction for cut in cuts} == {(1, 0), (0, 1)}
+    assert min(cut.lower for cut in cuts) == -2
+    assert max(cut.upper for cut in cuts) == pytest.approx(3)
+    assert all(cut.upper - cut.lower == pytest.approx(5 * width) for cut in cuts)
+
+
+def test_a_slab_at_an_angle_fills_its_share_of_the_box() -> None:
+    x = CART.space(10).uniform(20000, seed=5)
+    for cut in slabs_of(0.1, tilted=True):
+        sums = x @ torch.tensor(cut.direction, dtype=torch.float64)
+        assert float(((sums > cut.lower) & (sums < cut.upper)).double().mean()) == pytest.approx(0.1, abs=0.012)
 
 
 @pytest.mark.parametrize(

@@ -18,6 +18,7 @@ from .planted import slab
 POWER = "5%"
 WIDTHS = (0.02, 0.05, 0.1, 0.2, 0.4)  # of slabs, shares of the box
 SLABS = 36  # of each width
+TILTED = 10  # parameters of those at an angle
 AT_EDGES = 4  # of them, which begin or end at the box's own edge
 NEAR = 0.1  # share of a parameter's range, by which a rule may miss an edge of a region
 LATE = 2  # steps by which the first wrong one may be named too late
@@ -43,10 +44,20 @@ class Result:
 
 
 @dataclass(frozen=True)
+class Slab:
+    """A region of the box between two values of a weighted sum of the parameters."""
+
+    direction: tuple[float, ...]
+    lower: float
+    upper: float
+
+
+@dataclass(frozen=True)
 class Slabs:
     """Of how many slabs of a width, a share of the box, was the wrong sign found."""
 
     width: float
+    tilted: bool
     found: int
     tried: int
     seconds: float
@@ -136,21 +147,28 @@ def _names_step(step: int, told: Diagnosis) -> bool:
     return any(step <= one <= step + LATE for one in numbers)
 
 
-def slabs_of(width: float) -> list[tuple[int, float, float]]:
-    """Return slabs of a width by parameter and ends [N], at both edges of the box and at random places."""
+def slabs_of(width: float, tilted: bool = False) -> list[Slab]:
+    """Return slabs of a width, at both edges of the box and at random places.
+
+    They lie across one of two forces, or, tilted, at an angle in the box of ten.
+    """
     draw = np.random.default_rng(round(1000 * width))
     starts = np.concatenate([[0, 1 - width] * (AT_EDGES // 2), draw.uniform(0, 1 - width, SLABS - AT_EDGES)])
-    lower, across = -2.0, 5.0  # of a force of the cart
-    return [
-        (k // 2 % 2, lower + across * float(start), lower + across * float(start + width))
-        for k, start in enumerate(starts)
-    ]
+    across = [np.eye(2)[k // 2 % 2] for k in range(SLABS)]
+    directions = draw.standard_normal((SLABS, TILTED)) if tilted else np.array(across)
+    forces = draw.uniform(-2, 3, (20000, directions.shape[1]))  # shares are those of the box, so known by its points
+    found = []
+    for direction, start in zip(directions, starts, strict=True):
+        ends = np.array([start, start + width])
+        lower, upper = np.quantile(forces @ direction, ends) if tilted else 5 * ends - 2
+        found.append(Slab(tuple(map(float, direction)), float(lower), float(upper)))
+    return found
 
 
-def power(width: float, tell: Callable[[int], None] = lambda _: None) -> Slabs:
+def power(width: float, tilted: bool = False, tell: Callable[[str], None] = lambda _: None) -> Slabs:
     """Count how many slabs of a width are found, each with a seed of its own; `tell` hears how many are done."""
-    found, start, cuts = 0, time.perf_counter(), slabs_of(width)
-    for seed, (which, lower, upper) in enumerate(cuts):
-        found += not gs.check(slab(which, lower, upper), power=POWER, seed=seed).passed
-        tell(seed + 1)
-    return Slabs(width, found, len(cuts), time.perf_counter() - start)
+    found, start, cuts = 0, time.perf_counter(), slabs_of(width, tilted)
+    for seed, cut in enumerate(cuts):
+        found += not gs.check(slab(cut.direction, cut.lower, cut.upper), power=POWER, seed=seed).passed
+        tell(f"slab {seed + 1} of {width:.0%}")
+    return Slabs(width, tilted, found, len(cuts), time.perf_counter() - start)

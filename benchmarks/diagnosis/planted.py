@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -164,7 +164,7 @@ def cases() -> list[Case]:
     return [*_regions(), *_signs(), *_constants(), *_orders(), *_limits()]
 
 
-def slab(which: int, lower: float, upper: float) -> gs.Environment:
-    """Return a cart of two forces whose gradient has the wrong sign where one lies between two values [N]."""
-    spoil = within(between(which, lower, upper), scaled(-1))
-    return objective("numpy", CART, 2, spoil, "float64", "slab")
+def slab(direction: Sequence[float], lower: float, upper: float) -> gs.Environment:
+    """Return a cart whose gradient has the wrong sign where a weighted sum of its forces is between two values [N]."""
+    region: Region = lambda x: (x @ np.array(direction) > lower) & (x @ np.array(direction) < upper)  # noqa: E731
+    return objective("numpy", CART, len(direction), within(region, scaled(-1)), "float64", "slab")
