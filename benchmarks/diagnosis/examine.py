@@ -112,7 +112,7 @@ def is_placed(case: Case, space: gs.ParameterSpace, told: Sequence[Diagnosis]) -
         return any(_names_step(case.step, one) for one in told)
     if case.edges:
         return any(_names_region(case, space, one) for one in told)
-    return any(_same(case.parameters, one.parameters) for one in told)
+    return any(_same(case.parameters, one.parameters or space.names) for one in told)  # none named: all are meant
 
 
 def _same(wanted: Sequence[str], named: Sequence[str]) -> bool:
