@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import re
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal, Unpack, get_args
 
@@ -13,9 +14,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..landscapes.objective import Evaluation, SimulatorError, first_line
+from ..landscapes.objective import Evaluation, SimulatorError, Status, first_line
 from ..landscapes.space import ParameterSpace, as_tensor, as_whole
 from .base import Environment, check_shape
+from .origins import torch_origin
 from .user_functions import Backend, Compute, Function, FunctionKeywords
 
 if TYPE_CHECKING:
@@ -93,6 +95,31 @@ class FunctionEnvironment(Environment):
         error: Tensor = losses.std(dim=0) / len(losses) ** 0.5
         return error
 
+    def nan_origin(self, x: Float[Tensor, " dim"]) -> str:
+        """Return which operation makes the gradient at a point not finite, where the loss is; "" where none does.
+
+        A sentence's end, such as `sqrt in line 12 of my.py ("jnp.sqrt(p[0])")`.
+        """
+        found = self.evaluate(x[None])
+        if int(found.status[0]) != Status.NO_GRADIENT:
+            return ""
+        return self._first_said(self.function.backend.nan_origin, x)
+
+    def wrong_origin(self, x: Float[Tensor, " dim"]) -> str:
+        """Return which operation's own derivative is wrong at a point, where it is finite; "" where none is known.
+
+        A sentence's end, such as `kernel step in line 12 of my.py`.
+        """
+        return self._first_said(self.function.backend.wrong_origin, x)
+
+    def _first_said(self, ask: Callable[..., str], x: Float[Tensor, " dim"]) -> str:
+        """Return what a library says of the function at a point, for the first seed of which it says something."""
+        values, precision = self.space.to_values(self._check_points(x[None])), self.fidelity.precision
+        said = (ask(self.function, self._settings_of(seed), precision, self.device, values) for seed in self._seeds)
+        with torch.inference_mode(False), torch.enable_grad(), suppress(Exception):  # it is no more than a hint
+            return next(filter(None, said), "")
+        return ""
+
     def named(self, name: str) -> FunctionEnvironment:
         """Return the same environment by another name."""
         settings = {"fidelity": self.fidelity, "device": self.device, **asdict(self.options)}
@@ -132,12 +159,14 @@ class FunctionEnvironment(Environment):
 
     def _compute(self, seed: int) -> Compute:
         if seed not in self._computes:
-            settings = dict(self._settings)
-            if self.function.seed_argument:
-                settings[self.function.seed_argument] = seed
-            bound = self.function.backend.bind(self.function, settings, self.fidelity.precision, self.device)
-            self._computes[seed] = bound
+            settings, precision = self._settings_of(seed), self.fidelity.precision
+            self._computes[seed] = self.function.backend.bind(self.function, settings, precision, self.device)
         return self._computes[seed]
+
+    def _settings_of(self, seed: int) -> dict[str, Any]:
+        """Return the function's keyword arguments, its random numbers included."""
+        argument = self.function.seed_argument
+        return {**self._settings, **({argument: seed} if argument else {})}
 
     def _evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
         losses, slopes, sign = [], [], -1.0 if self.function.maximize else 1.0
@@ -340,6 +369,13 @@ class _Torch(Backend):
             return losses, slope, str(loss.dtype).removeprefix("torch.")
 
         return compute
+
+    def nan_origin(
+        self, call: Function, settings: Mapping[str, Any], precision: str, device: str, x: Float[Tensor, "one dim"]
+    ) -> str:
+        """Return which operation makes the gradient at a point not finite, and where it is called."""
+        points = x.to(device, getattr(torch, precision))
+        return torch_origin(lambda own: self._losses(call, own, settings), points)
 
     def _losses(self, call: Function, x: Float[Tensor, "batch dim"], settings: Mapping[str, Any]) -> Tensor:
         if self.vectorized:

@@ -6,13 +6,14 @@ import abc
 import inspect
 import queue
 import threading
+import weakref
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import asdict, replace
 from functools import partial
 from importlib import import_module
-from types import ModuleType
+from types import MethodType, ModuleType
 from typing import Any, ClassVar, Generic, TypeVar, final
 
 import torch
@@ -68,6 +69,30 @@ class Pool(Generic[T]):
                 yield item
             finally:
                 self._idle.put(item)
+
+    def clear(self) -> None:
+        """Forget the idle objects, and so give back their memory."""
+        with suppress(queue.Empty):
+            while True:
+                self._idle.get_nowait()
+
+
+class OwnMethod:
+    """A method of an object that it does not keep alive.
+
+    An object that holds a method of its own is part of a cycle, whose memory is free only when garbage is collected.
+    """
+
+    def __init__(self, method: Callable[..., Any]) -> None:
+        self._owner, self._function = weakref.ref(method.__self__), method.__func__  # type: ignore[attr-defined]
+
+    def __call__(self, *values: Any) -> Any:
+        """Call it."""
+        return self._function(self._owner(), *values)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Go to another process with the object."""
+        return OwnMethod, (MethodType(self._function, self._owner()),)
 
 
 def copied(values: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
@@ -221,7 +246,6 @@ class Environment(Objective):
         found = Evaluation.from_results(whole.loss.to(x), slope, whole.status.cpu(), whole.error)
         if found.error:
             self._refuse_broken(x, found)
-            self._raised = None  # which holds all that was there
         return found
 
     @final
@@ -314,6 +338,13 @@ class Environment(Objective):
         self._max_rows, self._solvers = rows, None
         free_memory()
         self._setup()
+
+    @final
+    def release(self) -> None:
+        """Give back the memory that solvers hold between evaluations; the next one makes them again."""
+        if self._solvers is not None:
+            self._solvers.clear()
+        free_memory()
 
     def memory(self) -> int:
         """Estimate the bytes one episode takes while it runs."""
@@ -419,6 +450,7 @@ class Environment(Objective):
 
         So an engine that is broken, or a function that cannot work, is no landscape of errors.
         """
+        raised, self._raised = self._raised, None  # which holds all that was there, this too
         answered = found.status != Status.ERROR
         if bool(answered.any()):
             self._answering = x[answered][:1]
@@ -434,7 +466,7 @@ class Environment(Objective):
         raise SimulatorError(
             f"{self.name} raised wherever it was tried, at {len(x) + len(tried)} points: {found.error}; the first was "
             f"x = {self.space.to_values(x[0]).tolist()}"
-        ) from self._raised
+        ) from raised
 
     def _simulate(self, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
         values = self.space.to_values(x)

@@ -70,6 +70,18 @@ class Backend(abc.ABC):
     def bind(self, call: Function, settings: Mapping[str, Any], precision: str, device: str) -> Compute:
         """Return what computes the function with these keyword arguments."""
 
+    def nan_origin(
+        self, call: Function, settings: Mapping[str, Any], precision: str, device: str, x: Float[Tensor, "one dim"]
+    ) -> str:
+        """Return which operation makes the gradient at a point not finite, and where it is called; "" where unknown."""
+        return ""
+
+    def wrong_origin(
+        self, call: Function, settings: Mapping[str, Any], precision: str, device: str, x: Float[Tensor, "one dim"]
+    ) -> str:
+        """Return which operation's own derivative is wrong at a point, where it is finite; "" where unknown."""
+        return ""
+
 
 @dataclass(eq=False)
 class Function:

@@ -33,6 +33,8 @@ FACTORS = (1, 2, 4, 8)  # of the fidelity's time step, and of the scene's horizo
 GROWTH = (1, 2, 4)  # of the horizon: how long gradients are held against the rise of the loss
 POINT_ROWS = 32  # rows that are held for a point: those of all steps of a ladder
 FORWARD = 64  # parameters of which both modes are compared at most
+FINER, SAME_STEP = (2, 4), 0.01  # parts of the time step, and by which share of it the nearest may be another
+LENGTHS = 32  # of episodes, among which the first whose gradient is wrong is looked for
 MODES = ("forward", "reverse")  # of automatic differentiation
 
 
@@ -186,6 +188,9 @@ class CheckJob:
             variants=[*_time_steps(self), *_materials(self), *_horizons(self)],
             horizons=_lengths(self),
             other_mode=_other_mode(self),
+            finer={factor: make for factor in FINER if (make := _finer(self, factor))},
+            lengths=_shorter(self.env),
+            make_length=self.env.with_horizon,
             expected=self.env.known_failures.get(self.env.fidelity.name, {}),
             follow=follow,
         )
@@ -274,6 +279,31 @@ def _time_step(job: CheckJob, factor: int, dt: float) -> ExtremeCase:
         if work != before and abs(longer - 1) > 1e-3:
             note = f"its steps are rounded: an episode is {longer:.3g} times as long"
     return ExtremeCase(f"dt {factor}x", longer_steps.make, why=note)
+
+
+def _finer(job: CheckJob, factor: int) -> Callable[[], Environment] | None:
+    """Return what makes the environment with time steps that are so many times shorter, in float64 where it can."""
+    own = job.env.fidelity
+    if not own.dt:
+        return None
+    dt = job.env.nearest_dt(own.dt / factor)
+    if abs(dt * factor / own.dt - 1) > SAME_STEP:
+        return None
+    shorter = replace(own, name=f"{own.name}, dt / {factor}", dt=dt)
+    return replace(job.spec, fidelity=shorter).make
+
+
+def _shorter(env: Environment) -> list[float]:
+    """Return lengths of episodes up to its own, among which the first wrong one is looked for."""
+    own = env.horizon
+    if not own:
+        return []
+    whole = float(own).is_integer() and own >= LENGTHS / 2
+    return (
+        [float(one) for one in range(1, int(own) + 1)]
+        if whole
+        else [own * one / LENGTHS for one in range(1, LENGTHS + 1)]
+    )
 
 
 def _horizons(job: CheckJob) -> list[ExtremeCase]:

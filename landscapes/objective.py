@@ -231,6 +231,9 @@ class Objective(abc.ABC):
     def shrink(self, rows: int) -> None:  # noqa: B027 -- most hold no memory between evaluations
         """Take at most `rows` points at once from now on."""
 
+    def release(self) -> None:  # noqa: B027 -- most hold no memory between evaluations
+        """Give back the memory that is held between evaluations."""
+
     def memory(self) -> int:
         """Estimate the bytes that the evaluation of one point takes."""
         return 0
@@ -245,6 +248,10 @@ class Objective(abc.ABC):
 
     def nan_origin(self, x: Float[Tensor, " dim"]) -> str:
         """Say which operation makes the first NaN of the gradient at one point; empty where nothing tells."""
+        return ""
+
+    def wrong_origin(self, x: Float[Tensor, " dim"]) -> str:
+        """Say which operation's own derivative is wrong at one point, where it is finite; empty where nothing tells."""
         return ""
 
     def energy(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch step"] | None:
@@ -288,8 +295,8 @@ class ObjectiveWrapper(Objective):
 
 
 PASSED_ON = (
-    "threads preferred_batch precision packages identity prepare shrink memory events special_places nan_origin energy "
-    "noise observe"
+    "threads preferred_batch precision packages identity prepare shrink release memory events special_places "
+    "nan_origin wrong_origin energy noise observe"
 )
 for _part in PASSED_ON.split():
     setattr(ObjectiveWrapper, _part, property(attrgetter(f"objective.{_part}")))

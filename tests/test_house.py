@@ -17,7 +17,7 @@ Function = ast.FunctionDef | ast.AsyncFunctionDef
 
 def test_the_package_s_own_folder_is_the_door_only() -> None:
     held = {path.name for path in (ROOT / "src/gradscape").iterdir() if path.name != "__pycache__"}
-    assert held == {*FOLDERS, "cli.py", "__init__.py", "__main__.py", "py.typed"}
+    assert held == {*FOLDERS, "cli.py", "__init__.py", "__main__.py", "testing.py", "py.typed"}
 
 
 def test_no_function_is_longer_than_one_reads_at_once() -> None:

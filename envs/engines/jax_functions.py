@@ -16,6 +16,7 @@ from torch import Tensor
 
 from ...landscapes.objective import SimulatorError
 from ..user_functions import Backend, Compute, Function
+from .jax_origins import jax_origin
 
 GROWTH = 4
 _TRACED: dict[str, str] = {}  # the precision that JAX has last traced a function in
@@ -36,21 +37,37 @@ class JaxBackend(Backend):
 
     def bind(self, call: Function, settings: Mapping[str, Any], precision: str, device: str) -> Compute:
         """Return what computes the function with these keyword arguments, which are static."""
-        fixed = dict(settings)
-
-        def fn(x: Any) -> Any:
-            if "key" in fixed:
-                return call.fn(x, **{**fixed, "key": jax.random.key(fixed["key"])})
-            return call.fn(x, **fixed)
-
+        fn, chosen = _with_settings(call.fn, settings), _device(device)
         function = JaxFunction(fn, call.space.dim, call.name, precision, call.rows, self.mode, self.batch)
-        chosen = jax.devices("cpu" if device == "cpu" else None)[0]
 
         def compute(x: Float[Tensor, "batch dim"], grad: bool) -> tuple[Tensor, Tensor | None, str]:
             with jax.default_device(chosen):
                 return function(x, grad)
 
         return compute
+
+    def nan_origin(
+        self, call: Function, settings: Mapping[str, Any], precision: str, device: str, x: Float[Tensor, "one dim"]
+    ) -> str:
+        """Return which primitive makes the gradient at a point not finite, and where it is called."""
+        with computing_in(precision), jax.default_device(_device(device)):
+            return jax_origin(_with_settings(call.fn, settings), jnp.asarray(x[0].numpy(), dtype=precision), self.mode)
+
+
+def _device(name: str) -> Any:
+    return jax.devices("cpu" if name == "cpu" else None)[0]
+
+
+def _with_settings(fn: Callable[..., Any], settings: Mapping[str, Any]) -> Callable[[Any], Any]:
+    """Return a function with keyword arguments, of which a number as `key` becomes a key of JAX."""
+    fixed = dict(settings)
+
+    def of_point(x: Any) -> Any:
+        if "key" in fixed:
+            return fn(x, **{**fixed, "key": jax.random.key(fixed["key"])})
+        return fn(x, **fixed)
+
+    return of_point
 
 
 @dataclass(eq=False)

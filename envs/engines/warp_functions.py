@@ -18,6 +18,7 @@ from ...landscapes.objective import SimulatorError
 from ..base import check_shape
 from ..user_functions import Backend, Compute, Function
 from .runtime import cuda_available, precision
+from .warp_origins import warp_origin, wrong_kernel
 
 CORRUPTS = "This may corrupt gradient computation"  # how Warp ends what it says of an array that is overwritten
 
@@ -38,6 +39,21 @@ class WarpBackend(Backend):
         """Return what computes the function with these keyword arguments."""
         fn = partial(call.fn, **settings)
         return WarpFunction(fn, call.name, precision, device, unchecked=self.check_overwrites)
+
+    def nan_origin(
+        self, call: Function, settings: Mapping[str, Any], precision: str, device: str, x: Float[Tensor, "one dim"]
+    ) -> str:
+        """Return which kernel makes the gradient at a point not finite, and by which argument."""
+        return self._looked_at(call, settings, precision, device).nan_origin(x)
+
+    def wrong_origin(
+        self, call: Function, settings: Mapping[str, Any], precision: str, device: str, x: Float[Tensor, "one dim"]
+    ) -> str:
+        """Return which kernel's adjoint differs from its differences at a point."""
+        return self._looked_at(call, settings, precision, device).wrong_origin(x)
+
+    def _looked_at(self, call: Function, settings: Mapping[str, Any], precision: str, device: str) -> WarpFunction:
+        return WarpFunction(partial(call.fn, **settings), call.name, precision, device, unchecked=False)
 
 
 @dataclass(eq=False)
@@ -70,6 +86,32 @@ class WarpFunction:
             finally:
                 tape.zero()  # of arrays that the function keeps
             return _tensor(losses), slope, self.precision
+
+    def nan_origin(self, x: Float[Tensor, "one dim"]) -> str:
+        """Return which kernel makes the gradient at a point not finite, and by which argument."""
+        with self._recorded(x) as (tape, losses):
+            return warp_origin(tape, losses)
+
+    def wrong_origin(self, x: Float[Tensor, "one dim"]) -> str:
+        """Return which kernel's adjoint differs from its differences at a point, or what is overwritten."""
+        try:
+            self._refuse_overwrites(x)
+        except SimulatorError as error:
+            return _line(error)
+        with self._recorded(x) as (tape, _):
+            return wrong_kernel(tape)
+
+    @contextmanager
+    def _recorded(self, x: Float[Tensor, "one dim"]) -> Iterator[tuple[Any, Any]]:
+        """Give the tape of a point and its loss."""
+        with wp.ScopedDevice(self.device):
+            points: Any = wp.array(x.numpy(), dtype=self.real, requires_grad=True)
+            with wp.Tape() as tape:
+                losses = self._losses(points)
+            try:
+                yield tape, losses
+            finally:
+                tape.zero()  # of arrays that the function keeps
 
     def _losses(self, points: Any) -> Any:
         """Return what the function makes of points, held against what it must be."""

@@ -15,7 +15,7 @@ from torch import Tensor
 from ...landscapes.episode import Part, View
 from ...landscapes.objective import Evaluation
 from ...landscapes.space import ParameterSpace
-from ..base import Environment, Episode, Fidelity, Work
+from ..base import Environment, Episode, Fidelity, OwnMethod, Work
 from ..records import EpisodeOptions
 
 ROWS = 16
@@ -122,9 +122,9 @@ class MjxScene(Environment):
         places = tuple(self._rollout.find(one.field, one.index) for one in (*first, *held))
         each = round(self.duration / self.segments / self.fidelity.dt)
         count, steps = (1, o.count_steps(each)) if self.segments == 1 else (o.count_steps(self.segments), each)
-        self._course = solver.Course(places, self.segments, count, steps, self.act)
+        self._course = solver.Course(places, self.segments, count, steps, OwnMethod(self.act))
         self._function = solver.JaxFunction(
-            self._loss, self.space.dim, self.name, self.fidelity.precision, self.preferred_batch, o.mode
+            OwnMethod(self._loss), self.space.dim, self.name, self.fidelity.precision, self.preferred_batch, o.mode
         )
 
     def _loss(self, x: Any) -> Any:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,10 +14,14 @@ from .diagnosis import CERTAINTIES, Diagnosis, Region
 from .evidence import Evidence, Samples
 from .examination import Examination, percent
 from .finding import FAIL
-from .history import ROWS, History
+from .history import ROWS, SAME, History
+from .horizons import FirstWrong
+from .memory import MemoryGrowth
 from .probe import EPS
 from .slopes import TOLERANCE, UNJUDGED, Kind
+from .usefulness import Usefulness
 
+OVERWRITES = "writes to what it has read"  # how a simulator says so
 NAMED = 6  # parameters that are named, at most
 MANY_LINES = 20  # from which an average is told
 CLEAR_ERRORS = 3  # standard errors
@@ -27,24 +31,26 @@ STEEP_SHARE = 0.2
 
 @dataclass(frozen=True)
 class Calls:
-    """What checks of calls have found: of rows in a batch, of losses with and without gradients, of two backwards."""
+    """What checks of calls have found: the names of those that failed, and what they measured."""
 
     history: History | None = None
-    leaks: bool = False
-    depends: bool = False
+    broken: tuple[str, ...] = ()
     second_backward: float = 0.0
 
     def evidence(self) -> Evidence:
         """Return it as numbers."""
-        found: Evidence = {"leaks": self.leaks, "depends": self.depends, "random": 0.0, "hidden": 0.0}
+        depends = "loss without gradient" in self.broken
+        found: Evidence = {"leaks": 0.0, "depends": depends, "random": 0.0, "hidden": 0.0}
         if (one := self.history) is not None:
-            hidden = one.loss > 1e-9 and not one.random
+            hidden = one.loss > SAME and not one.random
             found |= {
                 "random": one.random,
+                "leaks": one.leak > max(SAME, 10 * one.loss),
                 "hidden": hidden,
                 "stale": one.stale,
                 "grows": one.grows,
                 "batch": one.batch,
+                "alike": one.alike,
                 "rows": ROWS,
                 "loss_moves": one.loss,
                 "gradient_moves": one.gradient,
@@ -55,20 +61,30 @@ class Calls:
 Texts = dict[str, str]
 
 
-def conclude(
-    seen: Examination, calls: Calls, origin: Callable[[int], str] = lambda row: "", length: Evidence | None = None
-) -> tuple[Diagnosis, ...]:
-    """Return a diagnosis for each kind of finding, what fails and is certain first.
+@dataclass(frozen=True)
+class Further:
+    """What can be asked about a point whose gradient is NaN or wrong, once there is one.
 
-    `origin` says where the first NaN at one of the random points begins, and `length` holds what is known of the
-    horizon.
+    `nan_origin` and `wrong_origin` say where that begins, and `first_wrong` from which length of an episode on, at a
+    random point or, numbered from -1 down, at a special place.
     """
+
+    nan_origin: Callable[[int], str] = lambda row: ""
+    wrong_origin: Callable[[int], str] = lambda row: ""
+    first_wrong: Callable[[Sequence[int]], FirstWrong | None] = lambda rows: None
+
+
+def conclude(seen: Examination, calls: Calls, further: Further | None = None) -> tuple[Diagnosis, ...]:
+    """Return a diagnosis for each kind of finding, what fails and is certain first."""
+    further = further or Further()
     found = [one for judge in (_of_calls, _of_grain) for one in judge(seen, calls)]
     explained = any(one.outcome == FAIL for one in found)
-    found += list(_of_nan(seen, origin))
+    found += list(_of_nan(seen, further))
     if not explained:
-        found += list(_of_wrong(seen, calls, length or {}))
-    found += [one for judge in (_of_zero, _of_steep, _of_noise, _of_length) for one in judge(seen)]
+        found += list(_of_wrong(seen, calls, further))
+    found += [*_of_zero(seen), *_of_length(seen)]
+    if not any(one.outcome == FAIL for one in found):  # nothing is the landscape's while a gradient is wrong
+        found += [*_of_steep(seen), *_of_noise(seen)]
     return tuple(sorted(found, key=lambda one: (one.outcome != FAIL, CERTAINTIES.index(one.certainty))))
 
 
@@ -102,8 +118,10 @@ def _where(region: Region | None) -> str:
 def _of_calls(seen: Examination, calls: Calls) -> Iterator[Diagnosis]:
     evidence = calls.evidence()
     how = "they add up from call to call" if evidence.get("grows") else "a call returns the gradient of the one before"
+    short = f"{evidence.get('batch', 1.0):.3g} times shorter"
+    how_batch = "all rows have the same" if evidence.get("alike") else short
     if (known := recognise("calls", evidence)) is not None:
-        yield _make(*known, evidence, {"how": how})
+        yield _make(*known, evidence, {"how": how, "how_batch": how_batch})
 
 
 def _of_grain(seen: Examination, calls: Calls) -> Iterator[Diagnosis]:
@@ -133,7 +151,7 @@ def _limit(seen: Examination) -> float:
     return float(np.median(limits)) if limits else 1.0
 
 
-def _of_nan(seen: Examination, origin: Callable[[int], str]) -> Iterator[Diagnosis]:
+def _of_nan(seen: Examination, further: Further) -> Iterator[Diagnosis]:
     rows = seen.rows(Kind.NAN)
     names, ladder = seen.places
     places = [row for row, one in enumerate(ladder.judged) if one.kind == Kind.NAN]
@@ -146,7 +164,7 @@ def _of_nan(seen: Examination, origin: Callable[[int], str]) -> Iterator[Diagnos
         "region": float(region is not None),
         "loss": float(ladder.lines.loss[places[0]]) if places else math.nan,
     }
-    begins = origin(rows[0] if rows else -1 - places[0])
+    begins = further.nan_origin(rows[0] if rows else -1 - places[0])
     texts = {
         "share": seen.share.describe().partition(" of ")[0],
         "where": _where(region),
@@ -157,7 +175,7 @@ def _of_nan(seen: Examination, origin: Callable[[int], str]) -> Iterator[Diagnos
         yield _make(*known, evidence, texts, region.parameters if region else (), region)
 
 
-def _of_wrong(seen: Examination, calls: Calls, length: Evidence) -> Iterator[Diagnosis]:
+def _of_wrong(seen: Examination, calls: Calls, further: Further) -> Iterator[Diagnosis]:
     rows, place = seen.rows(Kind.WRONG), _wrong_place(seen)
     axes = [one for one in seen.axes.ladder.judged if one.kind == Kind.WRONG]
     if not rows and not axes:
@@ -166,11 +184,17 @@ def _of_wrong(seen: Examination, calls: Calls, length: Evidence) -> Iterator[Dia
         return
     names = _named(seen, seen.blamed)
     region = seen.region if rows and not seen.rows(Kind.NAN) else None
-    evidence = _wrong_numbers(seen) | calls.evidence() | length | {"second_backward": calls.second_backward}
+    evidence = _wrong_numbers(seen) | calls.evidence() | {"second_backward": calls.second_backward}
+    begins, late = further.wrong_origin(rows[0]) if rows else "", further.first_wrong(rows)
+    evidence |= {"overwrites": float(OVERWRITES in begins)}
+    if late is not None and late.right is not None:
+        evidence |= {"right_until": late.right, "first_wrong": late.length}
     texts = {
         "by": _by(names),
         "where": _where(region),
-        "length": f" (wrong from {length['first_wrong']:.3g} of its length on)" if "first_wrong" in length else "",
+        "unit_text": "its ratio to the slope is the range of each parameter, or one over it"
+        if evidence.get("units", 0) > 0.5
+        else f"it is {evidence.get('ratio', 1):.4g} times the slope",
         "moved_text": percent(evidence.get("moved", 0.0)),
     }
     if (known := recognise("wrong", evidence)) is not None:
@@ -178,7 +202,14 @@ def _of_wrong(seen: Examination, calls: Calls, length: Evidence) -> Iterator[Dia
     else:
         what = f"the gradient{texts['by']} is not the slope of the loss{texts['where']}; no known cause fits"
         found = Diagnosis("", FAIL, "certain", what, REMEDY, names, region, evidence)
-    yield found
+    yield replace(found, what=found.what + _when(late) + (f"; it begins in {begins}" if begins else ""))
+
+
+def _when(late: FirstWrong | None) -> str:
+    """Say from which length of an episode on a gradient is wrong."""
+    if late is None or late.right is None:
+        return ""
+    return f"; it is right in episodes up to a length of {late.right:g}, and wrong from {late.length:g} on"
 
 
 REMEDY = "Compare the gradient with differences along one parameter, at one of these points, step by step."
@@ -259,6 +290,33 @@ def _of_noise(seen: Examination) -> Iterator[Diagnosis]:
     }
     if (known := recognise("noise", evidence)) is not None:
         yield _make(*known, evidence, {})
+
+
+def conclude_physics(evidence: Evidence) -> tuple[Diagnosis, ...]:
+    """Say that gradients are right for the program and wrong for the physics."""
+    texts = {"physics_text": percent(evidence.get("physics", 0.0)), "finest_text": percent(evidence.get("at_4", 0.0))}
+    known = recognise("physics", evidence)
+    return () if known is None else (_make(*known, evidence, texts),)
+
+
+def conclude_memory(growth: MemoryGrowth) -> tuple[Diagnosis, ...]:
+    """Say that memory grows with every evaluation."""
+    evidence = {"growth": growth.per_evaluation if growth.grows else 0.0, "evaluations": float(growth.evaluations)}
+    known = recognise("memory", evidence)
+    text = {"growth_text": f"{growth.per_evaluation:,.0f} bytes"}
+    return () if known is None else (_make(*known, evidence, text),)
+
+
+def conclude_jumps(curve: Sequence[Usefulness]) -> tuple[Diagnosis, ...]:
+    """Say that the loss jumps so regularly that means of gradients are not the slope of the smoothed loss."""
+    for one in sorted(curve, key=lambda one: -one.step):
+        evidence = {"step": one.step, "bias": one.bias.value, "low": one.bias.low, "high": one.bias.high}
+        evidence["least_bias"] = max(one.bias.low, -one.bias.high)
+        interval = f"{percent(one.bias.low, bare=True)} to {percent(one.bias.high)}"
+        texts = {"lacks": percent(one.bias.value), "interval": interval, "width": percent(one.step)}
+        if (known := recognise("jumps", evidence)) is not None:
+            return (_make(*known, evidence, texts),)
+    return ()
 
 
 def _of_length(seen: Examination) -> Iterator[Diagnosis]:

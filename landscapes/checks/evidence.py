@@ -13,13 +13,18 @@ from torch import Tensor
 
 from ..space import ParameterSpace
 from .parameters import AxisLines
-from .probe import Probe
-from .slopes import BAD, Judgement, Kind
+from .probe import EPS, Probe
+from .slopes import Judgement, Kind
 
 STEADY = 0.02  # of a ratio is what others may be off by, to be the same
 MATCHES = 0.02  # of the largest component is what permuted gradients may be off by
 SATURATED = 1e-4  # relative difference of components that are cut off at the same length
-TRIED = 24  # steps that are tried for the difference which a gradient may be
+NEAR = (1e-9, 1e-4)  # of the box: how far apart points are that gradients are compared at, in float64 and float32
+NO_SLOPE = (Kind.FLAT, Kind.ZERO)  # lines whose slope is 0
+TRIED = 32  # steps that are tried for the difference which a gradient may be
+STEPS_TRIED = (1e-4, 0.3)  # of the box,
+CROSSINGS = 4  # of which so many, at most, that fit are tried at other components
+FIRST_TRIED, OTHERS, HELD = 3, 6, 0.8  # components that it is found at, and others, of which a share has to agree
 SAME_DIFFERENCE = 1e-3  # relative error of a difference that a gradient is
 Array = NDArray[np.float64]
 
@@ -40,15 +45,16 @@ class Samples:
         rows = [
             row
             for row, one in enumerate(axes.ladder.judged)
-            if one.slope is not None and one.kind != Kind.NAN and (not wrong or one.kind in BAD)
+            if (one.slope is not None or one.kind in NO_SLOPE) and (not wrong or one.kind == Kind.WRONG)
         ]
         judged = [axes.ladder.judged[row] for row in rows]
-        numbers = np.array(
-            [(one.exact, one.slope.value, one.slope.error) for one in judged if one.slope is not None]
-        ).reshape(-1, 3)
+        found = [(one.exact, *((one.slope.value, one.slope.error) if one.slope else (0.0, 0.0))) for one in judged]
+        numbers = np.array(found).reshape(-1, 3)
         index = torch.tensor(rows, dtype=torch.long)
-        axis, point = axes.axis[index].numpy(), axes.ladder.lines.point[index].numpy()
-        return cls(*numbers.T, axis=axis, point=point)
+        axis, point = axes.axis[index], axes.ladder.lines.point[index]
+        along = axes.ladder.lines.direction[index, axis].numpy()  # ahead or back, whichever leads into the box
+        exact, slope, error = numbers.T
+        return cls(exact * along, slope * along, error, axis.numpy(), point.numpy())
 
     def __len__(self) -> int:
         return len(self.exact)
@@ -124,7 +130,10 @@ def exchanged(exact: Array, slope: Array) -> Evidence:
     """
     from scipy.optimize import linear_sum_assignment
 
-    count, dim = exact.shape
+    dim = exact.shape[1]
+    known = np.isfinite(exact).all(axis=1) & np.abs(slope).any(axis=1)
+    exact, slope = exact[known], slope[known]
+    count = len(exact)
     if count < 2 or dim < 2:
         return {}
     scale = np.abs(slope).max(axis=1, keepdims=True)
@@ -180,57 +189,69 @@ def cosine(exact: Array, slope: Array) -> Evidence:
     return {"cosine": float(np.median(angle)), "length_ratio": float(np.median((sizes[0] / sizes[1])[known]))}
 
 
+@dataclass(frozen=True, eq=False)
+class _AxisSlope:
+    """A component of a gradient at a point: what it says, and differences along its axis."""
+
+    probe: Probe
+    u: Float[Tensor, " dim"]
+    axis: int
+    exact: float
+
+    def difference(self, step: float, side: int) -> float:
+        """Return a central difference, or with `side` 1 and 2 one ahead and one behind; NaN beyond the box."""
+        offset = torch.zeros_like(self.u)
+        offset[self.axis] = step
+        ahead, here, behind = self.probe.loss(torch.stack([self.u + offset, self.u, self.u - offset])).tolist()
+        return float([(ahead - behind) / (2 * step), (ahead - here) / step, (here - behind) / step][side])
+
+    def agrees(self, step: float, side: int) -> bool:
+        """Say whether the component is the difference over a step; at a bound it may be one-sided."""
+        values = [self.difference(step, one) for one in ((side, 1, 2) if step > 0 else (side,))]
+        known = [one for one in values if np.isfinite(one)][:1]
+        return any(abs(one - self.exact) <= SAME_DIFFERENCE * max(abs(self.exact), abs(one)) for one in known)
+
+    def matching_steps(self, side: int) -> list[float]:
+        """Return steps over which the difference is what the component says."""
+        steps = np.geomspace(*STEPS_TRIED, TRIED)
+        gaps = np.array([self.difference(step, side) - self.exact for step in steps])
+        with np.errstate(invalid="ignore"):
+            changes = np.flatnonzero(gaps[:-1] * gaps[1:] <= 0)
+        return [self._halve(float(steps[one]), float(steps[one + 1]), gaps[one], side) for one in changes[:CROSSINGS]]
+
+    def _halve(self, low: float, high: float, start: float, side: int) -> float:
+        for _ in range(TRIED):
+            middle = (low * high) ** 0.5
+            gap = self.difference(middle, side) - self.exact
+            low, high = (middle, high) if gap * start > 0 else (low, middle)
+        return (low * high) ** 0.5
+
+
 def as_difference(probe: Probe, axes: AxisLines, rows: Sequence[int]) -> Evidence:
     """Look for the step of the difference that a gradient may be: `difference_step`, as a share of the box.
 
-    The step is found at one line by trying many, and has to hold at others, as a share of the box or in the
+    The step is found at one component by trying many, and has to hold at others, as a share of the box or in the
     parameters' own units.
     """
     lines, width = axes.ladder.lines, probe.width
-    for row in rows[:2]:
+    slopes = [
+        _AxisSlope(probe, lines.u[row], axis := int(axes.axis[row]), float(lines.grad[row, axis])) for row in rows
+    ]
+    for one in slopes[:FIRST_TRIED]:
+        others = [other for other in slopes if other is not one][:OTHERS]
         for side in (0, 1, 2):
-            step = _matching_step(probe, axes, row, side)
-            if step is None:
-                continue
-            others = [one for one in rows if one != row][:6]
-            for scale in (torch.ones_like(width), width[axes.axis[row]] / width):
-                errors = []
-                for other in others:
-                    own = step * float(scale[axes.axis[other]])
-                    value = _difference(probe, lines.u[other], lines.direction[other], own, side)
-                    exact = float(lines.slope[other])
-                    errors.append(abs(value - exact) <= SAME_DIFFERENCE * max(abs(exact), abs(value)))
-                if errors and np.mean(errors) >= 0.8:
-                    return {"difference_step": step, "one_sided": float(side > 0)}
+            for step in one.matching_steps(side):
+                for own in (torch.ones_like(width), width[one.axis] / width):
+                    held = [other.agrees(step * float(own[other.axis]), side) for other in others]
+                    if held and np.mean(held) >= HELD:
+                        return {"difference_step": step, "one_sided": float(side > 0)}
     return {}
-
-
-def _difference(probe: Probe, u: Tensor, direction: Tensor, step: float, side: int) -> float:
-    """Return a central difference, or with `side` 1 and 2 one ahead and one behind."""
-    ahead, here, behind = probe.loss(torch.stack([u + step * direction, u, u - step * direction])).tolist()
-    return float([(ahead - behind) / (2 * step), (ahead - here) / step, (here - behind) / step][side])
-
-
-def _matching_step(probe: Probe, axes: AxisLines, row: int, side: int) -> float | None:
-    """Return the step over which the difference is what the gradient says, if there is one."""
-    lines, exact = axes.ladder.lines, float(axes.ladder.lines.slope[row])
-    steps = np.geomspace(1e-4, 0.3, TRIED)
-    gaps = np.array([_difference(probe, lines.u[row], lines.direction[row], step, side) - exact for step in steps])
-    changes = np.flatnonzero(np.isfinite(gaps[:-1]) & np.isfinite(gaps[1:]) & (gaps[:-1] * gaps[1:] <= 0))
-    if not len(changes):
-        return None
-    low, high = float(steps[changes[0]]), float(steps[changes[0] + 1])
-    start = gaps[changes[0]]
-    for _ in range(TRIED):
-        middle = (low + high) / 2
-        gap = _difference(probe, lines.u[row], lines.direction[row], middle, side) - exact
-        low, high = (middle, high) if gap * start > 0 else (low, middle)
-    return (low + high) / 2
 
 
 def roughness(probe: Probe, u: Float[Tensor, "point dim"]) -> Evidence:
     """Return by how much gradients of points that are next to each other differ: `rough`, relative to their length."""
-    near = (u + 1e-9 * torch.where(u > 0.5, -1.0, 1.0)).clamp(0, 1)
+    apart = NEAR[probe.eps == EPS["float32"]]
+    near = (u + apart * torch.where(u > 0.5, -1.0, 1.0)).clamp(0, 1)
     here, there = (probe.gradient(one).grad for one in (u, near))
     if here is None or there is None:
         return {}

@@ -32,7 +32,8 @@ MOST_TIMES = 3  # as many points are drawn where some cannot be judged
 FEW_WRONG = 4  # points, of which more are drawn to see where they are
 INNER_GRADIENTS = 250  # of the smoothed gradient, and around places
 AXIS_POINTS = 6  # at which all axes are walked where gradients are wrong
-ALL_AXES = 40  # parameters, at most, of which all are walked there
+ALL_AXES = 40  # parameters, at most, of which all are walked there,
+MANY_AXES, FEW_POINTS = 200, 2  # and of so many at fewer points
 
 
 def points_for(power: float) -> int:
@@ -233,7 +234,9 @@ def _walk_at_wrong(result: Examination, points: Sequence[int]) -> None:
     dim = result.u.shape[1]
     generator = torch.Generator().manual_seed(result.seed)
     axes = torch.arange(dim)
-    if dim > ALL_AXES:
+    if ALL_AXES < dim <= MANY_AXES and result.blamed is None:
+        points = points[:FEW_POINTS]
+    elif dim > ALL_AXES:
         blamed = sorted(result.blamed or [])
         axes = torch.tensor(blamed[:ALL_AXES]) if blamed else torch.randperm(dim, generator=generator)[:ALL_AXES]
     rows = torch.tensor(list(points)).repeat_interleave(len(axes))

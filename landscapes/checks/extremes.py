@@ -14,9 +14,7 @@ from torch import Tensor
 
 from ..objective import Evaluation, Objective, Status, failed
 from ..space import ParameterSpace
-from .finding import FAIL, WARN, Finding, refused, skip, verdict
-from .places import have_infinite_slopes
-from .probe import Probe
+from .finding import FAIL, Finding, refused, skip, verdict
 from .subject import Subject, difference
 
 CORNERS = 16  # a box of no more corners is checked at all of them
@@ -124,14 +122,7 @@ def _check_inside(objective: Objective, x: Float[Tensor, "batch dim"], what: str
     found = objective.evaluate(x)
     judged = _judge(found, what)
     missing = describe_missing(objective.space, x, found, "" if len(x) > 1 else "the centre")
-    if not missing:
-        return judged
-    infinite = have_infinite_slopes(
-        Probe(objective, objective.precision), objective.space.to_unit(x[found.status == Status.NO_GRADIENT])
-    )
-    if bool(infinite.all()):
-        return replace(judged, outcome=WARN, why=f"{missing}; the loss's own slope is infinite there")
-    return replace(judged, outcome=FAIL, why=missing)
+    return replace(judged, outcome=FAIL, why=missing) if missing else judged
 
 
 def _check_beyond(objective: Objective, x: Float[Tensor, "batch dim"]) -> Finding:

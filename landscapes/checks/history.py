@@ -11,6 +11,7 @@ from torch import Tensor
 
 from ..objective import Evaluation, Objective, evaluate
 
+REPEATS = 6  # calls at one point, whose losses drift where a call counts
 ROWS = 4  # points of the batch that is compared with single rows
 ALIKE = 1e-3  # relative difference of gradients that are the same
 SAME = 1e-9  # relative difference of losses that are the same
@@ -21,8 +22,10 @@ class History:
     """Say how evaluations depend on what was evaluated before, and with what.
 
     `loss` and `gradient` are relative differences between two calls at one point; `random` says that these cannot be
-    reproduced by the same calls. `stale` says that a call returns the gradient of the one before, `grows` that
-    gradients add up from call to call, and `batch` is a gradient alone over that within a batch of `ROWS`.
+    reproduced by the same calls, and do not drift. `stale` says that a call returns the gradient of the one before,
+    `grows` that gradients add up from call to call. `batch` is a gradient alone over that within a batch of `ROWS`,
+    and `alike` says that all gradients of a batch are the same, though alone they are not. `leak` is the relative
+    difference of the losses of a row alone and in a batch.
     """
 
     loss: float
@@ -31,6 +34,8 @@ class History:
     stale: bool
     grows: bool
     batch: float
+    alike: bool
+    leak: float
 
 
 def observe(objective: Objective, x: Float[Tensor, "batch dim"]) -> History:
@@ -44,14 +49,29 @@ def observe(objective: Objective, x: Float[Tensor, "batch dim"]) -> History:
     again = _apart(after.loss, after_again.loss), _apart(repeated.loss, repeated_again.loss)
     moved = max(losses)
     batch = evaluate(objective, x[:ROWS], grad=True)
+    drifts = moved > SAME and _drifts([float(evaluate(objective, a, grad=False).loss) for _ in range(REPEATS)])
     return History(
         loss=moved,
         gradient=max(_gap(after, repeated), _gap(first, repeated)),
-        random=moved > SAME and max(again) > moved / 10,
+        random=moved > SAME and max(again) > moved / 10 and not drifts,
         stale=_gap(other, repeated) < ALIKE < _gap(after, repeated),
         grows=_grows(after, repeated, after_again, repeated_again),
         batch=_ratio(repeated, batch),
+        leak=_apart(repeated.loss, batch.loss[:1]),
+        alike=_is_alike(batch) and _gap(repeated, other) > ALIKE,
     )
+
+
+def _drifts(losses: list[float]) -> bool:
+    """Say whether losses of the same call go one way, or come nearer to something: chance does neither for so long."""
+    steps = [late - early for early, late in pairwise(losses)]
+    return all(step > 0 for step in steps) or all(step < 0 for step in steps)
+
+
+def _is_alike(batch: Evaluation) -> bool:
+    if batch.grad is None or len(batch.loss) < ROWS or not bool(batch.has_gradient.all()):
+        return False
+    return bool(batch.grad.any()) and _apart(batch.grad, batch.grad[:1].expand_as(batch.grad)) < SAME
 
 
 def _apart(one: Tensor, other: Tensor) -> float:

@@ -13,7 +13,7 @@ from ..objective import Evaluation
 from .probe import Lines, Probe
 from .slopes import BAD, UNJUDGED, Judgement, Kind, Ladder, measure
 
-STEPS = (1e-8, 1e-6, 1e-4, 1e-3, 1e-2)
+STEPS = (1e-8, 1e-6, 1e-4, 1e-3, 1e-2, 1e-1)
 RATIO_STEP = 1e-2  # of the box: the step of the slopes that the table compares gradients with
 AXIS_LINES = 80  # along axes, at most
 AXES_AT_MOST = 40  # parameters of which every one is walked along

@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
-from ..objective import Evaluation, Objective
+from ..objective import Objective
 from .probe import Lines, Probe
 from .slopes import Judgement, Kind, Ladder, measure
 
 STEPS = (1e-8, 1e-6, 1e-5, 1e-4, 1e-3)
 AXES = 4  # at each place, drawn from all
-AXES_TRIED = 16  # along which an infinite slope is looked for
 NEARBY, NEAR = 8, 1e-6  # gradients around a place, and how far from it, whose range holds that at a kink
 KINKED = 0.01  # of the largest component is what gradients around a kink differ by at least
-GROWING = 1.5  # times a slope is that over a tenth of the step at least, where it grows without bounds
-CLEAR = 100  # times rounding is what a change is, to be seen
 INSIDE = 1e-9  # of the box: how far inside a bound a zero lies
 
 
@@ -71,29 +68,8 @@ def measure_places(probe: Probe, seed: int) -> tuple[tuple[str, ...], Ladder]:
     for row in wrong:
         if _is_within_neighbours(probe, lines, row):
             judged[row] = Judgement(Kind.KINK, judged[row].exact)
-    infinite = _infinite_points(probe, ladder)
-    for row, one in enumerate(judged):
-        if one.kind == Kind.NAN and int(point[row]) in infinite:
-            judged[row] = Judgement(Kind.STEEP, one.exact)
     names = tuple(list(found)[one] for one in point.tolist())
     return names, Ladder(ladder.lines, ladder.steps, ladder.walked, tuple(judged))
-
-
-def have_infinite_slopes(probe: Probe, u: Float[Tensor, "place dim"]) -> Bool[Tensor, " place"]:
-    """Say at which places the loss's own slope is infinite, along some axis: no gradient there is finite."""
-    dim, count = u.shape[1], min(AXES_TRIED, u.shape[1])
-    point, axes = torch.arange(len(u)).repeat_interleave(count), torch.arange(count).repeat(len(u))
-    direction = torch.eye(dim, dtype=torch.float64)[axes]
-    nothing = Evaluation.from_results(probe.loss(u), torch.full_like(u, torch.nan))
-    lines = Lines.through(probe, u, direction, point, nothing)
-    ladder = Ladder(lines, STEPS, lines.walk(probe, list(STEPS)), ())
-    found = torch.zeros(len(u), dtype=torch.bool)
-    found[sorted(_infinite_points(probe, ladder))] = True
-    return found
-
-
-def _infinite_points(probe: Probe, ladder: Ladder) -> set[int]:
-    return {int(ladder.lines.point[row]) for row in range(len(ladder.lines)) if _is_infinite(probe, ladder, row)}
 
 
 def _is_within_neighbours(probe: Probe, lines: Lines, row: int) -> bool:
@@ -113,18 +89,6 @@ def _is_within_neighbours(probe: Probe, lines: Lines, row: int) -> bool:
     room, exact = KINKED * float(grads.abs().max()), float(lines.slope[row])
     varies = float((grads.amax(dim=0) - grads.amin(dim=0)).max()) > room
     return varies and min(0.0, float(grads.min())) - room <= exact <= max(0.0, float(grads.max())) + room
-
-
-def _is_infinite(probe: Probe, ladder: Ladder, row: int) -> bool:
-    """Say whether the loss's own slope grows without bounds towards a place, as that of a square root at 0."""
-    loss = ladder.lines.loss[row]
-    change = torch.fmax(*(ladder.walked[:, :, row] - loss).abs())
-    known = change.isfinite()
-    change, steps = change[known], torch.tensor(ladder.steps, dtype=torch.float64)[known]
-    if len(change) < 3 or float(change[0]) <= CLEAR * probe.eps * abs(float(loss)):
-        return False
-    slopes = change / steps
-    return bool((slopes[:-1] > GROWING * slopes[1:]).all())
 
 
 def describe(name: str, one: Judgement, parameter: str, loss: float) -> str:

@@ -18,15 +18,18 @@ from ..sampling.memory import ADVICE, is_out_of_memory
 from . import examination, extremes, growth
 from . import parameters as by_parameter
 from .causes import causes
-from .conclude import Calls, conclude
+from .conclude import Calls, Further, conclude, conclude_jumps, conclude_memory, conclude_physics
 from .diagnosis import Diagnosis
 from .examination import Examination, examine, percent
 from .extremes import ExtremeCase
 from .finding import FAIL, PASS, SKIP, UNEXPECTED, WARN, Finding, one_line, skip, verdict, within
 from .history import observe
+from .horizons import FirstWrong, first_wrong_step
+from .memory import memory_growth
+from .physics import compare_time_steps
 from .places import describe
-from .probe import Probe
-from .slopes import BAD, UNJUDGED, Kind, counts
+from .probe import Lines, Probe
+from .slopes import BAD, UNJUDGED, Kind, counts, measure
 from .subject import Subject, difference
 from .usefulness import Usefulness, usefulness
 
@@ -34,6 +37,8 @@ REPEATS = 3
 PROMISE_POINTS = 8  # at which batches, repeats and refusals are checked
 POWER = 0.05  # share of the box
 CANNOT_TELL = 0.1  # of the points is what has to be judged, to say anything
+LATE_POINTS = 2  # at which episodes of other lengths are judged
+MEMORY_SECONDS = 0.5  # that evaluations may take to see whether memory grows
 SAID_PLACES, MANY = 3, 6  # places and parameters that are named, at most
 OPTIMISER_STEP = 1e-2  # of the box: what a step of a search is long
 SIGNS = 0.75  # share of slopes whose sign has to agree over it
@@ -59,7 +64,8 @@ class Settings:
     is what the objective computes in; `twin` makes it in the other precision: gradients are judged in float64 where
     there is one. `variants` are further ways to push it. `horizons` make it with episodes so many times as long, in
     float64 where there is a twin; `other_mode` makes it with gradients by the other mode of automatic differentiation,
-    forward or reverse; `finer` makes it with shorter time steps, by factor. `expected` holds the checks that are known
+    forward or reverse; `finer` makes it with shorter time steps, by factor, and `make_length` with episodes of one of
+    the `lengths`. `expected` holds the checks that are known
     to fail, with the reason: such a failure is excused, and a pass is not. `follow` is called with the name of each
     check before it runs.
     """
@@ -72,6 +78,8 @@ class Settings:
     horizons: Mapping[float, Callable[[], Objective]] = dataclasses.field(default_factory=dict)
     other_mode: Callable[[], Objective] | None = None
     finer: Mapping[float, Callable[[], Objective]] = dataclasses.field(default_factory=dict)
+    lengths: Sequence[float] = ()
+    make_length: Callable[[float], Objective] | None = None
     expected: Mapping[str, str] = dataclasses.field(default_factory=dict)
     follow: Callable[[str], None] = lambda name: None
 
@@ -136,7 +144,7 @@ def _other(subject: Subject, twin: Callable[[], Objective] | None) -> Callable[[
 def _checks(subject: Subject, how: Settings, results: Results) -> Iterator[tuple[str, Callable[[], Finding]]]:
     other = _other(subject, how.twin)
     for name, run in PROMISES.items():
-        yield name, partial(run, subject)
+        yield name, partial(_keep_promise, name, run, subject, results)
     yield "order of calls", partial(_check_calls, subject, results)
     exact = other if subject.precision == "float32" else None
     best = exact or (lambda: subject)
@@ -144,10 +152,20 @@ def _checks(subject: Subject, how: Settings, results: Results) -> Iterator[tuple
     yield "special places", partial(_check_places, results)
     yield "parameters", partial(_check_parameters, results)
     yield "usefulness", partial(_check_usefulness, results)
+    yield "shorter time steps", partial(_check_time_steps, how, results)
+    yield "memory", partial(_check_memory, subject, results)
     yield "second backward", lambda: _check_second_backward(subject, results)
     yield "forward against reverse", lambda: _check_modes(subject, how.other_mode)
     yield "growth over horizons", lambda: growth.check_growth(best(), how.horizons)
     yield from extremes.checks(subject, other, how.variants)
+
+
+def _keep_promise(name: str, run: Callable[[Subject], Finding], subject: Subject, results: Results) -> Finding:
+    """Make a check of calls, and keep what it says of causes."""
+    found = run(subject)
+    if found.outcome == FAIL:
+        results.calls = replace(results.calls, broken=(*results.calls.broken, name))
+    return found
 
 
 def _check_calls(subject: Subject, results: Results) -> Finding:
@@ -169,7 +187,7 @@ def _check_gradient(subject: Subject, how: Settings, results: Results) -> Findin
     seen = results.examination = examine(probe, how.power, how.seed, how.follow)
     if seen.found.grad is None:
         return skip("no gradient")
-    results.diagnoses = conclude(seen, results.calls, _origin_of(subject.objective, seen))
+    results.diagnoses = conclude(seen, results.calls, _further(subject.objective, seen, how))
     return _judge_gradient(seen, results)
 
 
@@ -196,17 +214,65 @@ def _judge_gradient(seen: Examination, results: Results) -> Finding:
     return Finding("", PASS, figure, "", numbers, seen.table())
 
 
-def _origin_of(objective: Objective, seen: Examination) -> Callable[[int], str]:
-    """Return what says where the first NaN begins: at a random point, or at a place, numbered from -1 down."""
+def _further(objective: Objective, seen: Examination, how: Settings) -> Further:
+    """Return what can be asked about points whose gradient is NaN or wrong."""
 
-    def origin(row: int) -> str:
+    def point(row: int) -> Float[Tensor, " dim"]:
         u = seen.u[row] if row >= 0 else seen.places[1].lines.u[-1 - row]
-        try:
-            return objective.nan_origin(objective.space.from_unit(u[None])[0])
-        except Exception:  # it is worth a word, and no error
-            return ""
+        return objective.space.from_unit(u[None])[0]
 
-    return origin
+    def first_wrong(rows: Sequence[int]) -> FirstWrong | None:
+        if how.make_length is None or not rows:
+            return None
+        return first_wrong_step(how.make_length, how.lengths, partial(_is_wrong, seen, list(rows)[:LATE_POINTS]))
+
+    return Further(
+        lambda row: _quietly(objective.nan_origin, point(row)),
+        lambda row: _quietly(objective.wrong_origin, point(row)),
+        first_wrong,
+    )
+
+
+def _quietly(ask: Callable[[Tensor], str], x: Float[Tensor, " dim"]) -> str:
+    """Return an answer that is worth a word, and no error."""
+    try:
+        return ask(x)
+    except Exception:
+        return ""
+
+
+def _is_wrong(seen: Examination, rows: Sequence[int], objective: Objective) -> bool:
+    """Say whether gradients at some of the points are wrong for another objective, such as one of shorter episodes."""
+    probe, chosen = Probe(objective, objective.precision), torch.tensor(rows)
+    lines = seen.random.lines.rows(chosen)
+    found = probe.gradient(lines.u)
+    ladder = measure(probe, Lines.through(probe, lines.u, lines.direction, torch.arange(len(rows)), found))
+    return any(one.kind in BAD for one in ladder.judged)
+
+
+def _check_time_steps(how: Settings, results: Results) -> Finding:
+    """Compare gradients of shorter time steps with differences at the shortest."""
+    seen = results.examination
+    if not how.finer or seen is None or seen.found.grad is None:
+        return skip("n/a", "it has no time step")
+    evidence = compare_time_steps(seen, how.finer)
+    if not evidence:
+        return skip(
+            "not compared", "slopes are not the same over a hundredth of the box and three, or steps are refused"
+        )
+    found = conclude_physics(evidence)
+    results.diagnoses += found
+    figure = f"gradients {percent(evidence['physics'])} off differences at a quarter of the step (median)"
+    return Finding("", WARN if found else PASS, figure, "; ".join(one.what for one in found), evidence)
+
+
+def _check_memory(subject: Subject, results: Results) -> Finding:
+    """Say whether memory grows with every evaluation."""
+    growth = memory_growth(subject.objective, subject.x[:2], seconds=MEMORY_SECONDS)
+    found = conclude_memory(growth)
+    results.diagnoses += found
+    figure = f"{growth.total / 1e6:.1f} MB more after {growth.evaluations} evaluations"
+    return Finding("", WARN if found else PASS, figure, found[0].what if found else "")
 
 
 def _check_places(results: Results) -> Finding:
@@ -251,6 +317,8 @@ def _check_usefulness(results: Results) -> Finding:
     if seen is None or seen.found.grad is None:
         return skip("no gradient")
     results.usefulness = usefulness(seen.probe, seen.random)
+    if not any(one.outcome == FAIL for one in results.diagnoses):
+        results.diagnoses += conclude_jumps(results.usefulness)
     at = next((one for one in results.usefulness if one.step == OPTIMISER_STEP), None)
     if at is None or at.compared < LEAST_SHARE * len(seen.u):
         return skip("no slope to compare", "all are flat, lost in noise, or failed")
@@ -260,7 +328,13 @@ def _check_usefulness(results: Results) -> Finding:
         f"{percent(at.sign.high)}), median relative error {at.error:.2g}"
     )
     why = f"slopes do not hold that far: wanted are sign right {SIGNS:.0%} and an error of {USEFUL:g} for a search"
-    numbers = {"step": at.step, "sign": at.sign.value, "error": at.error, "cosine": at.cosine.value, "bias": at.bias}
+    numbers = {
+        "step": at.step,
+        "sign": at.sign.value,
+        "error": at.error,
+        "cosine": at.cosine.value,
+        "bias": at.bias.value,
+    }
     return Finding("", PASS if useful else WARN, figure, "" if useful else why, numbers)
 
 

@@ -17,6 +17,8 @@ OPTIMISER_STEPS = {"gradient descent": 1e-2, "Adam": 3e-2, "CMA-ES": 0.2}  # of 
 SMOOTHED = (1e-3, 1e-2, 1e-1)  # widths that the loss is smoothed over, as shares of the box
 SMOOTHED_LINES = 24  # at which the smoothed gradient is computed
 INNER = 3  # gradients along each
+MEANS = 8  # from which something is said
+UNKNOWN = Estimate(np.nan, np.nan, np.nan)
 RESAMPLED = 200
 CONFIDENT = (0.025, 0.975)
 CLEAR = 10  # times the noise is what a change is, to have a sign
@@ -27,9 +29,9 @@ class Usefulness:
     """What a gradient says of the loss over one step, a share of the box.
 
     `sign` is the share of slopes whose sign is right, `cosine` that of all slopes with differences over the step,
-    `error` the median relative error, `compared` how many changes were clear of the noise. `bias` is what the mean of
-    gradients within the width lacks of the slope of the smoothed loss, as a share of the latter; NaN where it was not
-    computed. The first has no part of what jumps add to the loss, the second has.
+    `error` the median relative error, `compared` how many changes were clear of the noise. `bias` is the share of the
+    slope of the smoothed loss that the mean of gradients within the width lacks, NaN where it was not computed: a mean
+    of gradients has no part of what jumps add to the loss.
     """
 
     step: float
@@ -37,7 +39,7 @@ class Usefulness:
     sign: Estimate
     cosine: Estimate
     error: float
-    bias: float
+    bias: Estimate
 
 
 def usefulness(probe: Probe, ladder: Ladder) -> tuple[Usefulness, ...]:
@@ -66,7 +68,7 @@ def _at(
     seen: NDArray[np.bool_],
 ) -> Usefulness:
     a, d = exact[seen], slope[seen]
-    bias = _bias(probe, lines, step, slope, seen) if step in SMOOTHED else np.nan
+    bias = _bias(probe, lines, step, slope, seen) if step in SMOOTHED else UNKNOWN
     with np.errstate(invalid="ignore", divide="ignore"):
         error = np.abs(a - d) / np.maximum(np.abs(a), np.abs(d))
     right = share(int((np.sign(a) == np.sign(d)).sum()), len(a))
@@ -77,7 +79,7 @@ def _at(
 def _cosine(a: NDArray[np.float64], d: NDArray[np.float64]) -> Estimate:
     """Return the cosine of gradients' slopes with differences over all lines, with its interval by resampling lines."""
     if len(a) < 2 or not (a.any() and d.any()):
-        return Estimate(np.nan, np.nan, np.nan)
+        return UNKNOWN
     drawn = np.random.default_rng(0).integers(len(a), size=(RESAMPLED, len(a)))
     values = [_cosine_of(a[rows], d[rows]) for rows in (np.arange(len(a)), *drawn)]
     low, high = np.nanquantile(values, CONFIDENT)
@@ -89,13 +91,11 @@ def _cosine_of(a: NDArray[np.float64], d: NDArray[np.float64]) -> float:
     return float(a @ d) / size if size > 0 else np.nan
 
 
-def _bias(
-    probe: Probe, lines: Lines, step: float, slope: NDArray[np.float64], seen: NDArray[np.bool_]
-) -> float:  # fmt: skip
-    """Compare the mean of gradients along a line with the slope of the loss over all of it."""
+def _bias(probe: Probe, lines: Lines, step: float, slope: NDArray[np.float64], seen: NDArray[np.bool_]) -> Estimate:
+    """Compare the mean of gradients along each line with the slope of the loss over all of it."""
     rows = torch.from_numpy(np.flatnonzero(seen)[:SMOOTHED_LINES])
     if not len(rows):
-        return float("nan")
+        return UNKNOWN
     generator = torch.Generator().manual_seed(len(rows))
     at = (torch.rand(INNER, len(rows), generator=generator, dtype=torch.float64) + torch.arange(INNER)[:, None]) / INNER
     ahead, behind = (lines.u[rows] + side * step * lines.direction[rows] for side in (1, -1))
@@ -104,9 +104,23 @@ def _bias(
     points = lines.u[rows] + offset[..., None] * lines.direction[rows]
     found = probe.gradient(points.reshape(-1, points.shape[-1]).clamp(0, 1))
     if found.grad is None:
-        return float("nan")
+        return UNKNOWN
     slopes = (found.grad * probe.width).reshape(points.shape)
-    mean = (slopes * lines.direction[rows]).sum(dim=2).nanmean(dim=0).numpy()
+    mean = (slopes * lines.direction[rows]).sum(dim=2).mean(dim=0).numpy()
     wanted = slope[rows.numpy()]
-    scale = float(np.nanmean(np.abs(wanted)))
-    return float(np.nanmean(np.abs(mean - wanted))) / scale if scale > 0 else float("nan")
+    return _lacking(mean, wanted)
+
+
+def _lacking(mean: NDArray[np.float64], wanted: NDArray[np.float64]) -> Estimate:
+    """Return the share of the slopes that is wanted and that means of gradients lack, with its interval."""
+    known = np.isfinite(mean) & np.isfinite(wanted)
+    mean, wanted = mean[known], wanted[known]
+    if len(mean) < MEANS or not wanted.any():
+        return UNKNOWN
+    drawn = np.random.default_rng(0).integers(len(mean), size=(RESAMPLED, len(mean)))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        values = [
+            1 - (mean[rows] @ wanted[rows]) / (wanted[rows] @ wanted[rows]) for rows in (np.arange(len(mean)), *drawn)
+        ]
+    low, high = np.nanquantile(values, CONFIDENT)
+    return Estimate(float(values[0]), float(low), float(high))

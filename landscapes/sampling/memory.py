@@ -69,7 +69,7 @@ class MemoryBound(ObjectiveWrapper):
 
 def free_memory() -> None:
     """Collect garbage and empty the cache of GPU memory."""
-    gc.collect()  # some, such as a solver and its launches, refer to each other
+    gc.collect()  # an error that has been raised and what it tells of may refer to each other
     torch.cuda.empty_cache()
 
 

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.2.0"
 
 if TYPE_CHECKING:
+    from . import testing
     from .api.compare import compare
     from .api.environments import list_envs
     from .api.export import export
@@ -58,12 +59,15 @@ _HOMES = {
     "optim.race": ("Race",),
     "optim.runs.run": ("Run",),
 }
+_MODULES = ("testing",)
 _FORMER = {"tradeoff": "study('fidelity', ...)", "extremes": "study('extremes', ...)"}
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 __all__ = sorted([*_HOME_OF, "__version__"])
 
 
 def __getattr__(name: str) -> Any:
+    if name in _MODULES:
+        return import_module(f".{name}", __name__)
     if name in _FORMER:
         raise AttributeError(f"gradscape.{name} is gradscape.{_FORMER[name]} today")
     if name not in _HOME_OF:
@@ -72,4 +76,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return __all__
+    return [*__all__, *_MODULES]

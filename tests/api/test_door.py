@@ -36,11 +36,18 @@ def test_a_type_checker_sees_what_is_imported_when_used() -> None:
     seen = {
         name.asname or name.name: str(node.module)
         for node in block.body
-        if isinstance(node, ast.ImportFrom)
+        if isinstance(node, ast.ImportFrom) and node.module
         for name in node.names
     }
     assert seen == gradscape._HOME_OF
     assert sorted(gradscape.__all__) == sorted([*seen, "__version__"])
+
+
+def test_what_tests_assert_is_a_module_that_is_imported_when_used() -> None:
+    program = "import sys, gradscape as gs; print('torch' in sys.modules); print(gs.testing.assert_gradients.__name__)"
+    said = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert said.stdout.split() == ["False", "assert_gradients"]
+    assert "testing" in dir(gradscape)
 
 
 def test_an_unknown_name_is_refused_with_those_there_are() -> None:

@@ -16,7 +16,7 @@ from importlib import resources
 from ..diagnosis import Certainty
 from ..finding import FAIL, WARN
 
-WARNED = ("zero", "steep", "noise", "physics", "memory")  # kinds of findings that are no wrong gradients
+WARNED = ("zero", "steep", "noise", "jumps", "physics", "memory")  # kinds of findings that are no wrong gradients
 Intervals = list[list[float]]
 
 

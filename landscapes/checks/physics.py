@@ -1,0 +1,71 @@
+"""Gradients that are right for the program and wrong for the physics: they change with the time step, slopes do not."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ..objective import Objective
+from .evidence import Evidence
+from .examination import Examination
+from .probe import Lines, Probe
+from .slopes import Kind
+
+LINES = 12  # along which time steps are compared, at most
+FEWEST_LINES = 5
+STEPS = (1e-2, 3e-2)  # of the box: slopes of the motion itself, which single steps of time do not change
+STABLE = 0.2  # relative difference of slopes over both, where the motion has one
+
+
+def compare_time_steps(seen: Examination, finer: Mapping[float, Callable[[], Objective]]) -> Evidence:
+    """Hold gradients at the time step, half and a quarter of it against differences at the finest.
+
+    Returns `physics`, the median relative difference of gradients and these slopes; the same of gradients at the other
+    steps, as `at_2` and `at_4`; and `ratio`, the median of gradients over slopes. Empty where slopes are not the same
+    over a hundredth of the box and three, where time steps are refused, or where too few lines are left.
+    """
+    rows = [row for row, one in enumerate(seen.random.judged) if one.kind in (Kind.AGREES, Kind.KINK)][:LINES]
+    if len(rows) < FEWEST_LINES or not finer:
+        return {}
+    lines = seen.random.lines.rows(torch.tensor(rows))
+    slopes: dict[float, NDArray[np.float64]] = {1.0: lines.slope.numpy()}
+    with suppress(ValueError):  # a time step is refused
+        for factor, make in sorted(finer.items()):
+            probe = Probe(made := make(), made.precision)
+            found = probe.gradient(lines.u)
+            along = Lines.through(probe, lines.u, lines.direction, torch.arange(len(rows)), found)
+            slopes[factor] = along.slope.numpy()
+        near, far = _differences(probe, along)
+        return _compare(slopes, near, far)
+    return {}
+
+
+def _differences(probe: Probe, lines: Lines) -> list[NDArray[np.float64]]:
+    """Return differences over both steps, one-sided where the box ends."""
+    ahead, behind = lines.walk(probe, list(STEPS))
+    steps = torch.tensor(STEPS, dtype=torch.float64)[:, None]
+    front, back = (ahead - lines.loss) / steps, (lines.loss - behind) / steps
+    both = torch.where((front + back).isfinite(), (front + back) / 2, torch.where(front.isfinite(), front, back))
+    return list(both.numpy())
+
+
+def _compare(
+    slopes: Mapping[float, NDArray[np.float64]], near: NDArray[np.float64], far: NDArray[np.float64]
+) -> Evidence:
+    with np.errstate(invalid="ignore", divide="ignore"):
+        stable = np.abs(near - far) <= STABLE * np.maximum(np.abs(near), np.abs(far))
+        known = stable & (near != 0) & np.all([np.isfinite(one) for one in slopes.values()], axis=0)
+        if known.sum() < FEWEST_LINES:
+            return {}
+        off = {factor: _off(one[known], near[known]) for factor, one in slopes.items()}
+        ratio = float(np.median(slopes[1.0][known] / near[known]))
+    found = {f"at_{factor:g}": value for factor, value in off.items() if factor != 1}
+    return {"physics": off[1.0], "ratio": ratio, "lines": float(known.sum()), **found}
+
+
+def _off(slope: NDArray[np.float64], wanted: NDArray[np.float64]) -> float:
+    return float(np.median(np.abs(slope - wanted) / np.maximum(np.abs(slope), np.abs(wanted))))
