@@ -18,7 +18,7 @@ from .history import ROWS, SAME, History
 from .horizons import FirstWrong
 from .memory import MemoryGrowth
 from .probe import EPS
-from .slopes import TOLERANCE, UNJUDGED, Kind
+from .slopes import TOLERANCE, UNJUDGED, Judgement, Kind
 from .usefulness import Usefulness
 
 OVERWRITES = "writes to what it has read"  # how a simulator says so
@@ -51,6 +51,7 @@ class Calls:
                 "grows": one.grows,
                 "batch": one.batch,
                 "alike": one.alike,
+                "gradient_leak": one.gradient_leak if one.gradient_leak > 10 * one.gradient else 0.0,
                 "rows": ROWS,
                 "loss_moves": one.loss,
                 "gradient_moves": one.gradient,
@@ -119,9 +120,10 @@ def _of_calls(seen: Examination, calls: Calls) -> Iterator[Diagnosis]:
     evidence = calls.evidence()
     how = "they add up from call to call" if evidence.get("grows") else "a call returns the gradient of the one before"
     short = f"{evidence.get('batch', 1.0):.3g} times shorter"
+    what = "the loss" if evidence.get("leaks") else "the gradient"
     how_batch = "all rows have the same" if evidence.get("alike") else short
     if (known := recognise("calls", evidence)) is not None:
-        yield _make(*known, evidence, {"how": how, "how_batch": how_batch})
+        yield _make(*known, evidence, {"how": how, "how_batch": how_batch, "what": what})
 
 
 def _of_grain(seen: Examination, calls: Calls) -> Iterator[Diagnosis]:
@@ -132,7 +134,7 @@ def _of_grain(seen: Examination, calls: Calls) -> Iterator[Diagnosis]:
     zero = float((grad[seen.found.has_gradient] == 0).all(dim=1).double().mean()) if grad is not None else 0.0
     evidence = {
         "grain": probe.grain,
-        "levels": float(loss.max() - loss.min()) / probe.grain,
+        "levels": float(loss.max() - loss.min()) / max(probe.grain, probe.eps / 2 * float(loss.abs().median())),
         "zero_gradients": zero if math.isfinite(zero) else 0.0,
         "limit": _limit(seen),
         **(numbers_of.roughness(probe, seen.u[:16]) if seen.rows(Kind.WRONG) else {}),
@@ -197,6 +199,8 @@ def _of_wrong(seen: Examination, calls: Calls, further: Further) -> Iterator[Dia
         else f"it is {evidence.get('ratio', 1):.4g} times the slope",
         "moved_text": percent(evidence.get("moved", 0.0)),
     }
+    if not names and evidence.get("zero", 0.0) == 1:
+        names = tuple(row.parameter for row in seen.parameters() if row.zero == 1)
     if (known := recognise("wrong", evidence)) is not None:
         found = _make(*known, evidence, texts, names, region)
     else:
@@ -249,7 +253,7 @@ def _wrong_numbers(seen: Examination) -> Evidence:
     return found | ({"noise_ratio": float(np.median(noise))} if noise else {})
 
 
-def _lines(seen: Examination) -> list[tuple[int, object]]:
+def _lines(seen: Examination) -> list[tuple[int, Judgement]]:
     return [(row, one) for row, one in enumerate(seen.random.judged) if math.isfinite(one.noise)]
 
 

@@ -23,6 +23,7 @@ NEAR = (1e-9, 1e-4)  # of the box: how far apart points are that gradients are c
 NO_SLOPE = (Kind.FLAT, Kind.ZERO)  # lines whose slope is 0
 TRIED = 32  # steps that are tried for the difference which a gradient may be
 STEPS_TRIED = (1e-4, 0.3)  # of the box,
+COMMON_STEPS = (0.2, 0.1, 0.05, 0.02, 0.01, 5e-3, 2e-3, 1e-3, 1e-4)
 CROSSINGS = 4  # of which so many, at most, that fit are tried at other components
 FIRST_TRIED, OTHERS, HELD = 3, 6, 0.8  # components that it is found at, and others, of which a share has to agree
 SAME_DIFFERENCE = 1e-3  # relative error of a difference that a gradient is
@@ -211,20 +212,26 @@ class _AxisSlope:
         known = [one for one in values if np.isfinite(one)][:1]
         return any(abs(one - self.exact) <= SAME_DIFFERENCE * max(abs(self.exact), abs(one)) for one in known)
 
-    def matching_steps(self, side: int) -> list[float]:
-        """Return steps over which the difference is what the component says."""
+    def matching_steps(self, side: int, width: float) -> list[float]:
+        """Return steps over which the difference is what the component says; `width` is the parameter's range.
+
+        Those that people take come first, as shares of the box and in the parameter's unit: of a loss that oscillates
+        many others fit by chance.
+        """
+        common = [step for one in COMMON_STEPS for step in (one, one / width) if step <= STEPS_TRIED[1]]
         steps = np.geomspace(*STEPS_TRIED, TRIED)
         gaps = np.array([self.difference(step, side) - self.exact for step in steps])
         with np.errstate(invalid="ignore"):
             changes = np.flatnonzero(gaps[:-1] * gaps[1:] <= 0)
-        return [self._halve(float(steps[one]), float(steps[one + 1]), gaps[one], side) for one in changes[:CROSSINGS]]
+        found = [self._halve(float(steps[one]), float(steps[one + 1]), gaps[one], side) for one in changes[:CROSSINGS]]
+        return [step for step in common if self.agrees(step, side)] + found
 
     def _halve(self, low: float, high: float, start: float, side: int) -> float:
         for _ in range(TRIED):
             middle = (low * high) ** 0.5
             gap = self.difference(middle, side) - self.exact
             low, high = (middle, high) if gap * start > 0 else (low, middle)
-        return (low * high) ** 0.5
+        return float((low * high) ** 0.5)
 
 
 def as_difference(probe: Probe, axes: AxisLines, rows: Sequence[int]) -> Evidence:
@@ -240,7 +247,7 @@ def as_difference(probe: Probe, axes: AxisLines, rows: Sequence[int]) -> Evidenc
     for one in slopes[:FIRST_TRIED]:
         others = [other for other in slopes if other is not one][:OTHERS]
         for side in (0, 1, 2):
-            for step in one.matching_steps(side):
+            for step in one.matching_steps(side, float(width[one.axis])):
                 for own in (torch.ones_like(width), width[one.axis] / width):
                     held = [other.agrees(step * float(own[other.axis]), side) for other in others]
                     if held and np.mean(held) >= HELD:

@@ -143,7 +143,7 @@ def evaluations(dim: int, power: float) -> tuple[int, int]:
 def examine(probe: Probe, power: float, seed: int, say: Callable[[str], None] = lambda text: None) -> Examination:
     """Judge gradients at random points, at special places and by every parameter; look closer where some are wrong."""
     say("gradients at random points")
-    engine = SobolEngine(probe.objective.space.dim, scramble=True, seed=seed)
+    engine = SobolEngine(probe.objective.space.dim, scramble=True, seed=seed)  # type: ignore[no-untyped-call]
     wanted = points_for(power)
     drawn = 2 ** math.ceil(math.log2(wanted))
     u, found, ladder = _random(probe, engine, drawn, seed)
@@ -163,8 +163,8 @@ def examine(probe: Probe, power: float, seed: int, say: Callable[[str], None] = 
 
 
 def _worth(ladder: Ladder) -> bool:
-    """Say whether more points would tell more: where nothing could be judged, they would not."""
-    return any(one.kind not in UNJUDGED for one in ladder.judged)
+    """Say whether more points would tell more: where most could not be judged, they would not."""
+    return Share.of(ladder.judged).judged >= len(ladder.judged) / 2
 
 
 Drawn = tuple[Tensor, Evaluation, Ladder]

@@ -25,7 +25,7 @@ class History:
     reproduced by the same calls, and do not drift. `stale` says that a call returns the gradient of the one before,
     `grows` that gradients add up from call to call. `batch` is a gradient alone over that within a batch of `ROWS`,
     and `alike` says that all gradients of a batch are the same, though alone they are not. `leak` is the relative
-    difference of the losses of a row alone and in a batch.
+    difference of the losses of a row alone and in a batch, and `gradient_leak` that of its gradients.
     """
 
     loss: float
@@ -36,6 +36,7 @@ class History:
     batch: float
     alike: bool
     leak: float
+    gradient_leak: float
 
 
 def observe(objective: Objective, x: Float[Tensor, "batch dim"]) -> History:
@@ -53,11 +54,12 @@ def observe(objective: Objective, x: Float[Tensor, "batch dim"]) -> History:
     return History(
         loss=moved,
         gradient=max(_gap(after, repeated), _gap(first, repeated)),
-        random=moved > SAME and max(again) > moved / 10 and not drifts,
+        random=(moved > SAME and max(again) > moved / 10 and not drifts) or _varies(after, after_again, repeated),
         stale=_gap(other, repeated) < ALIKE < _gap(after, repeated),
         grows=_grows(after, repeated, after_again, repeated_again),
         batch=_ratio(repeated, batch),
         leak=_apart(repeated.loss, batch.loss[:1]),
+        gradient_leak=max(_gap(repeated, batch.rows(slice(0, 1))), _gap(other, batch.rows(slice(1, 2)))),
         alike=_is_alike(batch) and _gap(repeated, other) > ALIKE,
     )
 
@@ -66,6 +68,12 @@ def _drifts(losses: list[float]) -> bool:
     """Say whether losses of the same call go one way, or come nearer to something: chance does neither for so long."""
     steps = [late - early for early, late in pairwise(losses)]
     return all(step > 0 for step in steps) or all(step < 0 for step in steps)
+
+
+def _varies(found: Evaluation, again: Evaluation, other: Evaluation) -> bool:
+    """Say whether gradients at one point differ, and the same order of calls does not give the same."""
+    same_loss = _apart(found.loss, other.loss) <= SAME
+    return same_loss and SAME < _gap(found, other) < 10 * _gap(found, again) and not _grows(found, again)
 
 
 def _is_alike(batch: Evaluation) -> bool:

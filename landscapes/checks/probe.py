@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -21,13 +22,15 @@ CLEAR_GRAIN = 16  # times float64's spacing is what the spacing of losses has to
 class Probe:
     """Evaluate an objective at points of the unit cube.
 
-    `repeats` is the largest difference of losses between repeats [loss unit]; `precision` is what the objective says
+    `repeats` is the largest difference of losses between repeats [loss unit], and `gradient_repeats` that of gradients
+    as a share of the largest component; `precision` is what the objective says
     that it computes in. `seen` gathers losses, from which their grain is told. `losses` and `gradients` count rows.
     """
 
     objective: Objective
     precision: str
     repeats: float = 0.0
+    gradient_repeats: float = 0.0
     losses: int = 0
     gradients: int = 0
     seen: list[Float[Tensor, " some"]] = field(default_factory=list)
@@ -77,7 +80,7 @@ class Probe:
     @property
     def _different(self) -> Float[Tensor, " some"]:
         """Return the different losses that were seen, but for 0."""
-        loss = torch.cat(self.seen).unique() if self.seen else torch.zeros(0)
+        loss = torch.from_numpy(np.unique(torch.cat(self.seen).numpy())) if self.seen else torch.zeros(0)
         return loss[loss.isfinite() & (loss != 0)]
 
     @property

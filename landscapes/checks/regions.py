@@ -45,11 +45,12 @@ def find_region(
     if few < FEWEST:
         return None
     features, labels, spans = _features(values, names, events or {})
-    single = sorted((_best_interval(features, one, wrong) for one in range(len(labels))), key=lambda one: -one.score)
+    single = [_best_interval(features, feature, wrong) for feature in range(len(labels))]
+    single = sorted(single, key=lambda one: -one.score)
     best: tuple[float, list[_Interval]] = (_error(features, single[:1], wrong), single[:1])
     if best[0] > WORST * few / len(wrong) / 3:
-        for first, other in permutations(_narrowest(features, wrong), 2):
-            pair = _best_pair(features, first, other, wrong)
+        for first, second in permutations(_narrowest(features, wrong), 2):
+            pair = _best_pair(features, first, second, wrong)
             error = _error(features, pair, wrong)
             if error < best[0] - 1.5 / len(wrong):  # a second condition has to be worth it
                 best = (error, pair)
@@ -60,7 +61,8 @@ def find_region(
     for one in intervals:
         kept = wrong.copy()
         for other in intervals:
-            kept |= (other is not one) & ~other.holds(features)  # right points that another condition leaves out
+            if other is not one:
+                kept |= ~other.holds(features)  # right points that another condition leaves out
         rules.append(_describe(one, features, labels, kept, spans))
     rule = " and ".join(rules)
     return Region(rule, tuple(labels[one.feature] for one in intervals), error, len(wrong))

@@ -28,11 +28,13 @@ FINER_STEPS = (1e-13, 1e-12, 1e-11, 1e-10, 1e-9)  # where the gradient says that
 TOLERANCE = {"float64": 1e-3, "float32": 3e-3}  # relative error of a gradient that is no defect
 ROUNDED = 1e3  # times the precision is what rounding makes of a gradient's components
 PLATEAU = 0.2  # of the larger is what two differences that agree may be apart
+WIDE, HALF, TWICE = 5, 0.5, 2.0  # times a step is the next; then half of the difference is the truncation, else twice
 RELIABLE = 0.1  # of the larger of both slopes is what the error of a difference may be, to be judged by
 NOISE_MARGIN = 3  # times the typical noise is what one difference may show
 ROUGH = 100  # times rounding is what losses change between neighbours where they are rough, not rounded
 MOST_FINER = 24  # lines, at most, that are walked over finer steps
 BEYOND = 10  # times what losses change is what a gradient says where it is too steep to be judged
+FALLING = 0.05  # of the second difference over the next step is what that of a smooth loss is at most
 UNEVEN = 0.003  # of what neighbours differ by is what a gradient foresees at most, where that is noise
 ROUNDED_BY = 16  # times the spacing of losses is the most that rounding changes them by, in one step
 SMALL_GRAIN = 1e-4  # of the box: losses that do not change over longer steps are flat there, and not rounded
@@ -174,7 +176,10 @@ def _judge(probe: Probe, lines: Lines, steps: tuple[float, ...], walked: Float[T
     rounding = _rounding_of(probe, lines, limits.eps)
     noise = _typical_noise(loss, walked.numpy())
     typical = _typical_slope(slope, lines)
-    allowed = ROUNDED * limits.eps * lines.parts.numpy() + FLAT * typical
+    moved = lines.direction.abs().sum(dim=1).numpy() * float(lines.grad.abs().nan_to_num().max())
+    allowed = (
+        ROUNDED * limits.eps * lines.parts.numpy() + FLAT * typical + NOISE_MARGIN * probe.gradient_repeats * moved
+    )
     judged = []
     for row in range(len(lines)):
         found = walked[:, :, row].numpy()
@@ -303,7 +308,7 @@ class _Line:
         for small, large in pairwise(known):
             apart = abs(small.value - large.value)
             size = max(abs(small.value), abs(large.value), abs(self.exact))
-            error = small.error + apart / 2
+            error = small.error + apart * (HALF if large.step > WIDE * small.step else TWICE)
             if apart > small.error + large.error + PLATEAU * size or error > RELIABLE * size:
                 if best is not None and error <= RELIABLE * size:
                     break
@@ -363,10 +368,16 @@ class _Line:
         return None
 
     def _is_rough(self) -> bool:
-        """Say whether losses change unevenly over the smallest step, in which the gradient foresees more than that."""
-        second = abs(float(self.walked[:, 0].sum()) - 2 * self.loss) / 2
-        uneven = max(self.usual, second if np.isfinite(second) else 0.0)
-        return uneven > ROUGH * self.eps * abs(self.loss) and abs(self.exact) * self.steps[0] > UNEVEN * uneven
+        """Say whether losses change unevenly over the smallest step, in which the gradient foresees more than that.
+
+        Second differences of a smooth loss fall as the square of the step, those of a rough one do not.
+        """
+        change = np.fmax(*np.abs(self.walked - self.loss))
+        seconds = np.abs(self.walked.sum(axis=0) - 2 * self.loss)[:2] / 2
+        own = float(seconds[0]) if np.isfinite(seconds).all() and seconds[0] > FALLING * seconds[-1] else 0.0
+        uneven, steepness = max(self.usual, own), change[min(1, len(change) - 1)] / self.steps[min(1, len(change) - 1)]
+        rounding = self.eps * (abs(self.loss) + float(steepness))
+        return uneven > ROUGH * rounding and abs(self.exact) * self.steps[0] > UNEVEN * uneven
 
 
 def counts(judged: Sequence[Judgement]) -> dict[Kind, int]:

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from gradscape.landscapes.checks.suite import check
+from gradscape.landscapes.checks.suite import Settings, check
 from gradscape.landscapes.objective import Evaluation
 
 from .test_suite import OneWrongSign, Sound, Spoiled, WrongWhere, failures, outcomes, refusing
@@ -28,7 +28,7 @@ def warnings(objective, **settings):
 
 def test_a_right_gradient_that_does_not_hold_over_an_optimiser_s_step_is_a_warning():
     assert warnings(Sound()) == set()
-    assert warnings(Rippled()) == {"an optimiser's step"}
+    assert warnings(Rippled()) == {"usefulness"}
     assert failures(Rippled()) == set()
 
 
@@ -60,8 +60,7 @@ def test_forward_is_held_against_reverse():
 
 def test_a_wrong_gradient_at_a_special_place_is_said_with_what_it_should_be():
     found = outcomes(WrongWhere())["special places"]
-    assert "at a zero, by a, the gradient is" in found.figure or "at zero, by a, the gradient is" in found.figure
-    assert "the loss rises by" in found.figure
+    assert "at zero, by a, the gradient is 243 and the loss rises by 6 and 6 to either side" in found.why
 
 
 @pytest.mark.parametrize("side", [0.0, 0.4, 1.0])
@@ -87,7 +86,7 @@ def unsteady(share):
 
 
 def test_gradients_that_do_not_repeat_fail():
-    assert failures(unsteady(1e-4)) == {"determinism"}
+    assert failures(unsteady(1e-4)) == {"determinism", "order of calls"}
 
 
 def test_gradients_may_repeat_less_exactly_than_losses():
@@ -99,10 +98,10 @@ def test_gradients_may_repeat_less_exactly_than_losses():
 def test_memory_that_runs_out_is_said_with_what_to_do():
     class Large(Sound):
         def evaluate(self, x, *, grad=True):
-            if len(x) > 4:
+            if len(x) > 8:
                 raise RuntimeError("Failed to allocate 123456 bytes on device 'cuda:0'")
             return super().evaluate(x, grad=grad)
 
-    found = [finding for finding in check(Large()) if finding.bad]
+    found = [finding for finding in check(Large(), Settings(power=0.3)) if finding.bad]
     assert found
     assert all("end what else uses the device" in finding.why for finding in found)
