@@ -63,7 +63,8 @@ RENAMED = {  # verbs and options of earlier versions, and today's
     "--print": "--figure-width-mm",
     "--report": "--claims",
 }
-ALL_KINDS = (Slot.POSITIONAL_ONLY, Slot.POSITIONAL_OR_KEYWORD, Slot.KEYWORD_ONLY, Slot.VAR_KEYWORD)
+SEVERAL = (Slot.VAR_POSITIONAL, Slot.VAR_KEYWORD)
+ALL_KINDS = (Slot.POSITIONAL_ONLY, Slot.POSITIONAL_OR_KEYWORD, Slot.KEYWORD_ONLY, *SEVERAL)
 STOPPED = 130  # the exit code of what Ctrl-C has ended
 LONG_PATH = 200  # characters of a path that an error shows
 DIMS = "--dims"
@@ -207,11 +208,11 @@ def _slots(function: Callable[..., Any] | None, kinds: Sequence[Any] = ALL_KINDS
     slots = []
     for slot in signature(function).parameters.values() if function else ():
         hint, kind = hint_of(function, slot.annotation), slot.kind
-        if kind not in kinds or (kind is Slot.VAR_KEYWORD and hint is Any):
+        if kind not in kinds or (kind in SEVERAL and hint is Any):
             continue  # of a plan: the words of another verb
         if slot.default is None or slot.default is False or slot.default == ():
             hint = Annotated[hint, Parameter(show_default=False)]
-        if ARGUMENT in getattr(hint, "__metadata__", ()):
+        if ARGUMENT in getattr(hint, "__metadata__", ()) and kind is not Slot.VAR_POSITIONAL:
             kind = Slot.POSITIONAL_ONLY
         elif kind is Slot.POSITIONAL_OR_KEYWORD:
             kind = Slot.KEYWORD_ONLY

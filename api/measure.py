@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Annotated, Literal, Unpack
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Unpack, overload
 
 from cyclopts import Parameter
 
+from ..envs.registry import names_in_file
 from .call import current, verb
 from .options import (
+    ARGUMENT,
     Count,
     Device,
     FigureWidth,
@@ -27,26 +30,67 @@ from .values import as_path, as_power, as_widths
 if TYPE_CHECKING:
     from ..jobs.bench import Bench
     from ..jobs.check import CheckReport
+    from ..jobs.checks import CheckReports
     from ..jobs.pairs import PairRanking
     from ..landscapes.measures.card import Card
     from ..landscapes.measures.census import Census
 
+OtherScenes = Annotated[
+    Any,
+    ARGUMENT,
+    Parameter(help="Further environments, each as above; FILE.py:* stands for all that are in a file of your own."),
+]
+Junit = Annotated[
+    str | Path | None,
+    Parameter(help="Also write the findings to this file, in the XML of JUnit that services for tests read."),
+]
 
-@verb
+
+@overload
 def check(
     scene: Scene,
     *,
     power: Share = 0.05,
     seed: Seed = 0,
+    jobs: int = 1,
+    junit: str | Path | None = None,
     **keywords: Unpack[SceneKeywords],
-) -> CheckReport:
+) -> CheckReport: ...
+
+
+@overload
+def check(
+    scene: Scene,
+    other: Scene,
+    /,
+    *others: Scene,
+    power: Share = 0.05,
+    seed: Seed = 0,
+    jobs: int = 1,
+    junit: str | Path | None = None,
+    **keywords: Unpack[SceneKeywords],
+) -> CheckReports: ...
+
+
+@verb
+def check(
+    scene: Scene,
+    *others: OtherScenes,
+    power: Share = 0.05,
+    seed: Seed = 0,
+    jobs: Count = 1,
+    junit: Junit = None,
+    **keywords: Unpack[SceneKeywords],
+) -> CheckReport | CheckReports:
     """Check that the gradients of an environment are right: where they are not, why, and what to do.
 
     It holds gradients against differences over many steps at random points, at special places and by every parameter,
     and says at which share of the box they are wrong, with its interval, in which region, by which parameters and from
     which cause. It also checks shapes, refusals, batches, determinism, growth with the horizon, corners of the box and
     beyond, long time steps, materials, horizons and precision. A warning is no failure: the gradient is right, but
-    useless over an optimiser's step. The exit code is 0 if the environment passes, else 1. It writes no file.
+    useless over an optimiser's step. The exit code is 0 if the environment passes, else 1. It writes no file, unless
+    --junit names one. Of several environments there is a line and a verdict for each, and the exit code is 1 where one
+    fails or cannot be checked.
 
     Raises ValueError for what the scene does not have, TooLargeError for more points than there is memory for, and
     Stopped where it is interrupted.
@@ -58,12 +102,25 @@ def check(
     power
         Share of the box, as 5% or 0.05: a defect that fills it is found with 95 %. A smaller one takes more points (59
         at 5 %, 299 at 1 %, 14 at 20 %).
+    jobs
+        Number of processes that check environments, one each at a time. In Python, more than one needs a script whose
+        own work stands under `if __name__ == '__main__':`.
     """
-    spec = spec_of(scene, keywords)
-    from ..jobs.check import CheckJob
-
     call, share = current(), as_power(power)
-    return CheckJob.open(spec.resolve(call.watch), power=share, seed=seed, command=call.command).run(call.watch)
+    names = [name for one in (scene, *others) for name in (names_in_file(one) if isinstance(one, str) else [one])]
+    specs = [spec_of(name, keywords).resolve(call.watch) for name in names]
+    from ..jobs.check import CheckJob
+    from ..jobs.checks import CheckReports, ChecksJob, write_junit
+
+    found: CheckReport | CheckReports
+    if others or len(specs) > 1:
+        found = whole = ChecksJob(specs, share, seed, jobs, call.command).run(call.watch)
+    else:
+        found = CheckJob.open(specs[0], power=share, seed=seed, command=call.command).run(call.watch)
+        whole = CheckReports((found,), {})
+    if junit is not None:
+        write_junit(Path(junit), whole)
+    return found
 
 
 @verb

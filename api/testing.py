@@ -39,8 +39,9 @@ def assert_gradients(
 
 def _lines(report: CheckReport) -> Iterator[str]:
     """Yield what is wrong in one line, and then each cause, and each check that failed, in a line of its own."""
-    wrong = report.share is not None and report.share.wrong
-    yield f"{report.env} fails its check" + (f": gradients are wrong at {report.share.describe()}" if wrong else "")
+    share = report.share
+    where = f": gradients are wrong at {share.describe()}" if share is not None and share.wrong else ""
+    yield f"{report.env} fails its check{where}"
     causes = [one for one in report.diagnoses if one.outcome == "fail"]
     yield from (f"- {_describe(one)}" for one in causes)
     for finding in report.findings:

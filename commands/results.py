@@ -14,6 +14,7 @@ SHOWN = {
     "Card": "card:show",
     "Census": "census:show",
     "CheckReport": "check:show",
+    "CheckReports": "checks:show",
     "Computed": "gallery:show_computed",
     "Environment": "environments:show_environment",
     "FigureList": "gallery:show_figures",

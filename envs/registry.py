@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 # ---- Import what an environment's class is in: a module by its name, or somebody's file by its path.
 
 IN_FILE = re.compile(r".+\.py:\w+", re.DOTALL)  # FILE.py:NAME
+ALL_IN_FILE = re.compile(r".+\.py:\*", re.DOTALL)
 BINDS_UNSEEN = re.compile(r"import\s*\(?\s*\*|\b(globals|locals|vars|setattr|exec|eval|__dict__|modules)\b")
 
 
@@ -361,6 +362,21 @@ def _import_from_file(text: str) -> type[Environment] | Environment:
         raise ValueError(f"{text} is called {found.name!r}, and so is {taken.target}; give it another name")
     entries()[found.name] = Entry(found.name, target, model=f"of {path}")
     return found
+
+
+def names_in_file(what: str) -> list[str]:
+    """Return FILE.py:NAME for each simulator in a file that is given as FILE.py:*, and any other text as it is.
+
+    Raises ValueError where there is no such file, it cannot be imported, or it has no simulator.
+    """
+    if not ALL_IN_FILE.fullmatch(what):
+        return [what]
+    file, path, _ = _place_in_file(what)
+    module = import_named(str(file))
+    offered = {id(one): name for name, one in reversed(vars(module).items()) if _is_offered(name, one, module.__name__)}
+    if not offered:
+        raise ValueError(f"{path} holds no simulator: an environment, a class of one, or an object like one")
+    return [f"{path}:{name}" for name in reversed(offered.values())]  # each once, by its first name
 
 
 def _place_in_file(text: str) -> tuple[Path, str, str]:

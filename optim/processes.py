@@ -24,7 +24,7 @@ class WorkerProcesses:
     def __init__(self, count: int) -> None:
         context = multiprocessing.get_context("spawn")
         many = range(count if count > 1 else 0)
-        self._pools = [ProcessPoolExecutor(1, context, initializer=_prepare_process) for _ in many]
+        self._pools = [ProcessPoolExecutor(1, context, initializer=prepare_process) for _ in many]
         self._turns: dict[int, int] = {}  # by search, in the order in which they computed first
 
     def __enter__(self) -> WorkerProcesses:
@@ -49,7 +49,7 @@ def workers_worth(workers: int, episodes: int) -> int:
     return workers if episodes > MIN_EPISODES else 1
 
 
-def _prepare_process() -> None:
+def prepare_process() -> None:
     """Prepare a process: one thread, deaf to an interrupt, which its parent answers, and gone with its parent.
 
     Linear algebra of scipy, not loaded yet, would wait for threads of its own at every step of L-BFGS.

@@ -92,7 +92,7 @@ def functions(f: Any, name: str) -> dict[str, Callable[[], Any]]:
     return {
         "as_environment": lambda: gs.as_environment(f),
         "make": lambda: gs.make(f),
-        "check": lambda: gs.check(f, points=2),
+        "check": lambda: gs.check(f, power=0.5),
         "slice": lambda: gs.slice(f, resolution=6, out=f"{name}/slice"),
         "sample": lambda: gs.sample(f, gs.open_slice(f"{name}/slice").plane),
         "open_slice": lambda: gs.open_slice(f"{name}/slice", env=f).report(points=2),

@@ -139,8 +139,9 @@ def _finite(values: Values) -> bool:
 def _program(jaxpr: Any, consts: Values, values: Values, place: Place | None) -> _Program:
     """Return the equations of a jaxpr as steps; `place` is where they stand, None where each says so itself."""
     known = dict(zip((*jaxpr.constvars, *jaxpr.invars), (*consts, *values), strict=True))
-    atoms = [*jaxpr.outvars, *(atom for equation in jaxpr.eqns for atom in equation.invars)]
-    numbers = {_key(one): jnp.asarray(one.val, one.aval.dtype) for one in atoms if isinstance(one, core.Literal)}
+    atoms: list[Any] = [*jaxpr.outvars, *(atom for equation in jaxpr.eqns for atom in equation.invars)]
+    literals: list[Any] = [one for one in atoms if isinstance(one, core.Literal)]
+    numbers = {_key(one): jnp.asarray(one.val, one.aval.dtype) for one in literals}
     steps = [_step(jaxpr, equation, place or _place(equation)) for equation in jaxpr.eqns]
     return _Program(steps, tuple(jaxpr.invars), tuple(map(_key, jaxpr.outvars)), known | numbers)
 
@@ -211,25 +212,26 @@ def _scan(params: dict[str, Any], values: Values, place: Place | None) -> _Progr
     run = jax.jit(core.jaxpr_as_fun(body))
     pull, pull_item, pull_write = (jax.jit(partial(_pull, one)) for one in (run, _item, _write))
     inside = partial(_called, body, place)
-    takes = tuple(("in", number) for number in range(len(values)))
+    takes = _keys("in", 0, len(values))
     fixed, state, stacks = takes[:first], takes[first : first + many], takes[first + many :]
     shapes = [one.aval for one in body.jaxpr.outvars[many:]]
-    results = tuple(("result", number) for number in range(len(shapes)))
+    results = _keys("result", 0, len(shapes))
     known = {**dict(zip(takes, values, strict=True)), **{("step", step): jnp.asarray(step) for step in range(count)}}
     known |= {key: jnp.zeros((count, *one.shape), one.dtype) for key, one in zip(results, shapes, strict=True)}
     steps = []
     for step in reversed(range(count)) if params["reverse"] else range(count):
-        items, out = (
-            tuple((name, step, n) for n in range(len(of))) for name, of in (("item", stacks), ("out", shapes))
-        )
-        after, written = (
-            tuple((name, step, n) for n in range(len(of))) for name, of in (("state", state), ("all", out))
-        )
+        items, out = _keys("item", step, len(stacks)), _keys("out", step, len(shapes))
+        after, written = _keys("state", step, many), _keys("all", step, len(shapes))
         steps.append(_Step(_item, (("step", step), *stacks), items, pull=pull_item))
         steps.append(_Step(run, (*fixed, *state, *items), (*after, *out), "scan", place, inside, pull))
         steps.append(_Step(_write, (("step", step), *results, *out), written, pull=pull_write))
         state, results = after, written
     return _Program(steps, takes, (*state, *results), known)
+
+
+def _keys(name: str, step: int, count: int) -> tuple[Any, ...]:
+    """Return the keys of so many values of a step."""
+    return tuple((name, step, number) for number in range(count))
 
 
 @jax.jit
@@ -252,13 +254,12 @@ def _while(params: dict[str, Any], values: Values, place: Place | None) -> _Prog
     first = params["cond_nconsts"]
     start = first + params["body_nconsts"]
     goes_on, run = jax.jit(core.jaxpr_as_fun(condition)), jax.jit(core.jaxpr_as_fun(body))
-    takes = tuple(("in", number) for number in range(len(values)))
-    state, now, steps = takes[start:], list(values[start:]), []
+    takes, steps, inside = _keys("in", 0, len(values)), list[_Step](), partial(_called, body, place)
+    state, now = takes[start:], values[start:]
     while bool(goes_on(*values[:first], *now)[0]):
         if len(steps) == MAX_STEPS:
             return None
-        after = tuple(("state", len(steps), number) for number in range(len(now)))
-        inside = partial(_called, body, place)
+        after = _keys("state", len(steps), len(now))
         steps.append(_Step(run, (*takes[first:start], *state), after, "while", place, inside))
         state, now = after, run(*values[first:start], *now)
     return _Program(steps, takes, state, dict(zip(takes, values, strict=True)))

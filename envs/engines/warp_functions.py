@@ -95,7 +95,8 @@ class WarpFunction:
     def wrong_origin(self, x: Float[Tensor, "one dim"]) -> str:
         """Return which kernel's adjoint differs from its differences at a point, or what is overwritten."""
         try:
-            self._refuse_overwrites(x)
+            with wp.ScopedDevice(self.device):
+                self._refuse_overwrites(x)
         except SimulatorError as error:
             return _line(error)
         with self._recorded(x) as (tape, _):

@@ -22,7 +22,7 @@ def warp_origin(tape: Any, losses: Any) -> str:
 
     Empty where all are finite.
     """
-    grads = {losses: wp.ones_like(losses, requires_grad=False)}
+    grads: Any = {losses: wp.ones_like(losses, requires_grad=False)}
     launches = tape.launches
     try:
         for launch in reversed(launches):

@@ -206,11 +206,12 @@ class _AxisSlope:
         ahead, here, behind = self.probe.loss(torch.stack([self.u + offset, self.u, self.u - offset])).tolist()
         return float([(ahead - behind) / (2 * step), (ahead - here) / step, (here - behind) / step][side])
 
-    def agrees(self, step: float, side: int) -> bool:
-        """Say whether the component is the difference over a step; at a bound it may be one-sided."""
-        values = [self.difference(step, one) for one in ((side, 1, 2) if step > 0 else (side,))]
-        known = [one for one in values if np.isfinite(one)][:1]
-        return any(abs(one - self.exact) <= SAME_DIFFERENCE * max(abs(self.exact), abs(one)) for one in known)
+    def agrees(self, step: float, side: int) -> bool | None:
+        """Say whether the component is the difference over a step; None where that leads beyond the box."""
+        found = self.difference(step, side)
+        if not np.isfinite(found):
+            return None
+        return abs(found - self.exact) <= SAME_DIFFERENCE * max(abs(self.exact), abs(found))
 
     def matching_steps(self, side: int, width: float) -> list[float]:
         """Return steps over which the difference is what the component says; `width` is the parameter's range.
@@ -249,8 +250,9 @@ def as_difference(probe: Probe, axes: AxisLines, rows: Sequence[int]) -> Evidenc
         for side in (0, 1, 2):
             for step in one.matching_steps(side, float(width[one.axis])):
                 for own in (torch.ones_like(width), width[one.axis] / width):
-                    held = [other.agrees(step * float(own[other.axis]), side) for other in others]
-                    if held and np.mean(held) >= HELD:
+                    tried = [other.agrees(step * float(own[other.axis]), side) for other in others]
+                    held = [one for one in tried if one is not None]
+                    if len(held) > 1 and np.mean(held) >= HELD:
                         return {"difference_step": step, "one_sided": float(side > 0)}
     return {}
 

@@ -34,7 +34,8 @@ NOISE_MARGIN = 3  # times the typical noise is what one difference may show
 ROUGH = 100  # times rounding is what losses change between neighbours where they are rough, not rounded
 MOST_FINER = 24  # lines, at most, that are walked over finer steps
 BEYOND = 10  # times what losses change is what a gradient says where it is too steep to be judged
-FALLING = 0.05  # of the second difference over the next step is what that of a smooth loss is at most
+CURVED = 1.5  # times the second difference that a larger step foresees may be that of a curved loss
+SATURATED = 0.02  # of the largest change that of the smallest step is where losses of neighbours have nothing in common
 UNEVEN = 0.003  # of what neighbours differ by is what a gradient foresees at most, where that is noise
 ROUNDED_BY = 16  # times the spacing of losses is the most that rounding changes them by, in one step
 SMALL_GRAIN = 1e-4  # of the box: losses that do not change over longer steps are flat there, and not rounded
@@ -174,7 +175,7 @@ def _judge(probe: Probe, lines: Lines, steps: tuple[float, ...], walked: Float[T
     limits = Limits.of(probe)
     loss, slope = lines.loss.numpy(), lines.slope.numpy()
     rounding = _rounding_of(probe, lines, limits.eps)
-    noise = _typical_noise(loss, walked.numpy())
+    noise = _typical_noise(steps, loss, walked.numpy())
     typical = _typical_slope(slope, lines)
     moved = lines.direction.abs().sum(dim=1).numpy() * float(lines.grad.abs().nan_to_num().max())
     allowed = (
@@ -203,12 +204,29 @@ def _rounding_of(probe: Probe, lines: Lines, eps: float) -> NDArray[np.float64]:
     return found
 
 
-def _typical_noise(loss: NDArray[np.float64], walked: NDArray[np.float64]) -> NDArray[np.float64]:
+def _unexplained(
+    steps: NDArray[np.float64], walked: NDArray[np.float64], loss: NDArray[np.float64] | float
+) -> NDArray[np.float64]:
+    """Return half of the second difference over the smallest step, without what that over the next one explains.
+
+    Second differences of a smooth loss fall as the square of the step, those of a noisy one do not.
+    """
+    halves = np.abs(walked.sum(axis=0) - 2 * loss) / 2
+    if len(steps) < 2:
+        return halves[0]
+    curved = CURVED * halves[1] * (steps[0] / steps[1]) ** 2
+    found: NDArray[np.float64] = np.clip(halves[0] - np.nan_to_num(curved), 0.0, None)
+    return found
+
+
+def _typical_noise(
+    steps: Sequence[float], loss: NDArray[np.float64], walked: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """Return what is usual among lines: half of a second difference over the smallest step.
 
     By size and as a share of the loss: losses of several decades, and small differences of large numbers.
     """
-    second = np.abs(walked[0, 0] + walked[1, 0] - 2 * loss) / 2
+    second = _unexplained(np.array(steps), walked, loss)
     known = np.isfinite(second)
     if not known.any():
         return np.zeros(len(loss))
@@ -275,13 +293,16 @@ class _Line:
         do not change at all over smaller steps, as those of rounded numbers do.
         """
         ahead, behind = self.walked - self.loss
-        second = np.abs(ahead + behind) / 2
-        own = float(second[0]) if np.isfinite(second[0]) else 0.0
         change = np.fmax(np.abs(ahead), np.abs(behind))
         moved = np.flatnonzero(change > 0)
         first = int(moved[0]) if len(moved) else 0
         grain = float(change[first]) if first and self._is_grain(change) else 0.0
-        return max(self.usual, own, grain, self.rounding)
+        return max(self.usual, self._unevenness(), grain, self.rounding)
+
+    def _unevenness(self) -> float:
+        """Return what is uneven in losses over the smallest step, and no curvature."""
+        found = float(_unexplained(self.steps, self.walked, self.loss))
+        return found if np.isfinite(found) else 0.0
 
     def _is_grain(self, change: NDArray[np.float64]) -> bool:
         """Say whether the first change along a line is that of rounded losses or points, not a step of its own."""
@@ -368,16 +389,15 @@ class _Line:
         return None
 
     def _is_rough(self) -> bool:
-        """Say whether losses change unevenly over the smallest step, in which the gradient foresees more than that.
-
-        Second differences of a smooth loss fall as the square of the step, those of a rough one do not.
-        """
-        change = np.fmax(*np.abs(self.walked - self.loss))
-        seconds = np.abs(self.walked.sum(axis=0) - 2 * self.loss)[:2] / 2
-        own = float(seconds[0]) if np.isfinite(seconds).all() and seconds[0] > FALLING * seconds[-1] else 0.0
-        uneven, steepness = max(self.usual, own), change[min(1, len(change) - 1)] / self.steps[min(1, len(change) - 1)]
+        """Say whether losses change unevenly over the smallest step, in which the gradient foresees more."""
+        change, next_ = np.fmax(*np.abs(self.walked - self.loss)), min(1, len(self.steps) - 1)
+        saturated = (
+            change[0] > SATURATED * np.nanmax(change) and abs(self.exact) * self.steps[0] > SATURATED * change[0]
+        )
+        uneven, steepness = max(self.usual, self._unevenness()), change[next_] / self.steps[next_]
         rounding = self.eps * (abs(self.loss) + float(steepness))
-        return uneven > ROUGH * rounding and abs(self.exact) * self.steps[0] > UNEVEN * uneven
+        rough = uneven > ROUGH * rounding and abs(self.exact) * self.steps[0] > UNEVEN * uneven
+        return bool(rough or saturated)
 
 
 def counts(judged: Sequence[Judgement]) -> dict[Kind, int]:

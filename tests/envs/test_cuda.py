@@ -1,14 +1,18 @@
 """On a GPU the same kernels give the same losses and gradients; skipped where there is none."""
 
+import gc
 from dataclasses import replace
 from functools import partial
 
 import pytest
 import torch
 
+from gradscape.envs.base import Environment
+from gradscape.envs.engines import runtime
 from gradscape.envs.engines.mpm import solver
 from gradscape.envs.engines.runtime import cuda_available
 from gradscape.envs.registry import entries, environment_class, make
+from gradscape.landscapes.sampling.memory import free_memory
 
 from .scenes import SMALL_STEPS
 
@@ -46,6 +50,35 @@ def test_gradients_on_cuda_are_slopes(name: str) -> None:
     env = make(name, fidelity=fidelity, device="cuda")
     x = env.space.uniform(1, seed=2).requires_grad_()
     assert torch.autograd.gradcheck(env, (x,), eps=SMALL_STEPS.get(name, 1e-7), nondet_tol=1e-7, atol=1e-4, rtol=1e-3)
+
+
+@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("kept", [False, True])
+def test_a_scene_that_is_dropped_or_released_gives_its_memory_back(name: str, kept: bool) -> None:
+    """Without garbage being collected: a solver takes most of what is free for its tape, and the next one needs it."""
+
+    def use() -> Environment:
+        env = make(name, fidelity="draft", device="cuda")
+        x = env.space.uniform(2, seed=4)
+        for _ in range(3):  # the first run finds what is free, the second fills it, the third repeats its launches
+            env.evaluate(x)
+        return env
+
+    use()  # compiles, and loads modules
+    free_memory()
+    before = runtime.free_memory()
+    gc.disable()
+    try:
+        env = use()
+        taken = before - runtime.free_memory()
+        if kept:
+            env.release()
+        else:
+            del env
+        torch.cuda.empty_cache()
+        assert before - runtime.free_memory() < max(0.05 * taken, 64e6)
+    finally:
+        gc.enable()
 
 
 @pytest.mark.parametrize(("name", "known"), [("fluid", "scoop"), ("assembly", "demonstration")])  # odd substeps

@@ -62,12 +62,12 @@ def test_featherstone_flies_right_and_its_gradient_is_wrong():
 
 
 def test_check_says_which_solver_has_true_gradients(run, tmp_path):
-    true = run("check", "newton-flight", "--points", "2", cwd=tmp_path)
+    true = run("check", "newton-flight", "--power", "20%", cwd=tmp_path)
     assert true.returncode == 0, true.stdout
-    wrong = run("check", "newton-flight", "--points", "2", "--set", "solver=featherstone", cwd=tmp_path)
+    wrong = run("check", "newton-flight", "--power", "20%", "--set", "solver=featherstone", cwd=tmp_path)
     assert wrong.returncode == 1
     failed = {line[10:36].strip() for line in wrong.stdout.splitlines() if line.startswith("fail ")}
-    assert {"finite differences", "growth over horizons"} <= failed
+    assert {"gradient", "growth over horizons"} <= failed
 
 
 @pytest.mark.parametrize("name", ["newton-ball", "newton-cloth"])

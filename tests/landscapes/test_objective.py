@@ -95,10 +95,10 @@ def test_pairs_checks_and_trade_offs_ask_nothing_beyond(tmp_path):
     found = explore(Strict(), design, Checkpoint.open(tmp_path / "p", {}, what="pairs"))
     assert found.failed == 0
     assert (measure(Strict(), SPACE.sobol(4, seed=0)).status == Status.OK).all()
-    outcomes = {finding.check: finding for finding in check(Strict(), points=2)}
+    outcomes = {finding.check: finding for finding in check(Strict())}
     assert {finding.outcome for finding in outcomes.values()} <= {"pass", "skip"}
     assert "it does not invite points beyond its box" in outcomes["10% outside the box"].why
-    invited = {finding.check: finding for finding in check(Inviting(), points=2)}
+    invited = {finding.check: finding for finding in check(Inviting())}
     assert invited["10% outside the box"].outcome == "pass"
 
 
