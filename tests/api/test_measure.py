@@ -57,15 +57,6 @@ class Hill(Bowl):
 
 
 def test_a_class_is_checked_and_its_findings_are_a_table() -> None:
-<<<<<<< HEAD
-    passed, failed = gs.check(Bowl), gs.check(Hill(), power=0.3)
-    assert passed.passed
-    assert not failed.passed
-    assert failed.power == 0.3
-    table = failed.table()
-    assert list(table.index) == [finding.check for finding in failed.findings]
-    assert table.loc["gradient", "outcome"] == "fail"
-=======
     passed, failed = gs.check(Bowl), gs.check(Hill(), power="20%")
     assert passed.passed
     assert not failed.passed
@@ -75,7 +66,6 @@ def test_a_class_is_checked_and_its_findings_are_a_table() -> None:
     assert table.loc["gradient", "outcome"] == "fail"
     assert failed.diagnoses[0].cause == "sign"
     assert set(failed.parameter_table()["verdict"]) == {"wrong"}
->>>>>>> picture
     assert [one["check"] for one in failed.record()["checks"]] == list(table.index)
 
 
