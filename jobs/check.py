@@ -237,7 +237,8 @@ class CheckJob:
         own = self.env.horizon
         if not own:
             return {}
-        others = {factor: cache(partial(self.env.with_horizon, factor * own)) for factor in FACTORS[1:]}
+        keep = cache if self.env.device == "cpu" else lambda make: make  # there is no memory for all of them on a GPU
+        others = {factor: keep(partial(self.env.with_horizon, factor * own)) for factor in FACTORS[1:]}
         return {1: lambda: self.env, **others}
 
     def work(self) -> list[Work]:

@@ -212,9 +212,7 @@ def _unexplained(
     Second differences of a smooth loss fall as the square of the step, those of a noisy one do not.
     """
     halves = np.abs(walked.sum(axis=0) - 2 * loss) / 2
-    if len(steps) < 2:
-        return halves[0]
-    curved = CURVED * halves[1] * (steps[0] / steps[1]) ** 2
+    curved = CURVED * halves[1] * (steps[0] / steps[1]) ** 2 if len(steps) > 1 else 0.0
     found: NDArray[np.float64] = np.clip(halves[0] - np.nan_to_num(curved), 0.0, None)
     return found
 

@@ -106,12 +106,13 @@ def check(objective: Objective, settings: Settings | None = None, results: Resul
         yield _failure("determinism", error).excuse(how.expected)
         return
     left = dict(how.expected)
-    for name, run in _checks(subject, how, results):
+    made = [objective]
+    for name, run in _checks(subject, how, results, made):
         how.follow(name)
         left.pop(name, None)
+        if name not in PROMISES:
+            _give_back(made)
         yield _try(name, run).excuse(how.expected)
-        if objective.device != "cpu":
-            gc.collect()  # what a check has made may refer to itself, and holds the device's memory until then
     for name in left:
         yield Finding(name, UNEXPECTED, "not checked", "a failure is expected of it, but there is no such check")
 
@@ -134,19 +135,47 @@ def episodes(dim: int, power: float, horizons: Sequence[float] = ()) -> tuple[in
     return losses + longer, gradients + sloped + PROMISE_POINTS * (REPEATS + 8) + 3 * len(extremes.corners(dim)) + 20
 
 
-def _other(subject: Subject, twin: Callable[[], Objective] | None) -> Callable[[], Subject] | None:
-    """Return what evaluates the twin at the same points, once."""
+def _other(
+    subject: Subject, twin: Callable[[], Objective] | None, made: list[Objective]
+) -> Callable[[], Subject] | None:
+    """Return what evaluates the twin at the same points, once; it is added to what was `made`."""
     if twin is None:
         return None
     precision = "float32" if subject.precision == "float64" else "float64"
-    return cache(lambda: Subject.observe(twin(), subject.x, precision=precision, seed=subject.seed, repeats=2))
+
+    def observe_twin() -> Subject:
+        made.append(twin())
+        return Subject.observe(made[-1], subject.x, precision=precision, seed=subject.seed, repeats=2)
+
+    return cache(observe_twin)
 
 
-def _checks(subject: Subject, how: Settings, results: Results) -> Iterator[tuple[str, Callable[[], Finding]]]:
-    other = _other(subject, how.twin)
+def _usable(other: Callable[[], Subject] | None) -> Callable[[], Subject] | None:
+    """Return what evaluates the twin, None where it refuses to be evaluated: kernels written for one precision."""
+    if other is not None:
+        try:
+            other()
+        except ValueError:
+            return None
+    return other
+
+
+def _give_back(made: Sequence[Objective]) -> None:
+    """Give back the memory of a device that environments hold between evaluations: another one takes all there is."""
+    if any(one.device != "cpu" for one in made):
+        for one in made:
+            one.release()
+        gc.collect()
+
+
+def _checks(
+    subject: Subject, how: Settings, results: Results, made: list[Objective]
+) -> Iterator[tuple[str, Callable[[], Finding]]]:
+    other = _other(subject, how.twin, made)
     for name, run in PROMISES.items():
         yield name, partial(_keep_promise, name, run, subject, results)
     yield "order of calls", partial(_check_calls, subject, results)
+    other = _usable(other)
     exact = other if subject.precision == "float32" else None
     best = exact or (lambda: subject)
     yield "gradient", lambda: _check_gradient(best(), how, results)
@@ -209,6 +238,10 @@ def _judge_gradient(seen: Examination, results: Results) -> Finding:
     if share.wrong or on_average or any(one.kind == Kind.WRONG for one in seen.axes.ladder.judged):
         figure = f"wrong at {share.describe()}: {told}" if share.wrong else f"{share.points} points: {told}"
         return Finding("", FAIL, figure, "; ".join(failing), numbers, seen.table())
+    if counted[Kind.FAILED] == share.points:
+        return Finding(
+            "", FAIL, f"none of {share.points} points has a loss", "nothing can be said of the gradient", numbers
+        )
     if share.judged < CANNOT_TELL * share.points:
         why = f"only {share.judged} of {share.points} points could be judged, so nothing is said of the gradient"
         return Finding("", WARN, f"cannot tell: {told}", why, numbers, seen.table())
