@@ -25,7 +25,7 @@ from .probe import EPS, Lines, Probe
 STEPS = (1e-8, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 3e-1)
 BETWEEN_STEPS = (1e-7, 3e-6, 3e-5, 3e-4, 3e-3, 3e-2)  # for slopes that the others leave undecided
 FINER_STEPS = (1e-13, 1e-12, 1e-11, 1e-10, 1e-9)  # where the gradient says that losses change within the smallest step
-TOLERANCE = {"float64": 1e-3, "float32": 3e-3}  # relative error of a gradient that is no defect
+TOLERANCE = 5e-3  # relative error of a gradient that is no defect
 ROUNDED = 1e3  # times the precision is what rounding makes of a gradient's components
 PLATEAU = 0.2  # of the larger is what two differences that agree may be apart
 WIDE, HALF, TWICE = 5, 0.5, 2.0  # times a step is the next; then half of the difference is the truncation, else twice
@@ -115,8 +115,7 @@ class Limits:
     @classmethod
     def of(cls, probe: Probe) -> Limits:
         """Return those of an objective, by what was seen of it so far."""
-        single = probe.eps == EPS["float32"]
-        return cls(probe.eps, probe.repeats, TOLERANCE["float32" if single else "float64"])
+        return cls(probe.eps, probe.repeats, TOLERANCE)
 
 
 def measure(probe: Probe, lines: Lines, steps: Sequence[float] = STEPS) -> Ladder:
