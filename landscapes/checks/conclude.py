@@ -94,9 +94,9 @@ def _make(
     cause: Cause, signature: Signature, evidence: Evidence, texts: Texts, names: tuple[str, ...] = (),
     region: Region | None = None,
 ) -> Diagnosis:  # fmt: skip
-    what = cause.says.format_map({**evidence, **texts})
+    what, remedy = (text.format_map({**evidence, **texts}) for text in (cause.says, cause.remedy))
     return Diagnosis(
-        cause.name, signature.outcome, signature.certainty, what, cause.remedy, names, region, numbers=dict(evidence)
+        cause.name, signature.outcome, signature.certainty, what, remedy, names, region, numbers=dict(evidence)
     )
 
 

@@ -324,8 +324,9 @@ class _Line:
         return Kind.AGREES if self._agrees_beyond(slope, change) else Kind.WRONG
 
     def _agrees_beyond(self, slope: Slope, change: NDArray[np.float64]) -> bool:
-        """Say whether the gradient is the slope over longer steps, and what it lacks below is smaller than any solver's
-        tolerance: steps that a solver adapts make losses uneven there.
+        """Say whether the gradient is the slope over longer steps, and lacks less below than any solver tolerates.
+
+        Time steps that a solver adapts make losses uneven there.
         """
         ahead, behind = self.walked - self.loss
         with np.errstate(invalid="ignore"):
