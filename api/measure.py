@@ -44,6 +44,9 @@ Junit = Annotated[
     str | Path | None,
     Parameter(help="Also write the findings to this file, in the XML of JUnit that services for tests read."),
 ]
+CheckFolder = Annotated[
+    str | Path | None, Parameter(help="Folder of the results of one environment; without it they are not kept.")
+]
 
 
 @overload
@@ -54,6 +57,9 @@ def check(
     seed: Seed = 0,
     jobs: int = 1,
     junit: str | Path | None = None,
+    figure_width_mm: FigureWidth = (),
+    out: str | Path | None = None,
+    force: bool = False,
     **keywords: Unpack[SceneKeywords],
 ) -> CheckReport: ...
 
@@ -80,6 +86,9 @@ def check(
     seed: Seed = 0,
     jobs: Count = 1,
     junit: Junit = None,
+    figure_width_mm: FigureWidth = (),
+    out: CheckFolder = None,
+    force: Force = False,
     **keywords: Unpack[SceneKeywords],
 ) -> CheckReport | CheckReports:
     """Check that the gradients of an environment are right: where they are not, why, and what to do.
@@ -88,12 +97,14 @@ def check(
     and says at which share of the box they are wrong, with its interval, in which region, by which parameters and from
     which cause. It also checks shapes, refusals, batches, determinism, growth with the horizon, corners of the box and
     beyond, long time steps, materials, horizons and precision. A warning is no failure: the gradient is right, but
-    useless over an optimiser's step. The exit code is 0 if the environment passes, else 1. It writes no file, unless
-    --junit names one. Of several environments there is a line and a verdict for each, and the exit code is 1 where one
-    fails or cannot be checked.
+    useless over an optimiser's step. The exit code is 0 if the environment passes, else 1. Of several environments
+    there is a line and a verdict for each, and the exit code is 1 where one fails or cannot be checked.
 
-    Raises ValueError for what the scene does not have, TooLargeError for more points than there is memory for, and
-    Stopped where it is interrupted.
+    It writes no file but those that --junit and --out name. The folder then holds check.json and check.png: over which
+    steps gradients say how the loss changes.
+
+    Raises ValueError for what the scene does not have, TooLargeError for more points than there is memory for,
+    StoreMismatchError where the folder holds another check; Stopped where it is interrupted.
 
     Example: landscape check bounce
 
@@ -106,17 +117,22 @@ def check(
         Number of processes that check environments, one each at a time. In Python, more than one needs a script whose
         own work stands under `if __name__ == '__main__':`.
     """
-    call, share = current(), as_power(power)
+    call, share, folder, prints = current(), as_power(power), as_path(out), as_widths(figure_width_mm)
+    if prints and folder is None:
+        raise ValueError("--figure-width-mm is of a figure in a folder; give --out, too")
     names = [name for one in (scene, *others) for name in (names_in_file(one) if isinstance(one, str) else [one])]
     specs = [spec_of(name, keywords).resolve(call.watch) for name in names]
     from ..jobs.check import CheckJob
     from ..jobs.checks import CheckReports, ChecksJob, write_junit
 
     found: CheckReport | CheckReports
-    if others or len(specs) > 1:
+    if (many := bool(others) or len(specs) > 1) and folder is not None:
+        raise ValueError(f"--out is the folder of one environment; got {len(specs)} environments")
+    if many:
         found = whole = ChecksJob(specs, share, seed, jobs, call.command).run(call.watch)
     else:
-        found = CheckJob.open(specs[0], power=share, seed=seed, command=call.command).run(call.watch)
+        job = CheckJob.open(specs[0], power=share, seed=seed, command=call.command)
+        found = (job if folder is None else job.into(folder, force=force, prints=prints)).run(call.watch)
         whole = CheckReports((found,), {})
     if junit is not None:
         write_junit(Path(junit), whole)

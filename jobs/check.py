@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from functools import cache, cached_property, partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..landscapes.capacity import Need, require
@@ -13,11 +14,17 @@ from ..landscapes.checks.diagnosis import Diagnosis
 from ..landscapes.checks.examination import Share, points_for
 from ..landscapes.checks.finding import Finding
 from ..landscapes.checks.parameters import ParameterRow
+from ..landscapes.checks.slopes import Kind, counts
 from ..landscapes.checks.suite import POWER, Results, Settings, check, episodes
 from ..landscapes.checks.usefulness import Usefulness
 from ..landscapes.convert import to_json
 from ..landscapes.cost import duration, episode_cost
-from ..landscapes.plain import jsonable
+from ..landscapes.identity import check_identity
+from ..landscapes.plain import jsonable, plain_json
+from ..landscapes.storage.files import until_full
+from ..landscapes.storage.records import read_json, reading
+from .folder import CHECK
+from .job import Job
 from .scene import SceneSpec
 from .watch import PREPARING, Say, Stopped, Watch, Work
 
@@ -28,6 +35,7 @@ if TYPE_CHECKING:
 
     from ..envs.base import Environment
     from ..landscapes.checks.extremes import ExtremeCase
+    from ..landscapes.draw.figure import Picture
 
 FACTORS = (1, 2, 4, 8)  # of the fidelity's time step, and of the scene's horizon
 GROWTH = (1, 2, 4)  # of the horizon: how long gradients are held against the rise of the loss
@@ -36,6 +44,7 @@ FORWARD = 64  # parameters of which both modes are compared at most
 FINER, SAME_STEP = (2, 4), 0.01  # parts of the time step, and by which share of it the nearest may be another
 LENGTHS = 32  # of episodes, among which the first whose gradient is wrong is looked for
 MODES = ("forward", "reverse")  # of automatic differentiation
+IDENTITY = "identity"  # in the record in a folder: what was checked, and how
 
 
 def _materials(job: CheckJob) -> list[ExtremeCase]:
@@ -59,7 +68,10 @@ def _materials(job: CheckJob) -> list[ExtremeCase]:
 
 @dataclass(frozen=True)
 class CheckReport:
-    """Hold what was found of an environment; fields are called as `landscape check --json` has them."""
+    """Hold what was found of an environment; fields are called as `landscape check --json` has them.
+
+    `kinds` counts the random points by how their gradients compare with differences, those alone that occur.
+    """
 
     env: str
     fidelity: str
@@ -76,10 +88,11 @@ class CheckReport:
     share: Share | None = None
     parameters: tuple[ParameterRow, ...] = ()
     usefulness: tuple[Usefulness, ...] = ()
+    kinds: dict[Kind, int] = field(default_factory=dict)
 
     def record(self) -> dict[str, Any]:
         """Return it as plain JSON, which knows no infinity; findings are its `checks`."""
-        left = ("findings", "command", "diagnoses", "share", "parameters", "usefulness")
+        left = ("findings", "command", "diagnoses", "share", "parameters", "usefulness", "kinds")
         found = {name: getattr(self, name) for name in self.__dataclass_fields__ if name not in left}
         measured = {name: to_json(getattr(self, name)) for name in left[2:]}
         return {**found, **measured, "checks": list(map(_record, self.findings)), "command": self.command}
@@ -102,6 +115,12 @@ class CheckReport:
     def _repr_html_(self) -> str:
         """Show the table in a notebook."""
         return str(self.table().to_html())
+
+    def plot(self, width: float | None = None) -> Picture:
+        """Draw over which steps gradients say how the loss changes; `width` is that of a page for print [mm]."""
+        from ..landscapes.draw.figure import figure_of
+
+        return figure_of(self, width)
 
 
 @dataclass(frozen=True)
@@ -177,7 +196,23 @@ class CheckJob:
             share=seen.share if seen else None,
             parameters=seen.parameters() if seen else (),
             usefulness=self.results.usefulness,
+            kinds={kind: count for kind, count in counts(seen.random.judged).items() if count} if seen else {},
         )
+
+    def into(self, folder: Path, *, force: bool = False, prints: Sequence[float] = ()) -> CheckFolder:
+        """Return the job that also leaves the report in a folder, as JSON and as a picture.
+
+        Raises ValueError where the folder holds something else, StoreMismatchError where it holds another check, which
+        `force` replaces.
+        """
+        identity = {**self.env.identity(), "power": self.power, "seed": self.seed}
+        CHECK.check(folder)
+        path = folder / CHECK.files[0]
+        if path.exists() and not force:
+            with reading(path, f"write elsewhere with --out, or delete {path}"):
+                found = read_json(path)[IDENTITY]
+            check_identity(folder, wanted=plain_json(identity, "a check's identity"), found=found, what="check")
+        return CheckFolder(check=self, identity=identity, folder=folder, command=self.command, prints=prints)
 
     def _run(self, follow: Callable[[str], None]) -> Iterator[Finding]:
         settings = Settings(  # once the cost is known, and by that the type of the losses
@@ -221,6 +256,31 @@ class CheckJob:
         if env.precision != env.fidelity.precision:
             subject += f" · its losses are {env.precision}"
         return f"{subject}: some {plain} episodes and {sloped} with gradients, about {duration(seconds)}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class CheckFolder(Job[CheckReport]):
+    """A check whose report goes to a folder; `identity` says what is checked, and how."""
+
+    results = CHECK
+    check: CheckJob
+    identity: dict[str, Any]
+
+    def work(self) -> list[Work]:
+        """Return what the check has to simulate."""
+        return self.check.work()
+
+    def compute(self, watch: Watch) -> CheckReport:
+        """Check the environment."""
+        return self.check.run(watch)
+
+    def holding(self, watch: Watch) -> AbstractContextManager[None]:
+        """Let a full disk end it; a check that is stopped begins again."""
+        return until_full(lambda: "nothing of the check is kept")
+
+    def record(self, found: CheckReport) -> Any:
+        """Return what is written of it, with what was checked."""
+        return {**found.record(), IDENTITY: self.identity}
 
 
 def _need(dim: int, points: int) -> Need:

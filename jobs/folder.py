@@ -64,6 +64,7 @@ REPORTS = Results("set of reports", ("report.json", "report.md"))
 STUDIES = {kind: Results(f"{kind} study", (f"{kind}.json", f"{kind}.png"), f"{kind}.png") for kind in KINDS}
 CARD = Results("report card", ("card.json", "card.html", "card.npz", "card.png"), "card.png")
 PAIRS = Results("study of pairs", ("pairs.json",))
+CHECK = Results("check", ("check.json", "check.png"), "check.png")
 CENSUS = Results("census", ("census.json", "census.npz", "census.png"), "census.png")
 
 

@@ -52,6 +52,7 @@ WORDS |= {
     "triple-move": "bounce",
 }
 VALUES = {"--resolution": "2", "--budget": "3", "--seeds": "1", "--frames": "2", "--points": "2", "--slices": "1"}
+VALUES |= {"--power": "20%"}
 ADDED = {
     "race": ["--seeds", "1", "--budget", "3", "--device", "cpu"],
     "league": ["--seeds", "1", "--budget", "3", "--device", "cpu"],
@@ -60,7 +61,7 @@ ADDED = {
     "bounce": ["--resolution", "3"],
     "slice": ["--resolution", "2"],
     "sweep": ["--resolution", "2"],
-    "check": ["--points", "2"],
+    "check": ["--power", "20%"],
     "pairs": ["--samples", "2"],
     "card": ["--scene", "control", "--resolution", "3"],
     "census": ["--slices", "1", "--resolution", "6"],

@@ -92,7 +92,7 @@ def functions(f: Any, name: str) -> dict[str, Callable[[], Any]]:
     return {
         "as_environment": lambda: gs.as_environment(f),
         "make": lambda: gs.make(f),
-        "check": lambda: gs.check(f, power=0.5),
+        "check": lambda: gs.check(f, power="20%"),
         "slice": lambda: gs.slice(f, resolution=6, out=f"{name}/slice"),
         "sample": lambda: gs.sample(f, gs.open_slice(f"{name}/slice").plane),
         "open_slice": lambda: gs.open_slice(f"{name}/slice", env=f).report(points=2),
@@ -122,7 +122,7 @@ def commands(f: str, name: str) -> dict[str, str]:
         "envs": f"envs {f}",
         "slice": f"slice {f} --resolution 6 --out {name}/s",
         "report": f"report {name}/s --env {f} --points-per-axis 2 --out {name}/r",
-        "check": f"check {f} --points 2",
+        "check": f"check {f} --power 20%",
         "sweep": f"sweep {f} --dims 0 1 --over smoothing --frames 2 --resolution 4 --out {name}/w",
         "optimize": f"optimize {f} --method random --budget 6 --out {name}/o",
         "race": f"race {f} --methods random,cma-es --budget 6 --seeds 2 --out {name}/a",
@@ -200,7 +200,7 @@ def test_a_pendulum_with_fidelities_and_a_horizon_is_studied_like_a_scene(
     (here / "pendulum.py").write_text(PENDULUM)
     f = "pendulum.py:pendulum"
     for words in (
-        f"check {f} --points 2",
+        f"check {f} --power 20%",
         f"slice {f} --resolution 6 --fidelity reference --set damping=0.2 --out p/slice",
         f"study fidelity {f} --points 4 --settings dt --out p/fidelity",
         f"study convergence {f} --points 4 --settings dt --out p/convergence",

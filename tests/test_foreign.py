@@ -73,7 +73,7 @@ def test_a_class_in_a_file_is_sliced_measured_searched_and_shown(run: Run, folde
     for command in (
         ["report", "cut", "--env", "arm.py:TwoLinkArm", "--points-per-axis", "6", "--out", "told"],
         ["overlay", "cut", "run", "--env", "arm.py:TwoLinkArm", "--through", "best", "--out", "over"],
-        ["check", "arm.py:TwoLinkArm", "--points", "2"],
+        ["check", "arm.py:TwoLinkArm", "--power", "20%"],
         ["plan", "slice", "arm.py:TwoLinkArm", "--dims", "0", "1", "--resolution", "4"],
         ["race", "arm.py:TwoLinkArm", "--methods", "random", "--seeds", "1", "--budget", "3", "--out", "raced"],
         ["pairs", "arm.py:TwoLinkArm", "--samples", "2", "--out", "paired"],

@@ -41,7 +41,7 @@ view over/overlay.rrd
 bounce --axis y --resolution 3 --fidelity draft --device cpu
 plan slice bounce --dims 0 1 --resolution 2 --fidelity draft --device cpu
 bench bounce --batch 2 --seconds 0 --fidelity draft --device cpu
-check branin --points 2
+check branin --power 20%
 study fidelity cartpole --set horizon=0.02 --points 2 --settings precision --device cpu
 study mixed cartpole --set horizon=0.02 --points 2 --chaotic --time-limit 0.01 --device cpu
 study extremes bounce --set horizon=0.05 --points 4 --settings dt --precisions float64 --fidelity draft --device cpu

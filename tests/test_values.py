@@ -39,7 +39,7 @@ export cut
 view cut
 bounce --axis y --resolution 3
 bench branin --batch 2 --seconds 0
-check branin --points 2
+check branin --power 20%
 study fidelity bounce --points 2 --settings dt
 pairs ackley --samples 2 --top 3
 census ackley --slices 1 --resolution 6

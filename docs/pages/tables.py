@@ -20,6 +20,7 @@ from gradscape.gallery.figures import read_figures
 from gradscape.gallery.files import DATA, DEVICES
 from gradscape.gallery.paper import read_paper
 from gradscape.jobs.report import Report, environments_markdown
+from gradscape.landscapes.checks.causes import causes
 from gradscape.landscapes.storage.records import read_json
 from gradscape.studies.claims import CLAIMS, Claim, Shortfall
 from gradscape.studies.extremes import ExtremesRecord, Limit
@@ -28,7 +29,7 @@ from gradscape.studies.kept import file_name, read_study
 from gradscape.studies.model import MeasuredPart, ModelRecord
 from gradscape.studies.variants import StudyRecord
 
-from .text import table
+from .text import cell, table
 
 ROOT = Path(__file__).parents[2]
 UNMEASURED, MISSING = "not measured since the scene changed", "not measured"
@@ -218,6 +219,19 @@ def measured() -> str:
     return environments_markdown([Report.read(file) for file in files if file.exists()])
 
 
+def known_causes() -> str:
+    """Return a row for each cause of wrong gradients by its name: whether a check then fails or warns, what to try."""
+    rows: dict[str, tuple[set[str], list[str]]] = {}
+    for one in causes():
+        ends, remedies = rows.setdefault(one.name, (set(), []))
+        ends |= {f"{signature.outcome}s" for signature in one.signatures}
+        remedy = one.remedy.format(best_step=1e-5)
+        if not any(said.startswith(remedy.rstrip(".")) for said in remedies):
+            remedies.append(remedy)
+    lines = [(name, ", ".join(sorted(ends)), cell(" ".join(remedies))) for name, (ends, remedies) in rows.items()]
+    return table(["cause", "check", "what to try"], lines)
+
+
 TABLES: dict[tuple[str, str], Callable[[], str]] = {  # by page and name
     ("README.md", "censuses"): short_censuses,
     ("BENCHMARKS.md", "accuracy"): accuracy,
@@ -226,6 +240,7 @@ TABLES: dict[tuple[str, str], Callable[[], str]] = {  # by page and name
     ("docs/measured.md", "margins"): margins,
     ("docs/fidelities.md", "fidelities"): fidelities,
     ("docs/parts.md", "parts"): parts,
+    ("docs/measures.md", "causes"): known_causes,
 }
 
 

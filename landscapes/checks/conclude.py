@@ -18,13 +18,14 @@ from .history import ROWS, SAME, History
 from .horizons import FirstWrong
 from .memory import MemoryGrowth
 from .probe import EPS
-from .slopes import TOLERANCE, UNJUDGED, Judgement, Kind
+from .slopes import UNJUDGED, Judgement, Kind
 from .usefulness import Usefulness
 
 OVERWRITES = "writes to what it has read"  # how a simulator says so
 NAMED = 6  # parameters that are named, at most
 MANY_LINES = 20  # from which an average is told
 CLEAR_ERRORS = 3  # standard errors
+AVERAGE_TOLERANCE = 2e-3  # relative error of the average length of gradients that is no defect
 UNCLEAR = 0.05  # relative error of a slope that counts for the average
 STEEP_SHARE = 0.2
 
@@ -93,9 +94,9 @@ def _make(
     cause: Cause, signature: Signature, evidence: Evidence, texts: Texts, names: tuple[str, ...] = (),
     region: Region | None = None,
 ) -> Diagnosis:  # fmt: skip
-    what = cause.says.format_map({**evidence, **texts})
+    what, remedy = (text.format_map({**evidence, **texts}) for text in (cause.says, cause.remedy))
     return Diagnosis(
-        cause.name, signature.outcome, signature.certainty, what, cause.remedy, names, region, numbers=dict(evidence)
+        cause.name, signature.outcome, signature.certainty, what, remedy, names, region, numbers=dict(evidence)
     )
 
 
@@ -332,13 +333,11 @@ def _of_length(seen: Examination) -> Iterator[Diagnosis]:
     ratio = np.array([one.exact / one.slope.value for one in clear if one.slope])
     middle = float(np.median(ratio))
     spread = 1.4826 * float(np.median(np.abs(ratio - middle))) * 1.2533 / math.sqrt(len(ratio))
-    single = seen.probe.eps == EPS["float32"]
-    room = TOLERANCE["float32" if single else "float64"]
     evidence = {
         "length": middle,
         "length_low": middle - 2 * spread,
         "length_high": middle + 2 * spread,
-        "length_off": abs(middle - 1) - room - CLEAR_ERRORS * spread,
+        "length_off": abs(middle - 1) - AVERAGE_TOLERANCE - CLEAR_ERRORS * spread,
     }
     if (known := recognise("length", evidence)) is not None:
         yield _make(*known, evidence, {})

@@ -16,6 +16,7 @@ from .slopes import BAD, UNJUDGED, Judgement, Kind, Ladder, measure
 STEPS = (1e-8, 1e-6, 1e-4, 1e-3, 1e-2, 1e-1)
 RATIO_STEP = 1e-2  # of the box: the step of the slopes that the table compares gradients with
 AXIS_LINES = 80  # along axes, at most
+LINES_EACH, FEW_AXES, FEWEST_LINES = 6, 10, 12  # for each of few parameters, and in all
 AXES_AT_MOST = 40  # parameters of which every one is walked along
 BLAMED_POINTS = 3  # at which groups of parameters are halved
 FEW_GROUPS = 8  # of which nearly all are wrong where all parameters are
@@ -69,7 +70,7 @@ def walk_axes(probe: Probe, u: Float[Tensor, "batch dim"], found: Evaluation, se
 
 def axis_lines(dim: int) -> int:
     """Return along how many lines axes are walked."""
-    return min(AXIS_LINES, max(2 * min(dim, AXES_AT_MOST), 8 * dim))
+    return min(AXIS_LINES, max(FEWEST_LINES, min(dim, AXES_AT_MOST) * 2, LINES_EACH * min(dim, FEW_AXES)))
 
 
 def along(probe: Probe, u: Tensor, found: Evaluation, point: Tensor, axis: Tensor) -> AxisLines:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import permutations
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from .diagnosis import Region
 
 FEWEST = 3  # points, wrong or right, from which a rule is told
+CLEARLY = 3.0  # logarithm of how many times more choices there are than rules, where a rule is no chance
 WORST = 0.3  # of the rarer kind is what a rule may put on the wrong side
 AT_END = 0.02  # of a feature's range is what an interval may lack of its end
 CANDIDATES = 6  # features whose pairs are tried
@@ -55,7 +57,7 @@ def find_region(
             if error < best[0] - 1.5 / len(wrong):  # a second condition has to be worth it
                 best = (error, pair)
     error, intervals = best
-    if error > WORST * few / len(wrong):
+    if error > WORST * few / len(wrong) or _fits_by_chance(len(wrong), few, len(labels), len(intervals)):
         return None
     rules = []
     for one in intervals:
@@ -75,6 +77,13 @@ def _features(
     columns, labels = [values, *(count[:, None] for count in events.values())], [*names, *events]
     features = np.concatenate(columns, axis=1)
     return features, labels, np.ptp(features, axis=0)
+
+
+def _fits_by_chance(points: int, few: int, features: int, conditions: int) -> bool:
+    """Say whether some rule would tell so few points from the others by chance: there are more rules than choices."""
+    choices = math.lgamma(points + 1) - math.lgamma(few + 1) - math.lgamma(points - few + 1)
+    rules = conditions * math.log(features * points**2 / 2)
+    return choices < rules + CLEARLY
 
 
 def _narrowest(features: Points, wrong: NDArray[np.bool_]) -> list[int]:

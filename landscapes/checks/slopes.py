@@ -25,8 +25,11 @@ from .probe import EPS, Lines, Probe
 STEPS = (1e-8, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 3e-1)
 BETWEEN_STEPS = (1e-7, 3e-6, 3e-5, 3e-4, 3e-3, 3e-2)  # for slopes that the others leave undecided
 FINER_STEPS = (1e-13, 1e-12, 1e-11, 1e-10, 1e-9)  # where the gradient says that losses change within the smallest step
-TOLERANCE = {"float64": 1e-3, "float32": 3e-3}  # relative error of a gradient that is no defect
+TOLERANCE = 5e-3  # relative error of a gradient that is no defect
 ROUNDED = 1e3  # times the precision is what rounding makes of a gradient's components
+CLEAR = 0.02  # of the larger slope is what the error of a clear plateau is at most
+LONGEST_STEP = 0.02  # of the box, whose plateau contradicts a gradient: beyond it curvature looks like one
+LONGER_STEPS, TOLERATED = 3, 1e-6  # steps over which a gradient holds, and by which share of the loss it may fail below
 PLATEAU = 0.2  # of the larger is what two differences that agree may be apart
 WIDE, HALF, TWICE = 5, 0.5, 2.0  # times a step is the next; then half of the difference is the truncation, else twice
 RELIABLE = 0.1  # of the larger of both slopes is what the error of a difference may be, to be judged by
@@ -115,8 +118,7 @@ class Limits:
     @classmethod
     def of(cls, probe: Probe) -> Limits:
         """Return those of an objective, by what was seen of it so far."""
-        single = probe.eps == EPS["float32"]
-        return cls(probe.eps, probe.repeats, TOLERANCE["float32" if single else "float64"])
+        return cls(probe.eps, probe.repeats, TOLERANCE)
 
 
 def measure(probe: Probe, lines: Lines, steps: Sequence[float] = STEPS) -> Ladder:
@@ -137,7 +139,10 @@ def measure(probe: Probe, lines: Lines, steps: Sequence[float] = STEPS) -> Ladde
 
 
 def _undecided(found: Judgement) -> bool:
-    return found.kind in (Kind.NOISE, Kind.STEEP) or (found.kind == Kind.WRONG and found.slope is None)
+    """Say whether more steps may tell more: where none did, or the plateau that contradicts is no clear one."""
+    if found.kind != Kind.WRONG or found.slope is None:
+        return found.kind in (Kind.NOISE, Kind.STEEP)
+    return found.slope.error > CLEAR * max(abs(found.slope.value), abs(found.exact))
 
 
 def _needs_finer(found: Judgement, probe: Probe, lines: Lines, row: int, smallest: float) -> bool:
@@ -277,8 +282,8 @@ class _Line:
         change = np.fmax(np.abs(ahead), np.abs(behind))
         moves = bool(np.nanmax(change) > max(NOISE_MARGIN * noise, self.rounding))
         kind, slope = self._compare(central, front, back, change, noise)
-        if kind == Kind.WRONG and slope is not None and not self._holds(slope, noise):
-            kind = Kind.STEEP if abs(self.exact) > BEYOND * abs(slope.value) else Kind.NOISE
+        if kind == Kind.WRONG and slope is not None:
+            kind = self._doubt(slope, change, noise)
         limit = np.nan
         if slope is not None and max(abs(slope.value), abs(self.exact)) > 0:
             limit = self._margin(slope) / max(abs(slope.value), abs(self.exact))
@@ -310,6 +315,28 @@ class _Line:
         first = int(moved[0])
         return bool(self.steps[first] <= SMALL_GRAIN or change[first] <= ROUNDED_BY * self.eps * abs(self.loss))
 
+    def _doubt(self, slope: Slope, change: NDArray[np.float64], noise: float) -> Kind:
+        """Return what a gradient is that a plateau contradicts: wrong, unless something speaks against the plateau."""
+        if not self._holds(slope, noise):
+            return Kind.STEEP if abs(self.exact) > BEYOND * abs(slope.value) else Kind.NOISE
+        if slope.step > LONGEST_STEP:
+            return Kind.NOISE
+        return Kind.AGREES if self._agrees_beyond(slope, change) else Kind.WRONG
+
+    def _agrees_beyond(self, slope: Slope, change: NDArray[np.float64]) -> bool:
+        """Say whether the gradient is the slope over longer steps, and lacks less below than any solver tolerates.
+
+        Time steps that a solver adapts make losses uneven there.
+        """
+        ahead, behind = self.walked - self.loss
+        with np.errstate(invalid="ignore"):
+            near = np.abs((ahead - behind) / (2 * self.steps) - self.exact) <= self.relative * abs(self.exact)
+            off = np.fmax(np.abs(ahead - self.exact * self.steps), np.abs(behind + self.exact * self.steps))
+        longer = np.flatnonzero(near & (self.steps > slope.step))
+        if len(longer) < LONGER_STEPS:
+            return False
+        return bool(off[: longer[0]].max() <= TOLERATED * max(abs(self.loss), float(np.nanmax(change))))
+
     def _holds(self, slope: Slope, noise: float) -> bool:
         """Say whether differences over steps that are smaller than a plateau's are those of it, within their noise."""
         smaller = self.steps < slope.step
@@ -334,7 +361,7 @@ class _Line:
                 continue
             if best is None:
                 best = Slope(small.step, small.value, error)
-            elif abs(small.value - best.value) > error + best.error:
+            elif small.step > LONGEST_STEP or abs(small.value - best.value) > error + best.error:
                 break
             elif error < best.error:
                 best = Slope(small.step, small.value, error)

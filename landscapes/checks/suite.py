@@ -238,6 +238,10 @@ def _judge_gradient(seen: Examination, results: Results) -> Finding:
     if share.wrong or on_average or any(one.kind == Kind.WRONG for one in seen.axes.ladder.judged):
         figure = f"wrong at {share.describe()}: {told}" if share.wrong else f"{share.points} points: {told}"
         return Finding("", FAIL, figure, "; ".join(failing), numbers, seen.table())
+    if counted[Kind.FAILED] == share.points:
+        return Finding(
+            "", FAIL, f"none of {share.points} points has a loss", "nothing can be said of the gradient", numbers
+        )
     if share.judged < CANNOT_TELL * share.points:
         why = f"only {share.judged} of {share.points} points could be judged, so nothing is said of the gradient"
         return Finding("", WARN, f"cannot tell: {told}", why, numbers, seen.table())

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 FIGURES = {
     "Card": "landscapes.draw.figures.multiples:card_figure",
     "Census": "landscapes.draw.figures.multiples:census_figure",
+    "CheckReport": "landscapes.draw.figures.check:check_figure",
     "ConvergenceRecord": "landscapes.draw.figures.convergence:convergence_figure",
     "Episode": "landscapes.draw.figures.contact:episode_figure",
     "ExtremesRecord": "landscapes.draw.figures.extremes:extremes_figure",

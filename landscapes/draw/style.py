@@ -150,6 +150,31 @@ BOUNDARIES: tuple[dict[str, Any], dict[str, Any]] = (  # of accuracy, of stabili
     _BOUNDARY | {"linestyle": (0, (3, 1.5)), "marker": "s"},
     _BOUNDARY | {"marker": "o"},
 )
+CHECKED: dict[str, dict[str, Any]] = {  # what a check's curve compares; told apart without colour by lines and marks
+    "cosine": {"color": "#0072b2", "linestyle": "solid", "marker": "o", "linewidth": 1.5, "markersize": 4.5},
+    "sign": {"color": "#d55e00", "linestyle": (0, (4, 1.5)), "marker": "s", "linewidth": 1.5, "markersize": 4.5},
+    "smoothed": {
+        "color": INK, "marker": "D", "markersize": 6.0, "markerfacecolor": "white", "linestyle": "none",
+        "linewidth": 1.2, "zorder": 4,
+    },
+}  # fmt: skip
+CHECKED_BAND: dict[str, Any] = {"alpha": 0.16, "linewidth": 0.0, "zorder": 1.2}
+STEP_LINE: dict[str, Any] = {"color": QUIET, "linewidth": 0.9, "linestyle": (0, (1, 1.5)), "zorder": 1}
+_RIGHT: dict[str, Any] = {"facecolor": "#56b4e9", "linewidth": 0.0}
+_UNTOLD: dict[str, Any] = {"facecolor": "white", "edgecolor": QUIET, "linewidth": 0.6, "hatch": "////"}
+_FLAT: dict[str, Any] = {"facecolor": "#c9d3e0", "linewidth": 0.0}
+POINT_KINDS: dict[str, dict[str, Any]] = {  # how the gradient at a point compares with differences, by name of the kind
+    "agrees": {"facecolor": "#0072b2", "linewidth": 0.0},
+    "kink": _RIGHT,
+    "jump": _RIGHT,
+    "flat": _FLAT,
+    "exactly zero": _FLAT,
+    "lost in noise": _UNTOLD,
+    "too steep to judge": _UNTOLD,
+    "failed": _UNTOLD | {"hatch": "xxxx"},
+    "NaN": {"facecolor": "#d55e00", "linewidth": 0.0},
+    "wrong": {"facecolor": "#d55e00", "linewidth": 0.0},
+}
 INTERVAL_LINE: dict[str, Any] = {"color": FAINT, "linewidth": 1.0, "zorder": 1.5, "solid_capstyle": "butt"}
 CHOSEN_MARK: dict[str, Any] = {  # a ring around a variant that a fidelity's name should mean
     "linestyle": "none", "marker": "o", "markersize": 12.0, "markerfacecolor": "none", "markeredgewidth": 1.3,

@@ -57,13 +57,15 @@ class Hill(Bowl):
 
 
 def test_a_class_is_checked_and_its_findings_are_a_table() -> None:
-    passed, failed = gs.check(Bowl), gs.check(Hill(), power=0.3)
+    passed, failed = gs.check(Bowl), gs.check(Hill(), power="20%")
     assert passed.passed
     assert not failed.passed
-    assert failed.power == 0.3
+    assert (failed.power, failed.share.points) == (0.2, 16)
     table = failed.table()
     assert list(table.index) == [finding.check for finding in failed.findings]
     assert table.loc["gradient", "outcome"] == "fail"
+    assert failed.diagnoses[0].cause == "sign"
+    assert set(failed.parameter_table()["verdict"]) == {"wrong"}
     assert [one["check"] for one in failed.record()["checks"]] == list(table.index)
 
 

@@ -22,7 +22,7 @@ CELLS = (
     "run.plot()",
     'gs.race("bounce", ["random", "bo-leap"], budget=12, seeds=2).plot()',
     'env = gs.make("bounce")\nenv.episode(run.best.x).show()',
-    "gs.check(env, power=0.5)",
+    'gs.check(env, power="20%")',
     'gs.study("fidelity", env, points=4, settings=["dt"])',
     "gs.list_envs()",
     "gs.open_slice(s.folder)",

@@ -20,7 +20,7 @@ surface cut
 export cut --force
 compare cut cut
 plan slice branin --resolution 4
-check branin --points 2
+check branin --power 20%
 gallery list
 """.strip().splitlines()
 ELSEWHERE = {  # whose JSON other tests read

@@ -49,7 +49,7 @@ def test_a_plan_counts_what_the_verb_evaluates(
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("words", ["check branin --points 2", "pairs ackley --samples 2", "report ackley"])
+@pytest.mark.parametrize("words", ["check branin --power 20%", "pairs ackley --samples 2", "report ackley"])
 def test_verbs_whose_episodes_depend_on_what_they_find_are_planned_too(run: Run, tmp_path: Path, words: str) -> None:
     found = run.json("plan", *words.split())
     assert found["episodes"] > 10

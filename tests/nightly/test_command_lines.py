@@ -38,7 +38,7 @@ info
 methods cma-es
 bounce --axis y --resolution 3 --window 0:1 --fidelity draft
 bench branin --batch 2 --seconds 0
-check branin --points 2
+check branin --power 20%
 plan bounce --dims 0 1 --resolution 3 --workers 2 --over horizon --frames 2
 replay bounce --params point.json --no-film
 race branin --methods random,cma-es --budget 5 --seeds 2 --workers 2 --option cma-es.sigma=0.2

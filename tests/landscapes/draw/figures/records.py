@@ -7,15 +7,18 @@ import numpy as np
 import xarray as xr
 
 from gradscape.envs.records import Fidelity
+from gradscape.jobs.check import CheckReport
 from gradscape.jobs.league import simulated_scenes
 from gradscape.landscapes.checks.diagnosis import Diagnosis, Region
 from gradscape.landscapes.checks.examination import Share, could_be_missed
+from gradscape.landscapes.checks.slopes import Kind
+from gradscape.landscapes.checks.usefulness import UNKNOWN, Usefulness
 from gradscape.landscapes.draw import style
 from gradscape.landscapes.measures.card import Card, CardSlice, ClosedFormError, FailedCheck, Grade
 from gradscape.landscapes.measures.census import MEASURES, Census, CensusDesign, SurveyedSlice, conclude
 from gradscape.landscapes.measures.classify import WORDS
 from gradscape.landscapes.space import ParameterSpace
-from gradscape.landscapes.statistics import share
+from gradscape.landscapes.statistics import Estimate, share
 from gradscape.optim.registry import methods
 from gradscape.studies.convergence import (
     ConvergenceRecord,
@@ -188,3 +191,34 @@ def census() -> Census:
     found[5].loss[:] = np.nan
     about = {"env": "bowl", "fidelity": "draft", "other": "", "loss_unit": "m", "command": COMMAND.format("census")}
     return conclude(design, found, {}, seed=0, **about, identity=MEASURED, provenance=MEASURED)
+
+
+CURVE = tuple(
+    Usefulness(step, 64, Estimate(sign, sign - 0.1, sign + 0.02), Estimate(cosine, cosine - 0.4, cosine), 0.1, bias)
+    for step, sign, cosine, bias in (
+        (1e-6, 0.98, 1.0, UNKNOWN),
+        (1e-5, 0.98, 1.0, UNKNOWN),
+        (1e-3, 0.8, 0.5, Estimate(-0.2, -4.0, 0.3)),
+        (1e-2, 0.6, -0.5, Estimate(3.0, -1.0, 7.0)),
+        (1e-1, 0.7, 0.2, Estimate(0.25, 0.1, 0.4)),
+        (3e-1, 0.7, 0.1, UNKNOWN),
+    )
+)
+
+
+def checked(
+    curve: tuple[Usefulness, ...] = CURVE,
+    *,
+    kinds: dict[Kind, int] | None = None,
+    wrong: int = 27,
+    passed: bool = False,
+) -> CheckReport:
+    """Return a check that found points of every kind; of the steps 1e-4 is left out, so many changes were noise."""
+    region = Region("stiffness of the left spring between 0.52 and 0.95", ("stiffness of the left spring",), 0.0, 64)
+    cause = Diagnosis("factor 2", "fail", "certain", "the gradient is half of the slope", "Look.", ("a",), region)
+    return CheckReport(
+        env="triple-move", fidelity="reference", settings={}, options={}, device="cuda", engine="warp", power=0.05,
+        seed=0, passed=passed, findings=(), command=COMMAND.format("check"), diagnoses=() if passed else (cause,) * 2,
+        share=Share(wrong, 64, 70, 0.3, 0.55, 0.046), usefulness=curve,
+        kinds=dict(zip(Kind, range(1, 20, 2), strict=False)) if kinds is None else kinds,
+    )  # fmt: skip

@@ -20,6 +20,7 @@ from gradscape.landscapes.draw.figure import FIGURES as DISPATCHED
 from gradscape.landscapes.draw.figure import figure_of
 from gradscape.landscapes.draw.figures import page
 from gradscape.landscapes.draw.figures.accuracy import fidelity_figure, model_figure
+from gradscape.landscapes.draw.figures.check import check_figure
 from gradscape.landscapes.draw.figures.comparison import comparison_figure
 from gradscape.landscapes.draw.figures.contact import Caption, episode_figure
 from gradscape.landscapes.draw.figures.contour import landscape_figure
@@ -50,7 +51,7 @@ from gradscape.optim.registry import methods
 
 from ....made_studies import fidelities, study
 from ...test_overlay import LAID, SLICE
-from .records import card, census, convergence, extremes, league, mixed
+from .records import card, census, checked, convergence, extremes, league, mixed
 from .test_contour import BOUNCES, DATASET, LINE, Bowl, plane
 from .test_search import race, table
 from .test_sweep import SWEEP
@@ -153,6 +154,10 @@ FIGURES: dict[str, list[Callable[[float | None], page.Picture]]] = {
     ],
     "card_figure": [lambda width: card_figure(card(), width=width)],
     "census_figure": [lambda width: census_figure(census(), width=width)],
+    "check_figure": [
+        lambda width: check_figure(checked(), width=width),
+        lambda width: check_figure(checked((), kinds={}), width=width),
+    ],
     "extremes_figure": [lambda width: extremes_figure(extremes(), width=width)],
     "league_figure": [lambda width: league_figure(league(), width=width)],
     "frame_figure": [lambda width: frame_figure(SWEEP, 1, Scales.of(SWEEP), width=width)],

@@ -1,0 +1,54 @@
+"""What a case of the examination is: an objective, and what a check must say of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+import gradscape as gs
+
+Evidence = Literal["gradient", "nan", "wide", "repeat", "rows", "losses", "finer", "growth", "memory"]
+"""How a defect shows itself to somebody who knows it: the gradient is no slope of the loss, it is NaN, it is no slope
+over a tenth of the box, the same call gives another result, a row depends on others, a loss is another one where a
+gradient is asked for, the gradient is another one at a finer time step, it is larger than 10^6, or each call keeps
+memory."""
+
+Losses = Callable[[NDArray[np.float64]], NDArray[np.float64]]  # of points, shape (batch, dim)
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """An objective, and what a check must say of it.
+
+    `build` makes it anew, without anything that calls before have left. `causes` are the names of causes that are
+    right, none for a healthy function; `parameters` are those that must be named. `edges` are the places, by parameter
+    and in its unit, where a region begins or ends, `region` says which points, shape (batch, dim), lie in it, and
+    `step` is the last step that the gradient is right at. `warns` is true where a warning is enough. `evidence` says
+    how the defect shows itself, and `reference` gives the losses in float64 where the program's own is another.
+    `place` is where the truth is looked at, as shares of the box; None for random points.
+    """
+
+    name: str
+    kind: str
+    framework: str
+    dim: int
+    build: Callable[[], gs.Environment]
+    causes: tuple[str, ...] = ()
+    parameters: tuple[str, ...] = ()
+    edges: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    region: Callable[[Tensor], Tensor] | None = None
+    step: int | None = None
+    warns: bool = False
+    evidence: Evidence = "gradient"
+    reference: Losses | None = None
+    place: float | tuple[float, ...] | None = None
+
+    @property
+    def healthy(self) -> bool:
+        """Whether a check must let it pass."""
+        return not self.causes
