@@ -405,7 +405,7 @@ class _Line:
         jumps = first > BEYOND * (noise if np.isfinite(noise) else 0.0) + BEYOND * abs(self.exact) * self.steps[0]
         if front is not None and back is not None:
             low, high = sorted((front, back), key=lambda one: one.value)
-            apart = high.value - low.value > 2 * (low.error + high.error)
+            apart = high.value - low.value > low.error + high.error
             within = low.value - self._margin(low) <= self.exact <= high.value + self._margin(high)
             return Kind.KINK if apart and within else None
         if self._agrees(front) or self._agrees(back):
