@@ -25,7 +25,7 @@ Losses = Callable[[NDArray[np.float64]], NDArray[np.float64]]  # of points, shap
 class Case:
     """An objective, and what a check must say of it.
 
-    `build` makes it anew, without anything that calls before have left. `causes` are the names of causes that are
+    `build` makes it again, without anything that earlier calls have left. `causes` are the names of causes that are
     right, none for a healthy function; `parameters` are those that must be named. `edges` are the places, by parameter
     and in its unit, where a region begins or ends, `region` says which points, shape (batch, dim), lie in it, and
     `step` is the last step that the gradient is right at. `warns` is true where a warning is enough. `evidence` says

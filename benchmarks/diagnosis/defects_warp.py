@@ -260,7 +260,7 @@ class Shaken:
 def case(
     kind: str, word: str, fn: Callable[[], Any], causes: tuple[str, ...], space: gs.ParameterSpace = POINTS, **how: Any
 ) -> Case:
-    """Return a case of a function of Warp, made anew for each objective; nothing looks for overwritten arrays."""
+    """Return a case of a function of Warp, made again for each objective; nothing looks for overwritten arrays."""
     name = f"{kind.replace(' ', '-')}-warp-{word}-{space.dim}"
     build = lambda: gs.from_warp(fn(), space, name=name, device="cpu", check_overwrites=False)  # noqa: E731
     return Case(name, kind, "warp", space.dim, build, causes, **how)

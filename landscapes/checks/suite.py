@@ -191,7 +191,7 @@ def _checks(
 
 
 def _keep_promise(name: str, run: Callable[[Subject], Finding], subject: Subject, results: Results) -> Finding:
-    """Make a check of calls, and keep what it says of causes."""
+    """Make a check of calls, and remember its name where it fails: it tells causes."""
     found = run(subject)
     if found.outcome == FAIL:
         results.calls = replace(results.calls, broken=(*results.calls.broken, name))
