@@ -17,6 +17,7 @@ from .finding import FAIL
 from .history import ROWS, SAME, History
 from .horizons import FirstWrong
 from .memory import MemoryGrowth
+from .parameters import AGREES, WRONG
 from .probe import EPS
 from .slopes import UNJUDGED, Judgement, Kind
 from .usefulness import Usefulness
@@ -27,7 +28,7 @@ MANY_LINES = 20  # from which an average is told
 CLEAR_ERRORS = 3  # standard errors
 AVERAGE_TOLERANCE = 2e-3  # relative error of the average length of gradients that is no defect
 UNCLEAR = 0.05  # relative error of a slope that counts for the average
-STEEP_SHARE = 0.2
+FEWEST_CONTROLS = 3  # parameters, wrong and right ones, from which it is told that the first are wrong
 
 
 @dataclass(frozen=True)
@@ -68,12 +69,13 @@ class Further:
     """What can be asked about a point whose gradient is NaN or wrong, once there is one.
 
     `nan_origin` and `wrong_origin` say where that begins, and `first_wrong` from which length of an episode on, at a
-    random point or, numbered from -1 down, at a special place.
+    random point or, numbered from -1 down, at a special place; `has_length` says that episodes have one.
     """
 
     nan_origin: Callable[[int], str] = lambda row: ""
     wrong_origin: Callable[[int], str] = lambda row: ""
     first_wrong: Callable[[Sequence[int]], FirstWrong | None] = lambda rows: None
+    has_length: bool = False
 
 
 def conclude(seen: Examination, calls: Calls, further: Further | None = None) -> tuple[Diagnosis, ...]:
@@ -189,7 +191,10 @@ def _of_wrong(seen: Examination, calls: Calls, further: Further) -> Iterator[Dia
     region = seen.region if rows and not seen.rows(Kind.NAN) else None
     evidence = _wrong_numbers(seen) | calls.evidence() | {"second_backward": calls.second_backward}
     begins, late = further.wrong_origin(rows[0]) if rows else "", further.first_wrong(rows)
-    evidence |= {"overwrites": float(OVERWRITES in begins)}
+    early = _early(seen) if seen.blamed is None else set()
+    names = names or _named(seen, early)
+    evidence |= {"overwrites": float(OVERWRITES in begins), "early": float(bool(early))}
+    evidence |= {"horizon": float(further.has_length)}
     if late is not None and late.right is not None:
         evidence |= {"right_until": late.right, "first_wrong": late.length}
     texts = {
@@ -215,6 +220,19 @@ def _when(late: FirstWrong | None) -> str:
     if late is None or late.right is None:
         return ""
     return f"; it is right in episodes up to a length of {late.right:g}, and wrong from {late.length:g} on"
+
+
+def _early(seen: Examination) -> set[int]:
+    """Return the first parameters, where gradients are wrong by all that were walked of them and right by the others.
+
+    They may be the controls of the first steps. Empty where it is not so.
+    """
+    verdicts = [row.verdict for row in seen.parameters()]
+    wrong = [axis for axis, one in enumerate(verdicts) if one in WRONG]
+    right = [axis for axis, one in enumerate(verdicts) if one == AGREES]
+    if min(len(wrong), len(right)) < FEWEST_CONTROLS or max(wrong) > min(right):
+        return set()
+    return set(range(max(wrong) + 1))
 
 
 REMEDY = "Compare the gradient with differences along one parameter, at one of these points, step by step."

@@ -179,6 +179,7 @@ def table(
 
 WRONG = ("wrong", DETACHED := "gradient 0, and the loss is not flat")
 STEPPED = "gradient 0, and the loss moves in steps"
+AGREES = "agrees"
 
 
 def _verdict(judged: Sequence[Judgement], wrong: int | bool, zero: float, stepped: bool) -> str:
@@ -192,4 +193,4 @@ def _verdict(judged: Sequence[Judgement], wrong: int | bool, zero: float, steppe
         return "the loss does not depend on it"
     if all(one.kind in UNJUDGED for one in judged):
         return "cannot be judged"
-    return "agrees"
+    return AGREES

@@ -265,6 +265,7 @@ def _further(objective: Objective, seen: Examination, how: Settings) -> Further:
         lambda row: _quietly(objective.nan_origin, point(row)),
         lambda row: _quietly(objective.wrong_origin, point(row)),
         first_wrong,
+        has_length=bool(how.lengths),
     )
 
 
