@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from ..jobs.watch import Planned, Watch
-from .call import calling, current, verb
-from .options import ARGUMENT
+from .call import calling, current, hint_of, verb
+from .options import ARGUMENT, Out
 
 if TYPE_CHECKING:
     from ..jobs.plan import Plan
@@ -55,7 +55,7 @@ def plan(verb: Annotated[Callable[..., Any], ARGUMENT], *given: Any, **named: An
 def work_of(verb: Callable[..., Any], given: Sequence[Any], named: dict[str, Any]) -> Sequence[Work]:
     """Return what a call of a verb would simulate. Raises ValueError for what the verb refuses before that."""
     with tempfile.TemporaryDirectory() as folder:
-        if "out" in signature(verb).parameters:
+        if (out := signature(verb).parameters.get("out")) and hint_of(verb, out.annotation) is Out:
             named = named | {"out": str(Path(folder) / "planned")}
         try:
             with calling(replace(current(), watch=_Planner())):

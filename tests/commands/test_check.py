@@ -73,7 +73,7 @@ def test_bounce_passes_at_draft(run: Run, tmp_path: Path) -> None:
     assert checks["corners"]["numbers"]["finite"] == 8
     for name in ("dt 8x", "horizon 8x", "ke 100000", "10% outside the box"):
         assert sum(checks[name]["numbers"][kind] for kind in ("finite", "non-finite", "escaped", "error")) >= 2
-    assert "bounce · draft · cpu · warp · 59 points: some 1648 episodes and" in done.stderr
+    assert "bounce · draft · cpu · warp · 59 points: some 1576 episodes and" in done.stderr
     assert not list(tmp_path.iterdir())
 
 
