@@ -23,6 +23,7 @@ def show_entries(found: list[Entry], console: Console) -> None:
     from ..envs.registry import installs
 
     shown = table("name", "dim", "parameters", "model", "fidelities", title="environments")
+    shown.columns[0].no_wrap = True  # what one types
     for entry in found:
         style = "dim" if installs(entry) else None
         shown.add_row(entry.name, entry.dim, entry.parameters, entry.model, ", ".join(entry.fidelities), style=style)
