@@ -187,12 +187,6 @@ class Card:
 
         return figure_of(self, width)
 
-    def page(self) -> str:
-        """Return the card as a page of its own, with a panel of each slice."""
-        from ..draw.card import card_page
-
-        return card_page(self)
-
     def count(self, verdict: Verdict) -> int:
         """How many engines in scenes have a verdict."""
         return sum(one.verdict == verdict for one in self.grades)

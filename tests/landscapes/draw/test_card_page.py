@@ -6,13 +6,13 @@ from typing import Any
 
 import pytest
 
-from gradscape.landscapes.draw.card import card_scenes
+from gradscape.landscapes.draw.card import card_page, card_scenes
 
 from .figures.records import card
 
 
 def test_the_page_holds_all_it_shows() -> None:
-    page = card().page()
+    page = card_page(card())
     assert not re.findall(r'(?:src|href)="(?!data:)', page)
     assert not re.search(r"https?://|@import|url\(", page)
     assert all(said in page for said in ("sign", "22 to 46 %", "95 % of points: below 210 %", "speed x below 0.3"))
@@ -33,7 +33,7 @@ def test_panels_of_a_scene_share_their_scale_and_say_how_many_arrows_oppose() ->
 def test_it_can_be_read_wide_and_narrow_in_light_and_dark(
     browser: Any, tmp_path: Path, width: int, scheme: str
 ) -> None:
-    (tmp_path / "card.html").write_text(card().page(), encoding="utf-8")
+    (tmp_path / "card.html").write_text(card_page(card()), encoding="utf-8")
     page = browser.new_page(viewport={"width": width, "height": 900}, color_scheme=scheme)
     page.goto((tmp_path / "card.html").as_uri())
     assert page.evaluate("document.documentElement.scrollWidth") <= width
