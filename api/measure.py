@@ -53,7 +53,7 @@ CheckFolder = Annotated[
 def check(
     scene: Scene,
     *,
-    power: Share = 0.05,
+    power: Share = "5%",
     seed: Seed = 0,
     jobs: int = 1,
     junit: str | Path | None = None,
@@ -70,7 +70,7 @@ def check(
     other: Scene,
     /,
     *others: Scene,
-    power: Share = 0.05,
+    power: Share = "5%",
     seed: Seed = 0,
     jobs: int = 1,
     junit: str | Path | None = None,
@@ -82,7 +82,7 @@ def check(
 def check(
     scene: Scene,
     *others: OtherScenes,
-    power: Share = 0.05,
+    power: Share = "5%",
     seed: Seed = 0,
     jobs: Count = 1,
     junit: Junit = None,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from ..landscapes.measures.card import describe_share
 from .terminal import Console, table
 
 if TYPE_CHECKING:
@@ -13,6 +12,8 @@ if TYPE_CHECKING:
 
 def show(found: Card, console: Console) -> None:
     """Print a row for each engine in each scene: verdict, share of points wrong, cause, median error."""
+    from ..landscapes.measures.card import describe_share
+
     shown = table("scene", "engine", "verdict", "points wrong", "cause", "off the closed form")
     for one in found.grades:
         off = describe_share(one.closed_form.median) if one.closed_form is not None else ""

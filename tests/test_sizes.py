@@ -21,7 +21,7 @@ pytestmark = pytest.mark.e2e
 
 HUGE = 10**15
 ROOM = 2 << 30  # bytes that a command may take beyond what it is loaded with
-COUNTS = {"--seed", "--top", "--workers", "--port"}  # whole numbers that allocate nothing
+COUNTS = {"--seed", "--top", "--workers", "--port", "--jobs"}  # whole numbers that allocate nothing
 OF_A_GRID = {("slice", "--budget"), ("census", "--gradients")}  # nor does one that is held to the points of a grid
 OF_A_GRID |= {("slice", "--gradients"), ("sweep", "--gradients"), ("study", "--grid")}
 SUBJECTS = {"env": "ackley", "SLICE": "cut", "RUNS": "run", "WHAT": "cut", "KIND": "extremes"}
