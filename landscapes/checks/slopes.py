@@ -29,10 +29,12 @@ TOLERANCE = 5e-3  # relative error of a gradient that is no defect
 ROUNDED = 1e3  # times the precision is what rounding makes of a gradient's components
 CLEAR = 0.02  # of the larger slope is what the error of a clear plateau is at most
 LONGEST_STEP = 0.02  # of the box, whose plateau contradicts a gradient: beyond it curvature looks like one
+UNLIKE, FEWEST_OTHERS = 0.1, 5  # share of other lines, and of their slopes, that differences are off over such steps
 LONGER_STEPS, TOLERATED = 3, 1e-6  # steps over which a gradient holds, and by which share of the loss it may fail below
 PLATEAU = 0.2  # of the larger is what two differences that agree may be apart
 WIDE, HALF, TWICE = 5, 0.5, 2.0  # times a step is the next; then half of the difference is the truncation, else twice
 RELIABLE = 0.1  # of the larger of both slopes is what the error of a difference may be, to be judged by
+HIGH, HIGH_MARGIN, MOST_MARGIN = 0.9, 1.5, 10  # times this quantile, and at most so many times the median, is the same
 NOISE_MARGIN = 3  # times the typical noise is what one difference may show
 ROUGH = 100  # times rounding is what losses change between neighbours where they are rough, not rounded
 MOST_FINER = 24  # lines, at most, that are walked over finer steps
@@ -129,12 +131,34 @@ def measure(probe: Probe, lines: Lines, steps: Sequence[float] = STEPS) -> Ladde
     if open_ and further:
         ladder = _extend(probe, ladder, open_, further)
     rough = [one for one, found in enumerate(ladder.judged) if _needs_finer(found, probe, lines, one, ladder.steps[0])]
-    if not rough:
-        return ladder
-    ladder = _extend(probe, ladder, rough[:MOST_FINER], list(FINER_STEPS))
-    judged = list(ladder.judged)
-    for row in rough[MOST_FINER:]:
-        judged[row] = replace(judged[row], kind=Kind.STEEP)
+    if rough:
+        ladder = _extend(probe, ladder, rough[:MOST_FINER], list(FINER_STEPS))
+        judged = list(ladder.judged)
+        for row in rough[MOST_FINER:]:
+            judged[row] = replace(judged[row], kind=Kind.STEEP)
+        ladder = replace(ladder, judged=tuple(judged))
+    return _distrust(ladder)
+
+
+def _distrust(ladder: Ladder) -> Ladder:
+    """Let no plateau contradict a gradient by steps over which differences are not the slope on other lines either.
+
+    Noise may be larger than was seen; and losses that jump between steps of time have slopes below the jumps, where
+    float32 may see none, and others above.
+    """
+    differences, judged = ladder.differences.numpy(), list(ladder.judged)
+    right = [
+        (row, one.slope.step, one.exact) for row, one in enumerate(judged) if one.kind == Kind.AGREES and one.slope
+    ]
+    for row, one in enumerate(judged):
+        if one.kind != Kind.WRONG or one.slope is None:
+            continue
+        level = ladder.steps.index(one.slope.step)
+        others = [(differences[level, other], exact) for other, step, exact in right if step != one.slope.step]
+        known = [(value, exact) for value, exact in others if np.isfinite(value)]
+        off = [abs(value - exact) > UNLIKE * max(abs(value), abs(exact)) for value, exact in known]
+        if len(off) >= FEWEST_OTHERS and np.mean(off) > UNLIKE:
+            judged[row] = replace(one, kind=Kind.NOISE)
     return replace(ladder, judged=tuple(judged))
 
 
@@ -235,10 +259,17 @@ def _typical_noise(
         return np.zeros(len(loss))
     with np.errstate(divide="ignore", invalid="ignore"):
         shares = (second / np.abs(loss))[known & (loss != 0)]
-    usual = float(np.median(second[known]))
-    share = float(np.median(shares)) if len(shares) else 0.0
-    found: NDArray[np.float64] = NOISE_MARGIN * np.minimum(usual, share * np.abs(loss))
+    usual = _spread_of(second[known])
+    share = _spread_of(shares) if len(shares) else 0.0
+    found: NDArray[np.float64] = np.minimum(usual, share * np.abs(loss))
     return found
+
+
+def _spread_of(values: NDArray[np.float64]) -> float:
+    """Return what nearly all of the values stay below, told from the middle ones and not from a few large ones."""
+    middle = float(np.median(values))
+    high = HIGH_MARGIN * float(np.quantile(values, HIGH))
+    return min(max(high, NOISE_MARGIN * middle), MOST_MARGIN * middle)
 
 
 def _typical_slope(slope: NDArray[np.float64], lines: Lines) -> NDArray[np.float64]:
