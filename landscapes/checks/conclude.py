@@ -18,7 +18,6 @@ from .history import ROWS, SAME, History
 from .horizons import FirstWrong
 from .memory import MemoryGrowth
 from .parameters import AGREES, WRONG
-from .probe import EPS
 from .slopes import UNJUDGED, Judgement, Kind
 from .usefulness import Usefulness
 
@@ -131,7 +130,7 @@ def _of_calls(seen: Examination, calls: Calls) -> Iterator[Diagnosis]:
 
 def _of_grain(seen: Examination, calls: Calls) -> Iterator[Diagnosis]:
     probe, loss = seen.probe, seen.found.loss[seen.found.loss.isfinite()]
-    if probe.eps != EPS["float32"] or not probe.grain or not len(loss):
+    if not probe.single or not probe.grain or not len(loss):
         return
     grad = seen.found.grad
     zero = float((grad[seen.found.has_gradient] == 0).all(dim=1).double().mean()) if grad is not None else 0.0
@@ -254,7 +253,7 @@ def _wrong_numbers(seen: Examination) -> Evidence:
     axes = seen.at_wrong or seen.axes
     wrong, known = Samples.of(axes, wrong=True), Samples.of(axes, wrong=False)
     space, dim = seen.probe.objective.space, len(seen.names)
-    single = seen.probe.eps == EPS["float32"]
+    single = seen.probe.single
     found: Evidence = {"single": float(single), "best_step": 1e-3 if single else 1e-5}
     if not len(wrong):
         return found | numbers_of.of_lines(seen.random.judged)
@@ -299,13 +298,13 @@ def _of_steep(seen: Examination) -> Iterator[Diagnosis]:
 
 
 def _of_noise(seen: Examination) -> Iterator[Diagnosis]:
-    lines = [one for one in seen.random.judged if math.isfinite(one.noise)]
+    lines = [one for _, one in _lines(seen)]
     if not lines:
         return
     loss = float(seen.found.loss[seen.found.loss.isfinite()].abs().median())
     noise = float(np.median([one.noise for one in lines]))
     evidence = {
-        "single": float(seen.probe.eps == EPS["float32"]),
+        "single": float(seen.probe.single),
         "noise": noise,
         "noise_ratio": noise / (seen.probe.eps * loss) if loss else 0.0,
         "noise_share": len(seen.rows(Kind.NOISE)) / len(seen.random.judged),

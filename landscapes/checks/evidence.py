@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ..space import ParameterSpace
 from .parameters import AxisLines
-from .probe import EPS, Probe
+from .probe import Probe
 from .slopes import Judgement, Kind
 
 STEADY = 0.02  # of a ratio is what others may be off by, to be the same
@@ -259,7 +259,7 @@ def as_difference(probe: Probe, axes: AxisLines, rows: Sequence[int]) -> Evidenc
 
 def roughness(probe: Probe, u: Float[Tensor, "point dim"]) -> Evidence:
     """Return by how much gradients of points that are next to each other differ: `rough`, relative to their length."""
-    apart = NEAR[probe.eps == EPS["float32"]]
+    apart = NEAR[probe.single]
     near = (u + apart * torch.where(u > 0.5, -1.0, 1.0)).clamp(0, 1)
     here, there = (probe.gradient(one).grad for one in (u, near))
     if here is None or there is None:

@@ -13,7 +13,7 @@ from ..objective import Objective
 from .evidence import Evidence
 from .examination import Examination
 from .probe import Lines, Probe
-from .slopes import Kind
+from .slopes import Kind, Ladder
 
 LINES = 12  # along which time steps are compared, at most
 FEWEST_LINES = 5
@@ -39,18 +39,9 @@ def compare_time_steps(seen: Examination, finer: Mapping[float, Callable[[], Obj
             found = probe.gradient(lines.u)
             along = Lines.through(probe, lines.u, lines.direction, torch.arange(len(rows)), found)
             slopes[factor] = along.slope.numpy()
-        near, far = _differences(probe, along)
+        near, far = Ladder(along, STEPS, along.walk(probe, list(STEPS)), ()).differences.numpy()
         return _compare(slopes, near, far)
     return {}
-
-
-def _differences(probe: Probe, lines: Lines) -> list[NDArray[np.float64]]:
-    """Return differences over both steps, one-sided where the box ends."""
-    ahead, behind = lines.walk(probe, list(STEPS))
-    steps = torch.tensor(STEPS, dtype=torch.float64)[:, None]
-    front, back = (ahead - lines.loss) / steps, (lines.loss - behind) / steps
-    both = torch.where((front + back).isfinite(), (front + back) / 2, torch.where(front.isfinite(), front, back))
-    return list(both.numpy())
 
 
 def _compare(

@@ -71,6 +71,11 @@ class Probe:
         return EPS["float64"]
 
     @property
+    def single(self) -> bool:
+        """Whether losses are computed in float32."""
+        return self.eps == EPS["float32"]
+
+    @property
     def grain(self) -> float:
         """Largest power of two that all losses are multiples of, 0 where it is no coarser than float64 [loss unit]."""
         loss, found = self._different, self._lowest_bit

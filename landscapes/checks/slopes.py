@@ -139,7 +139,7 @@ def measure(probe: Probe, lines: Lines, steps: Sequence[float] = STEPS) -> Ladde
             judged[row] = replace(judged[row], kind=Kind.STEEP)
         ladder = replace(ladder, judged=tuple(judged))
     ladder = _distrust(ladder)
-    return _forgive_few(ladder) if probe.eps == EPS["float32"] else ladder
+    return _forgive_few(ladder) if probe.single else ladder
 
 
 def _forgive_few(ladder: Ladder) -> Ladder:
