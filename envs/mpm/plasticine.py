@@ -117,7 +117,11 @@ class Anchor:
 
 @dataclass(frozen=True)
 class Scene:
-    """All that makes one scene; `posts` are tools that stay, `target` is empty where a demonstration makes it."""
+    """All that makes one scene; `posts` are tools that stay, `target` is empty where a demonstration makes it.
+
+    `yield_stress` [Pa] is the norm of the stress's deviator where plasticine yields, as in PlasticineLab. Von Mises'
+    stress is sqrt(3/2) times as large: a bar of "50 Pa" yields in tension at 61 Pa.
+    """
 
     pieces: tuple[Piece, ...]
     anchors: tuple[Anchor, ...]
@@ -307,6 +311,7 @@ class JudgedStage(Stage):
 class Plasticine(MpmScene):
     """Model: MLS-MPM, fixed-corotated elasticity, von Mises plasticity in log strain; x right, y up, z to the front.
 
+    A yield stress is the norm of the stress's deviator: in tension a body yields at sqrt(3/2) times as much.
     Young's modulus 5000 Pa at a density of 1 kg/m^3; gravity 30 m/s^2; 0.1 s. Tools are signed distances that move as
     the parameters say and are felt by grid nodes, with Coulomb friction, through a shell (3.5 mm) in which their
     influence falls to nothing. The floor is thick: its nodes reach up to y = 1/32 m, and what lies lower rests among

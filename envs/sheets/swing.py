@@ -53,7 +53,8 @@ class Swing(SheetScene):
     x right, y up, z to the front. Springs resist stretching and shear; a plate's stiffness of 3e-4 N m resists bending.
     An episode is 0.5 s: longer ones sway on, and meshes differ more.
     Loss [m] against where example `target` brings the cloth at the same fidelity: the centre of mass's distance
-    (single), or the mean distance of the corners (corner) or of all vertices (mesh), by option.
+    (single), or the mean distance of the corners (corner) or of all vertices (mesh), by option. Two of the four corners
+    are held and never miss their places, so that `corner` is half the mean distance of the two that move.
     Simplifications: the anchors stand still, since what they hold is what makes the cloth swing; air is felt as a drag
     of 0.5/s; stretching is resisted by 10 N/m, softer than fabric, so that a step may be long; the resistance to
     bending is ours, so that folds are wider than a few cells. Coarse meshes do not fold as fine ones do: of 32 points
