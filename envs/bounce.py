@@ -63,7 +63,7 @@ class Bounce(Environment):
     the same time: at steps of 1/480, 1/3840, 1/30720 s its median relative error against the model is 8.0, 7.2, 7.9,
     its sign right in 61, 57, 57 % of 23 throws that bounce. contacts=touch splits the step at the time of touch (0.37,
     0.24, 0.023), contacts=smooth lets damping grow with depth (2.8, 0.29, 0.026): both converge at first order, signs
-    right in 100 % at last. At 1/480 s the losses of contacts=touch are less accurate than those of the default, although
+    right in 100 % at last. At 1/480 s the losses of contacts=touch are less accurate than the default's, although
     its slopes are more truthful. The default stays the paper's contact, whose landscape the scene is about.
     Simplifications: the ball does not spin (option), since the paper's contact is one of points; there is no air
     (option), and no wall, since the policy has to use the ground. Viscous friction is capped so that a step cannot
