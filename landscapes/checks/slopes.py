@@ -109,6 +109,13 @@ class Ladder:
         central = (ahead + behind) / 2
         return torch.where(central.isfinite(), central, torch.where(ahead.isfinite(), ahead, behind))
 
+    def with_kind(self, rows: Sequence[int], kind: Kind) -> Ladder:
+        """Return this ladder with some of its lines judged to be of a kind."""
+        judged = list(self.judged)
+        for row in rows:
+            judged[row] = replace(judged[row], kind=kind)
+        return replace(self, judged=tuple(judged))
+
 
 @dataclass(frozen=True)
 class Limits:
@@ -134,28 +141,19 @@ def measure(probe: Probe, lines: Lines, steps: Sequence[float] = STEPS) -> Ladde
     rough = [one for one, found in enumerate(ladder.judged) if _needs_finer(found, probe, lines, one, ladder.steps[0])]
     if rough:
         ladder = _extend(probe, ladder, rough[:MOST_FINER], list(FINER_STEPS))
-        judged = list(ladder.judged)
-        for row in rough[MOST_FINER:]:
-            judged[row] = replace(judged[row], kind=Kind.STEEP)
-        ladder = replace(ladder, judged=tuple(judged))
+        ladder = ladder.with_kind(rough[MOST_FINER:], Kind.STEEP)
     ladder = _distrust(ladder)
     return _forgive_few(ladder) if probe.single else ladder
 
 
 def _forgive_few(ladder: Ladder) -> Ladder:
     """Let few small disagreements in float32 be noise: losses that jump between steps of time hide below rounding."""
-    judged = list(ladder.judged)
     small = [
         row
-        for row, one in enumerate(judged)
-        if one.kind == Kind.WRONG
-        and one.slope is not None
-        and abs(one.slope.value - one.exact) <= SMALL * max(abs(one.slope.value), abs(one.exact))
+        for row, one in enumerate(ladder.judged)
+        if one.kind == Kind.WRONG and one.slope is not None and _alike(one.slope.value, one.exact, SMALL)
     ]
-    if len(small) < MANY * len(judged):
-        for row in small:
-            judged[row] = replace(judged[row], kind=Kind.NOISE)
-    return replace(ladder, judged=tuple(judged))
+    return ladder.with_kind(small, Kind.NOISE) if len(small) < MANY * len(ladder.judged) else ladder
 
 
 def _distrust(ladder: Ladder) -> Ladder:
@@ -164,20 +162,26 @@ def _distrust(ladder: Ladder) -> Ladder:
     Noise may be larger than was seen; and losses that jump between steps of time have slopes below the jumps, where
     float32 may see none, and others above.
     """
-    differences, judged = ladder.differences.numpy(), list(ladder.judged)
+    differences, distrusted = ladder.differences.numpy(), list[int]()
     right = [
-        (row, one.slope.step, one.exact) for row, one in enumerate(judged) if one.kind == Kind.AGREES and one.slope
+        (row, one.slope.step, one.exact)
+        for row, one in enumerate(ladder.judged)
+        if one.kind == Kind.AGREES and one.slope
     ]
-    for row, one in enumerate(judged):
+    for row, one in enumerate(ladder.judged):
         if one.kind != Kind.WRONG or one.slope is None:
             continue
         level = ladder.steps.index(one.slope.step)
         others = [(differences[level, other], exact) for other, step, exact in right if step != one.slope.step]
-        known = [(value, exact) for value, exact in others if np.isfinite(value)]
-        off = [abs(value - exact) > UNLIKE * max(abs(value), abs(exact)) for value, exact in known]
+        off = [not _alike(value, exact, UNLIKE) for value, exact in others if np.isfinite(value)]
         if len(off) >= FEWEST_OTHERS and np.mean(off) > UNLIKE:
-            judged[row] = replace(one, kind=Kind.NOISE)
-    return replace(ladder, judged=tuple(judged))
+            distrusted.append(row)
+    return ladder.with_kind(distrusted, Kind.NOISE)
+
+
+def _alike(one: float, other: float, share: float) -> bool:
+    """Say whether two slopes differ by at most a share of the larger."""
+    return abs(one - other) <= share * max(abs(one), abs(other))
 
 
 def _undecided(found: Judgement) -> bool:
