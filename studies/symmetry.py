@@ -17,7 +17,7 @@ import torch
 
 from ..envs.records import Fidelity
 from ..envs.registry import as_environment
-from ..landscapes.measures.floor import Floor, floor_between, refuse_other_space, replica_cosines
+from ..landscapes.measures.floor import Floor, floor_between, format_cosine, refuse_other_space, replica_cosines
 from ..landscapes.objective import Evaluation
 from ..landscapes.plain import digest
 from ..landscapes.statistics import Estimate, spearman
@@ -113,7 +113,7 @@ class SymmetryRecord(StudyRecord):
             return ""
         slopes = ""
         if cosine is not None and math.isfinite(cosine.low):
-            slopes = f" and {cosine.low:z.2g} to {cosine.high:z.2g}"
+            slopes = f" and {format_cosine(cosine.low)} to {format_cosine(cosine.high)}"
         return f" (95 % intervals {percent(share.low)} to {percent(share.high)}{slopes})"
 
 
