@@ -133,6 +133,8 @@ class Fluid(MpmScene):
 
         Walls own their nodes, so that a grid moved by a part of a cell would make the tank a cell wider. A cell more or
         less moves the nodes by half a cell in the middle and by none at the walls. The mirrored scene is the same grid.
+        At 12 points of standard they are 1.1 and 2 % of the range apart, and other particles 0.1 %. With ladle and cube
+        moved by half a cell instead it is 1.4 % along x and 0.7 % along z, of which 0.6 and 0.1 % are their new place.
         """
         cells, sampling = self.fidelity.resolution, self.fidelity.sampling
         across, band = round(cells * sampling), _band(TANK_WIDTH / cells)  # particles and grip stay what they are
