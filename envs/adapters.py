@@ -6,7 +6,7 @@ import inspect
 import re
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, Literal, Unpack, get_args
 
 import numpy as np
@@ -120,10 +120,20 @@ class FunctionEnvironment(Environment):
             return next(filter(None, said), "")
         return ""
 
+    def replicas(self) -> Mapping[str, Environment]:
+        """Return the functions that compute the same physics otherwise, with the settings of this one."""
+        given = self.function.replicas or {}
+        return {changed: self._with_function(self.function.with_call(fn)) for changed, fn in given.items()}
+
+    def _with_function(self, function: Function) -> FunctionEnvironment:
+        """Return the environment of another function; an option that is bound in it is left out."""
+        known = {one.name for one in fields(function.options_class)}
+        options = {name: value for name, value in asdict(self.options).items() if name in known}
+        return FunctionEnvironment(function, fidelity=self.fidelity, device=self.device, **options)
+
     def named(self, name: str) -> FunctionEnvironment:
         """Return the same environment by another name."""
-        settings = {"fidelity": self.fidelity, "device": self.device, **asdict(self.options)}
-        return FunctionEnvironment(replace(self.function, name=name), **settings)
+        return self._with_function(replace(self.function, name=name))
 
     def _remake(self, **settings: Any) -> Environment:
         return FunctionEnvironment(self.function, **settings)
@@ -205,7 +215,7 @@ def from_torch(
 
     Gradients come by autograd. Each loss may depend on its own row only. With `vectorized=False` the function takes a
     single point, shape (dim,), and returns one loss. Points lie on `device`, cpu or cuda. The other keywords are those
-    of `FunctionKeywords`: name, loss_unit, maximize, options, fidelities, horizon, seeds, precision, rows.
+    of `FunctionKeywords`: name, loss_unit, maximize, options, fidelities, horizon, seeds, precision, rows, replicas.
 
     Raises ValueError for settings that the function does not take; evaluating raises it where the function returns no
     losses of the batch, or losses that carry no gradient.
@@ -227,7 +237,7 @@ def from_numpy(
     `differences` makes gradients by central differences with that step, a fraction of each parameter's range; at the
     bounds they are one-sided, since the function is not asked beyond them. With `vectorized=False` the function takes a
     single point, shape (dim,), and returns one loss, or that and its gradient. The other keywords are those of
-    `FunctionKeywords`: name, loss_unit, maximize, options, fidelities, horizon, seeds, precision, rows.
+    `FunctionKeywords`: name, loss_unit, maximize, options, fidelities, horizon, seeds, precision, rows, replicas.
 
     Raises ValueError where `differences` is no fraction of the bounds, or lost in rounding relative to them.
     """
@@ -250,7 +260,7 @@ def from_jax(
     after point, which functions without a batching rule and large simulations need. Batches smaller than `rows` are
     padded to the next power of four, since the function is compiled for each size. It runs in its own precision,
     whatever JAX is configured to. Settings are static: the function is compiled for each. The other keywords are those
-    of `FunctionKeywords`: name, loss_unit, maximize, options, fidelities, horizon, seeds, precision, rows.
+    of `FunctionKeywords`: name, loss_unit, maximize, options, fidelities, horizon, seeds, precision, rows, replicas.
 
     Raises ValueError where JAX is not installed, and for other modes and batches; evaluating raises it where the
     function returns no single number, or JAX cannot trace, differentiate or vectorize it.
@@ -283,7 +293,7 @@ def from_warp(
     A kernel that writes to an array which an earlier one has read makes gradients wrong without a word.
     `check_overwrites` looks for that once, before the first gradient, and builds the function's kernels again for it,
     which may take long; leave it out for a simulator that is known to be right. The other keywords are those of
-    `FunctionKeywords`: name, loss_unit, maximize, options, fidelities, horizon, seeds, precision, rows.
+    `FunctionKeywords`: name, loss_unit, maximize, options, fidelities, horizon, seeds, precision, rows, replicas.
 
     Raises ValueError for other precisions and devices; evaluating raises it where the function returns no such array,
     launches nothing, does not read its points, or writes to what was read.
@@ -560,6 +570,12 @@ class GivenEnvironment(Environment):
         """Count what happens at each point, where the object says that."""
         counts: Callable[[Tensor], Mapping[str, Any]] | None = getattr(self.given, "events", None)
         return {} if counts is None else counts(x)
+
+    def replicas(self) -> Mapping[str, Environment]:
+        """Return the same physics computed otherwise, where the object offers that."""
+        offered: Callable[[], Mapping[str, Any]] | None = getattr(self.given, "replicas", None)
+        found = {} if offered is None else offered()
+        return {name: one if isinstance(one, Environment) else GivenEnvironment.of(one) for name, one in found.items()}
 
     def _remake(self, **settings: Any) -> Environment:
         return GivenEnvironment(self.given, **settings)

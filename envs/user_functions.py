@@ -5,7 +5,7 @@ from __future__ import annotations
 import abc
 import inspect
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields, make_dataclass
+from dataclasses import dataclass, field, fields, make_dataclass, replace
 from functools import cached_property, partial
 from typing import Any, ClassVar, TypedDict
 
@@ -38,6 +38,9 @@ class FunctionKeywords(TypedDict, total=False):
     A function that takes a `key` (of JAX) or a `seed` gets the same one at every point: common random numbers. The
     loss is the mean over `seeds` of them, and then it knows its standard error.
     `precision`, float64 or float32, is what it is given its points in, at most `rows` of them in one call.
+
+    `replicas` are functions of the same kind, by what was changed, that compute the same physics otherwise: what they
+    differ by is the numerical floor, `{"shifted grid": partial(fn, shift=0.5)}`.
     """
 
     name: str
@@ -49,6 +52,7 @@ class FunctionKeywords(TypedDict, total=False):
     seeds: int
     precision: str
     rows: int
+    replicas: Mapping[str, Callable[..., Any]] | None
 
 
 Compute = Callable[[Float[Tensor, "batch dim"], bool], tuple[Tensor, Tensor | None, str]]
@@ -102,6 +106,7 @@ class Function:
     seeds: int = 1
     precision: str = "float64"
     rows: int = 256
+    replicas: Mapping[str, Callable[..., Any]] | None = None
 
     def __post_init__(self) -> None:
         fn, who = self.fn, f"from_{self.backend.engine}"
@@ -124,6 +129,24 @@ class Function:
         self.defaults = chosen | ({"seed": 0} if self.seed_argument else {})
         self.known_fidelities = _read_fidelities(self.name, given, _check_precision(self.precision, who))
         self.fidelity_arguments = tuple(own)
+        self._refuse_uncallable()
+
+    def _refuse_uncallable(self) -> None:
+        """Raise ValueError where a replica is no function."""
+        for changed, fn in (self.replicas or {}).items():
+            if not callable(fn):
+                raise ValueError(f"{self.name}'s replica {changed!r} must be a function; got {type(fn).__name__}")
+
+    def with_call(self, fn: Callable[..., Any]) -> Function:
+        """Return another function with all that is said of this one but its replicas; what it binds is no setting."""
+        bound = fn.keywords if isinstance(fn, partial) else {}
+
+        def free(settings: Mapping[str, Any]) -> dict[str, Any]:
+            return {name: value for name, value in settings.items() if name not in bound}
+
+        options = None if self.options is None else free(self.options)
+        fidelities = {name: free(settings) for name, settings in (self.fidelities or {}).items()}
+        return replace(self, fn=fn, options=options, fidelities=fidelities or None, replicas=None)
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out what another process makes again."""

@@ -262,6 +262,14 @@ class Objective(abc.ABC):
         """Return the standard error of the loss at each point [loss unit]; None where repeats have to tell."""
         return None
 
+    def replicas(self) -> Mapping[str, Objective]:
+        """Return objectives of the same space, by what was changed, that would be the same if physics alone decided.
+
+        The same physics computed otherwise: a shifted grid, other particles, the mirrored scene with its parameters
+        mirrored. Each takes points of this space and returns losses and gradients in it.
+        """
+        return {}
+
     def observe(self, x: Float[Tensor, "batch dim"], decision: int) -> Float[Tensor, "batch feature"]:
         """Return what a policy sees before a decision: here no more than that nothing has happened yet."""
         return x.new_zeros(len(x), 1)
@@ -296,7 +304,7 @@ class ObjectiveWrapper(Objective):
 
 PASSED_ON = (
     "threads preferred_batch precision packages identity prepare shrink release memory events special_places "
-    "nan_origin wrong_origin energy noise observe"
+    "nan_origin wrong_origin energy noise replicas observe"
 )
 for _part in PASSED_ON.split():
     setattr(ObjectiveWrapper, _part, property(attrgetter(f"objective.{_part}")))
@@ -312,6 +320,10 @@ class BoxedObjective(ObjectiveWrapper):
     def evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool = True) -> Evaluation:
         """Return losses, and gradients if asked, at points `x` of the space."""
         return evaluate_inside(self.objective, check_points(x, self.space, self.name), grad=grad)
+
+    def replicas(self) -> Mapping[str, Objective]:
+        """Return the replicas, each inside its box only."""
+        return {name: BoxedObjective(replica) for name, replica in self.objective.replicas().items()}
 
 
 class SimulatorError(ValueError):

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from itertools import pairwise
 from typing import Any
 
@@ -76,6 +76,11 @@ class PolicyObjective(ObjectiveWrapper):
         lost = blind & found.has_loss
         status = found.status.masked_fill(lost, Status.NONFINITE)
         return Evaluation(found.loss.masked_fill(lost, torch.nan), None, status, found.error)
+
+    def replicas(self) -> Mapping[str, Objective]:
+        """Return the same policy in those replicas of the environment that decide as often."""
+        alike = {name: one for name, one in self._env.replicas().items() if one.decisions == self._env.decisions}
+        return {name: PolicyObjective(one, self.policy) for name, one in alike.items()}
 
     def decide(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch decided"]:
         """Return the environment's parameters that policies with these weights decide on, one after another."""
