@@ -323,7 +323,6 @@ def _time(env: Environment, variants: Sequence[Environment]) -> dict[str, float]
 
     It is kept so that the same command chooses the same variant, and continues what it began.
     """
-
     from ..landscapes.plain import number
     from ..landscapes.storage.files import write_json
     from ..landscapes.storage.records import read_json, reading

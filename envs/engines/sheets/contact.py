@@ -283,7 +283,9 @@ def contact_kernel(name: str, stop: Any, Data: Any) -> Any:
     """Return the kernel that lets a surface stop vertices, and moves them.
 
     Within a step the surface moves steadily from one pose to the next. `held` vertices go where places do that are
-    given as poses: nowhere where poses stay. Poses are read by vertex. The adjoint sets those of poses, `x` and `pulled`, whatever they were, or leaves out what is None.
+    given as poses: nowhere where poses stay. Poses are read by vertex.
+
+    The adjoint sets those of poses, `x` and `pulled`, whatever they were, or leaves out what is None.
     """
     types = precision(name)
     real, vec3, Vectors = types.real, types.vec3, types.rows[1]
