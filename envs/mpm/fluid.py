@@ -98,7 +98,7 @@ class Fluid(MpmScene):
     2022), appendix A.2.1; material and geometry where it is silent are ours.
     """
 
-    model_version = 1
+    model_version = 2
     name = "fluid"
     fidelities: ClassVar[dict[str, Fidelity]] = {
         "draft": Fidelity("draft", dt=SPAN / 6, resolution=12, sampling=16 / 12),
@@ -145,9 +145,10 @@ class Fluid(MpmScene):
         moved by half a cell instead it is 1.4 % along x and 0.7 % along z, of which 0.6 and 0.1 % are their new place.
         """
         cells, sampling = self.fidelity.resolution, self.fidelity.sampling
-        across, band = round(cells * sampling), _band(TANK_WIDTH / cells)  # particles and grip stay what they are
+        band, inset = _band(TANK_WIDTH / cells), _inset(TANK_WIDTH / cells)  # with the particles, they stay
+        across = round(cells * sampling)
         changes: dict[str, dict[str, Any]] = {
-            name: {"resolution": other, "sampling": across / other, "settings": {"band": band}}
+            name: {"resolution": other, "sampling": across / other, "settings": {"band": band, "inset": inset}}
             for name, other in (("one cell more across", cells + 1), ("one cell less across", cells - 1))
         }
         return self._replicas_of({**changes, "other particles": {"settings": {"particle_seed": 1}}})
@@ -183,7 +184,9 @@ class Fluid(MpmScene):
 
     def _parts(self, bodies: Sequence[Tensor], tools: Float[Tensor, "frame 1 3"]) -> tuple[Part, ...]:
         syrup, cube = bodies
-        block, faces = skin(cube)
+        center = cube.mean(dim=1, keepdim=True)
+        inset = self.fidelity.settings.get("inset", _inset(self.model.dx))
+        block, faces = skin(center + (cube - center) * (CUBE_EDGE / (CUBE_EDGE - 2 * inset)))
         tank = torch.zeros(len(tools), 1, 3, dtype=tools.dtype)
         return (
             Part("sheet", "sugar", block, faces=faces),
@@ -206,10 +209,10 @@ class Fluid(MpmScene):
 def _model(fidelity: Fidelity, options: FluidOptions) -> Model:
     dx = TANK_WIDTH / fidelity.resolution
     across = fidelity.resolution + 1 + 2 * MARGIN
-    corner = -TANK_WIDTH / 2 - MARGIN * dx
+    corner, seed = -TANK_WIDTH / 2 - MARGIN * dx, int(fidelity.settings.get("particle_seed", 0))
     return Model(
         precision=fidelity.precision,
-        bodies=_bodies(dx / fidelity.sampling, options, int(fidelity.settings.get("particle_seed", 0))),
+        bodies=_bodies(dx / fidelity.sampling, fidelity.settings.get("inset", _inset(dx)), options, seed),
         boundary=_boundary(fidelity.settings.get("band", _band(dx)), options),
         origin=(corner, -MARGIN * dx, corner),
         dx=dx,
@@ -219,6 +222,14 @@ def _model(fidelity: Fidelity, options: FluidOptions) -> Model:
         steps=options.count_steps(STEPS),
         gravity=GRAVITY,
     )
+
+
+def _inset(dx: float) -> float:
+    """Return how far from the cube's faces its particles' cells end, on a grid of cells so wide [m].
+
+    A solid stops syrup half a cell before its particles' cells end, and displaces that much more of it.
+    """
+    return min(dx / 2, CUBE_EDGE / 3)
 
 
 def _band(dx: float) -> float:
@@ -239,10 +250,11 @@ def _boundary(band: float, options: FluidOptions) -> LadleInTank:
     )
 
 
-def _bodies(pitch: float, options: FluidOptions, seed: int = 0) -> tuple[Body, Body]:
+def _bodies(pitch: float, inset: float, options: FluidOptions, seed: int = 0) -> tuple[Body, Body]:
     """Fill the tank with particles about `pitch` [m] apart, but for cube and ladle, all at hydrostatic pressure.
 
-    They are a lattice; by a seed other than 0, the syrup's are moved from there at random, by JITTER at most.
+    They are a lattice; by a seed other than 0, the syrup's are moved from there at random, by JITTER at most. The
+    cube's end `inset` [m] before its faces, with its whole mass and volume.
     """
     counts = round(TANK_WIDTH / pitch), round(FILL / pitch), round(TANK_WIDTH / pitch)
     sides = (TANK_WIDTH, FILL, TANK_WIDTH)
@@ -250,13 +262,13 @@ def _bodies(pitch: float, options: FluidOptions, seed: int = 0) -> tuple[Body, B
     volume = _volume_outside_cube(grid, np.divide(sides, counts))
     free = (np.abs(grid - CUBE_CENTER).max(axis=1) >= CUBE_EDGE / 2) & (_distance_to_bowl(grid - RIM) >= SHELL)
     moves = np.random.default_rng(seed).uniform(-JITTER, JITTER, grid.shape) * pitch if seed else np.zeros(3)
-    edge = max(3, round(CUBE_EDGE / pitch))
+    edge, side = max(3, round(CUBE_EDGE / pitch)), CUBE_EDGE - 2 * inset
     speed = options.sound_speed
     syrup = Liquid(SYRUP_DENSITY, SYRUP_DENSITY * speed**2, options.viscosity, options.smoothing)
     sugar = Elastic.with_wave_speed(options.cube_density, speed, poisson=0.3)
     return (
         _body(syrup, (grid + moves)[free], volume[free]),
-        _body(sugar, _lattice((edge,) * 3, (CUBE_EDGE,) * 3) + CUBE_CENTER, np.full(edge**3, (CUBE_EDGE / edge) ** 3)),
+        _body(sugar, _lattice((edge,) * 3, (side,) * 3) + CUBE_CENTER, np.full(edge**3, (CUBE_EDGE / edge) ** 3)),
     )
 
 

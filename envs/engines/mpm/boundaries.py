@@ -197,6 +197,11 @@ class Boundary(abc.ABC):
         """Number of vectors per environment and control step in `tools`."""
         return 1
 
+    @property
+    def mirrors(self) -> tuple[tuple[float | None, float | None, float | None], ...]:
+        """Where walls are that reflect [m], the lower and the upper one along each axis (`mirrors`)."""
+        return ((None,) * 3, (None,) * 3)
+
     @abc.abstractmethod
     def function(self, name: str) -> tuple[Any, Any]:
         """Return the Warp function of one precision, and the struct its data is in."""
@@ -237,6 +242,13 @@ class LadleInTank(Boundary):
     friction: float
     slip: float = 1.0
     walls: ClassVar[str] = "TankWalls"
+
+    @property
+    def mirrors(self) -> tuple[tuple[float | None, float | None, float | None], ...]:
+        """Where walls are that reflect [m], the lower and the upper one along each axis: floor and sides that slip."""
+        if self.slip != 1.0:
+            return super().mirrors
+        return (-self.half_width, 0.0, -self.half_width), (self.half_width, None, self.half_width)
 
     def function(self, name: str) -> tuple[Any, Any]:
         """Return the boundary's Warp function and its struct."""

@@ -31,7 +31,7 @@ from ..mpm.boundaries import FAINTEST, STICKY, TINY, UPSTREAM_DT, Boundary, Kind
 from ..mpm.materials import Elastic, Fluid, Material, Plasticine
 from ..mpm.materials.fluid import TORN
 from ..mpm.materials.plasticine import ROUNDED, SMALLEST
-from ..mpm.model import EMPTY, Model
+from ..mpm.model import EMPTY, Model, walls_that_reflect
 from ..mpm.smoothing import smooth_volume_ratios
 from ..runtime import precision
 from .runtime import real as real_type
@@ -661,12 +661,14 @@ class Solver:
         self.volume = self._constant(np.concatenate([body.volume for body in model.bodies]))
         self.origin = ti.Vector(model.origin)
         self.empty = EMPTY * float(model.mass.min())
+        walls = zip(walls_that_reflect(model), (1, -1), strict=True)
+        self.images = [(axis, node, before) for nodes, before in walls for axis, node in enumerate(nodes) if node]
         self.smooth = [b for b, body in enumerate(model.bodies) if body.material.smoothing]
         self.checkpoints = self._states(model.steps + 1)
         self.tape = self._states(model.substeps + 1)
         self.A = self._zeros(model.substeps, capacity, model.particles, 3, 3)
-        nodes = capacity, *model.nodes
-        self.grid = Grid(self._zeros(*nodes, 3), self._zeros(*nodes), self._zeros(*nodes, 3))
+        shape = capacity, *model.nodes
+        self.grid = Grid(self._zeros(*shape, 3), self._zeros(*shape), self._zeros(*shape, 3))
         self.tools = self._zeros(capacity, model.steps + 1, model.boundary.slots, 3)
         self.differentiated = (*self.tape.arrays(), self.A, *self.grid.arrays(), self.tools)
         for array in self.differentiated:
@@ -735,7 +737,33 @@ class Solver:
         for array in self.grid.arrays():
             array.detach().zero_()
         self.transfers.p2g(*self._p2g_inputs(s, batch))
+        self._fold(self.grid.q.detach(), self.grid.m.detach())
         self.grid_op(*self._grid_inputs(step, s, batch))
+        self._unfold(self.grid.v.detach())
+
+    def _fold(self, vectors: torch.Tensor, masses: torch.Tensor | None = None) -> None:
+        """Add what nodes beyond walls that reflect hold to their images (`mirrors`); the adjoint of `_unfold`."""
+        for axis, on, before in self.images:
+            for values in (vectors,) if masses is None else (vectors, masses):
+                across = values.movedim(axis + 1, 0)
+                across[on + before] += self._image(across[on - before], axis)
+                across[on - before] = 0.0
+            vectors.movedim(axis + 1, 0)[on, ..., axis] = 0.0
+
+    def _unfold(self, vectors: torch.Tensor, masses: torch.Tensor | None = None) -> None:
+        """Give nodes beyond walls that reflect the image of what those before them hold."""
+        for axis, on, before in reversed(self.images):
+            for values in (vectors,) if masses is None else (vectors, masses):
+                across = values.movedim(axis + 1, 0)
+                across[on - before] = self._image(across[on + before], axis)
+            vectors.movedim(axis + 1, 0)[on, ..., axis] = 0.0
+
+    def _image(self, values: torch.Tensor, axis: int) -> torch.Tensor:
+        """Return what a plane of nodes [environment, j, k] of vectors or masses looks like in a wall."""
+        image = values.clone()
+        if image.ndim == 4:
+            image[..., axis] *= -1.0
+        return image
 
     def _retreat(self, step: int, batch: int) -> None:
         """Take gradients from the tape's last state to its first, then to the last of the step before."""
@@ -746,7 +774,9 @@ class Solver:
                 _grad(array).zero_()
             self.transfers.move.grad(*self._move_inputs(s, batch))
             self.transfers.g2p.grad(*self._g2p_inputs(s, batch))
+            self._fold(_grad(self.grid.v))
             self.grid_op.grad(*self._grid_inputs(step, s, batch))
+            self._unfold(_grad(self.grid.q), _grad(self.grid.m))
             self.transfers.p2g.grad(*self._p2g_inputs(s, batch))
             for (_, adjoint), inputs in zip(self.materials, self._material_inputs(s, batch), strict=True):
                 adjoint(*inputs)
