@@ -25,8 +25,8 @@ from .sheets import Drive, SheetOptions, SheetScene
 
 SIDE, HEIGHT = 0.2, 0.1  # the cloth's edge, and how far above the floor it is held [m]
 AREAL_DENSITY = 0.2  # [kg/m^2]
-STIFFNESS, SWING = 10.0, (1.0, -0.5, 0.0)  # where they are no parameters [N/m], [m/s]
-BRAKING = 0.4  # in which anchors that swing come to rest [s]: a throw of -0.5 m/s takes them down to the floor
+STIFFNESS, SWING = 10.0, (1.0, -0.5, 0.0)  # where they are no parameters, and of anchors that swing [N/m], [m/s]
+BRAKING = 0.4  # in which anchors that swing come to rest [s], on the floor
 PATCHES = 4  # along each edge
 BEND = 3e-4  # bending stiffness [N m]
 DAMPING, DRAG, GRAVITY = 8e-3, 0.5, 9.81  # [N s/m], [1/s], [m/s^2]
@@ -39,8 +39,8 @@ class SwingOptions(SheetOptions):
     `damping` is that of springs [N s/m], `drag` that of air [1/s], `gravity` [m/s^2]; `bending` is the stiffness
     against it [N m], `shear` scales the shear springs; `friction` is the floor's coefficient.
 
-    `anchors`: still, or swing, where the anchors set out with the cloth's initial velocity and slow down evenly, to
-    rest after 0.4 s or, along the vertical, on the floor. `bending_springs`: the share of the springs along the lattice
+    `anchors`: still, or swing, where they set out at (1, -0.5, 0) m/s and slow down evenly, to rest after 0.4 s, 20 cm
+    to the right on the floor. `bending_springs`: the share of the springs along the lattice
     that join what is a sixth of the edge apart instead, so that what is stiffer bends less, too.
     """
 
@@ -68,6 +68,8 @@ class Swing(SheetScene):
     velocity of vertices that are in contact (contact=start). Its cloth is springs alone: bending springs, four fifths
     of those along the lattice (bending_springs=0.8, as in flip), resist bending instead of a plate (bending=0), so that
     patches of stiffness decide how it folds: their random losses reach 33 mm instead of 8. How anchors swing is ours.
+    They do so alike whatever velocity the cloth starts with: its landscape is then as rugged, and its gradients are as
+    often opposite to the slope, as the paper shows; with anchors that set out at that velocity it is smooth.
     Simplifications: by default the anchors stand still, since what they hold makes the cloth swing anyway, and contact
     stops vertices on the floor, since what else it does hangs on the time step; air is felt as a drag
     of 0.5/s; stretching is resisted by 10 N/m, softer than fabric, so that a step may be long; the resistance to
@@ -194,13 +196,13 @@ class Swing(SheetScene):
             Part("sheet", "target", self._target.expand_as(frames), faces=faces),
         )
 
-    def _course(self, velocity: Float[Tensor, "batch 3"]) -> Float[Tensor, "batch step_plus_1 3"]:
-        """Return how far the anchors have gone [m]: nowhere, or as a throw that slows evenly to rest, to the floor."""
+    def _course(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch step_plus_1 3"]:
+        """Return how far the anchors have gone [m]: nowhere, or as what slows down evenly to rest."""
         if self.options.anchors == "still":
-            return velocity.new_zeros(1, 1, 3).expand(len(velocity), self.steps + 1, 3)
-        time = (self.fidelity.dt * torch.arange(self.steps + 1, dtype=velocity.dtype)).clamp(max=BRAKING)
-        gone = velocity[:, None] * (time - time**2 / (2 * BRAKING))[:, None]
-        return torch.cat([gone[:, :, :1], gone[:, :, 1:2].clamp(min=-HEIGHT), gone[:, :, 2:]], dim=2)
+            return x.new_zeros(1, 1, 3).expand(len(x), self.steps + 1, 3)
+        time = (self.fidelity.dt * torch.arange(self.steps + 1, dtype=x.dtype)).clamp(max=BRAKING)
+        gone = x.new_tensor(SWING) * (time - time**2 / (2 * BRAKING))[:, None]
+        return gone.expand(len(x), -1, -1)
 
     def _prepare(self) -> None:
         _ = self._target
@@ -249,8 +251,7 @@ class SwingStiffness(Swing):
     def _drive(self, x: Float[Tensor, "batch dim"]) -> Drive:
         share = self._patch_shares().to(x)
         stiffness = torch.stack([(share @ row.view(PATCHES, PATCHES) @ share.T).flatten() for row in x])
-        swing = x.new_tensor(SWING).expand(len(x), 3)
-        return Drive(swing, stiffness, self._course(swing))
+        return Drive(x.new_tensor(SWING).expand(len(x), 3), stiffness, self._course(x))
 
     def _patch_shares(self) -> Float[Tensor, "vertex patch"]:
         """Return how much of what a vertex stands for along an edge lies in each patch: a cell's width, or half."""
