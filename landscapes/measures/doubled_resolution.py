@@ -148,7 +148,7 @@ def _measure(
     rises, turned = list[Values](), list[Values]()
     for axis in range(loss.ndim):
         difference = np.diff(loss, axis=axis)
-        sign = np.sign(np.where(np.abs(difference) > whole / steps[axis] / 2, difference, 0.0))
+        sign = np.sign(np.where(np.abs(difference) > max(floor, whole / steps[axis] / 2), difference, 0.0))
         before, after = (np.take(sign, range(start, start + loss.shape[axis] - 2), axis) for start in (0, 1))
         turned.append((before * after < 0).ravel())
         central = np.take(loss, range(2, loss.shape[axis]), axis) - np.take(loss, range(loss.shape[axis] - 2), axis)
