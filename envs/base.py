@@ -120,6 +120,7 @@ def map_parts(
 
 
 FLOAT32 = torch.finfo(torch.float32).max
+SHORTER = (0.01, 0.02)  # by which the time steps of replicas are shorter: longer ones might be unstable
 PROBES = 8  # points besides the centre that are tried where a whole batch raised
 
 
@@ -396,6 +397,13 @@ class Environment(Objective):
         """Return what is proportional to the time that an episode simulates, for one size of the scene."""
         return self.work().count * self.fidelity.dt
 
+    def replicas(self) -> Mapping[str, Environment]:
+        """Return the scene computed otherwise, by what was changed: the same physics at the same accuracy.
+
+        {} where nothing can be changed: a closed form has neither steps nor a grid.
+        """
+        return {}
+
     def engine_call(self, x: Float[Tensor, "batch dim"], *, grad: bool) -> Callable[[], object] | None:
         """Return what calls the engine alone at these points, for timing; None where evaluating does no more."""
         return None
@@ -434,6 +442,25 @@ class Environment(Objective):
     def _remake(self, **settings: Any) -> Environment:
         """Return this environment with all settings given."""
         return type(self)(**settings)
+
+    @final
+    def _replicas_of(self, changes: Mapping[str, Mapping[str, Any]]) -> dict[str, Environment]:
+        """Return this environment with fields of its fidelity changed, and settings added to those it has, by name."""
+        found = {}
+        for name, change in changes.items():
+            settings = {**self.fidelity.settings, **change.get("settings", {})}
+            named = {**change, "name": f"{self.fidelity.name}, {name}", "settings": settings}
+            found[name] = self.remake(fidelity=replace(self.fidelity, **named))
+        return found
+
+    @final
+    def _shorter_steps(self, steps: int) -> dict[str, dict[str, float]]:
+        """Return the changes of an episode of so many time steps by which contacts fall elsewhere within a step."""
+        shorter = {
+            share: max(steps + place, round(steps * (1 + share))) for place, share in enumerate(SHORTER, start=1)
+        }
+        dt = self.fidelity.dt
+        return {f"time steps {share:.0%} shorter": {"dt": dt * steps / count} for share, count in shorter.items()}
 
     def _observe(self, x: Float[Tensor, "batch dim"], decision: int) -> Float[Tensor, "batch feature"]:
         """Return the state just before a decision, in units that make it about one."""

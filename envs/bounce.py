@@ -135,6 +135,10 @@ class Bounce(Environment):
         """Count the bounces of each flight."""
         return {"bounces": self.bounces(x)}
 
+    def replicas(self) -> Mapping[str, Environment]:
+        """Return the flight in time steps a little shorter: a bounce falls elsewhere within a step."""
+        return self._replicas_of(self._shorter_steps(round(DURATION / self.fidelity.dt)))
+
     def episode(self, x: Float[Tensor, " dim"]) -> Episode:
         """Return the ball's flight."""
         (row,) = self._row(x)

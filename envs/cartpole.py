@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, ClassVar
@@ -120,11 +121,19 @@ class Cartpole(Environment):
         """Count steps of links."""
         return Work(len(CHAIN.masses) * self.steps, "body-step")
 
+    def replicas(self) -> Mapping[str, Environment]:
+        """Return the chain whose angles are counted from a turn on, so that they are rounded otherwise.
+
+        Without contacts there is nothing else for steps to fall upon, and controls change at the ends of steps. The
+        mirrored chain is of no use here, since it rounds alike.
+        """
+        return self._replicas_of({f"angles {turns} turns on": {"settings": {"turns": turns}} for turns in (1, 2)})
+
     def episode(self, x: Float[Tensor, " dim"]) -> Episode:
         """Return the cart, and the joints of the chain with its tip."""
         controls = self._controls(self._row(x))
         with self._solvers.lend() as solver:
-            phi = copied(_swing(solver, controls)[:, 0])
+            phi = copied(self._swing(solver, controls)[:, 0])
         joints = _joints(self._cart(controls)[0], phi)
         joints = torch.cat([joints, torch.zeros_like(joints[..., :1])], dim=2)
         time = self.fidelity.dt * torch.arange(self.steps + 1, dtype=torch.float64)
@@ -152,7 +161,7 @@ class Cartpole(Environment):
         x = x.clone().requires_grad_(grad)
         controls = self._controls(x)
         with self._solvers.lend() as solver:
-            phi = copied(_swing(solver, controls.detach())[-1]).requires_grad_(grad)
+            phi = copied(self._swing(solver, controls.detach())[-1]).requires_grad_(grad)
             tip = _joints(self._cart(controls)[:, -1], phi)[:, -1]
             loss = (tip - self.target).norm(dim=1)
             slope = _pull_back(solver, loss, phi, controls, x) if grad else None
@@ -174,10 +183,17 @@ class Cartpole(Environment):
         """Watch the cart and the sines and cosines of angles, and how fast cart and angles changed in the last step."""
         controls, step = self._controls(x), decision * self.steps // CONTROLS
         with self._solvers.lend() as solver:
-            phi = copied(_swing(solver, controls)).transpose(0, 1)
+            phi = copied(self._swing(solver, controls)).transpose(0, 1)
         joints = torch.cat([self._cart(controls)[:, :, None], phi], dim=2)
         rate = (joints[:, step] - joints[:, max(0, step - 1)]) * (TEMPO / self.fidelity.dt)
         return torch.cat([joints[:, step, :1], phi[:, step].sin(), phi[:, step].cos(), rate], dim=1)
+
+    def _swing(
+        self, solver: Solver, controls: Float[Tensor, "batch control 4"]
+    ) -> Float[Tensor, "step_plus_1 batch 3"]:
+        """Return the angles at the ends of steps [rad], from hanging at rest, counted from so many turns on."""
+        rest = torch.zeros(3, dtype=torch.float64)
+        return solver.run(rest + 2 * torch.pi * self.fidelity.settings.get("turns", 0), rest, controls)
 
     def _controls(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch control 4"]:
         """Return cart velocity and torques in each control step; none after the last that parameters set."""
@@ -202,12 +218,6 @@ def _parts(joints: Float[Tensor, "frame 4 3"], target: Float[Tensor, "frame 3"])
         Part("trail", "rubber", joints[:, 3:], (0.015,)),
         Part("sphere", "target", target[:, None], (0.14,)),
     )
-
-
-def _swing(solver: Solver, controls: Float[Tensor, "batch control 4"]) -> Float[Tensor, "step_plus_1 batch 3"]:
-    """Return the angles at the ends of steps [rad], from hanging at rest."""
-    rest = torch.zeros(3, dtype=torch.float64)
-    return solver.run(rest, rest, controls)
 
 
 def _joints(cart: Float[Tensor, "*batch"], phi: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 4 2"]:

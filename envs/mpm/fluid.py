@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ...landscapes.episode import Part, View
 from ...landscapes.space import ParameterSpace
-from ..base import Fidelity, MaterialRange, ModelPart
+from ..base import Environment, Fidelity, MaterialRange, ModelPart
 from ..controls import ease, extend, hold, integrate_velocity
 from ..engines.mpm.boundaries import LadleInTank
 from ..engines.mpm.materials import Elastic
@@ -36,6 +36,7 @@ EASING = 4  # control steps over which the ladle's speed changes
 SYRUP_DENSITY, GRAVITY = 1330.0, 9.81  # [kg/m^3], [m/s^2]
 SPAN = 0.01  # length of a control step [s]
 MARGIN = 2  # nodes outside the walls
+JITTER = 0.1  # of the distance between particles, by which those of another seed are moved
 VIEW = View((-0.2, 0.0, -0.2), (0.2, 0.42, 0.2), eye=(0.4, 0.55, 1.0))
 
 
@@ -127,6 +128,20 @@ class Fluid(MpmScene):
         depth = path.new_full((*path.shape[:2], 1), RIM[2])
         return torch.cat([path, depth], dim=2)[:, :, None]
 
+    def replicas(self) -> Mapping[str, Environment]:
+        """Return the scene on grids of a cell more or less across the tank, and with the syrup's particles elsewhere.
+
+        Walls own their nodes, so that a grid moved by a part of a cell would make the tank a cell wider. A cell more or
+        less moves the nodes by half a cell in the middle and by none at the walls. The mirrored scene is the same grid.
+        """
+        cells, sampling = self.fidelity.resolution, self.fidelity.sampling
+        across, band = round(cells * sampling), _band(TANK_WIDTH / cells)  # particles and grip stay what they are
+        changes: dict[str, dict[str, Any]] = {
+            name: {"resolution": other, "sampling": across / other, "settings": {"band": band}}
+            for name, other in (("one cell more across", cells + 1), ("one cell less across", cells - 1))
+        }
+        return self._replicas_of({**changes, "other particles": {"settings": {"particle_seed": 1}}})
+
     def cube(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch 3"]:
         """Return where the cube's centre is at the end of the episode [m]."""
         with self._solvers.lend() as stage:
@@ -179,8 +194,8 @@ def _model(fidelity: Fidelity, options: FluidOptions) -> Model:
     corner = -TANK_WIDTH / 2 - MARGIN * dx
     return Model(
         precision=fidelity.precision,
-        bodies=_bodies(dx / fidelity.sampling, options),
-        boundary=_boundary(dx, options),
+        bodies=_bodies(dx / fidelity.sampling, options, int(fidelity.settings.get("particle_seed", 0))),
+        boundary=_boundary(fidelity.settings.get("band", _band(dx)), options),
         origin=(corner, -MARGIN * dx, corner),
         dx=dx,
         nodes=(across, int(np.ceil(HEADROOM / dx)) + 1 + 2 * MARGIN, across),
@@ -191,32 +206,41 @@ def _model(fidelity: Fidelity, options: FluidOptions) -> Model:
     )
 
 
-def _boundary(dx: float, options: FluidOptions) -> LadleInTank:
+def _band(dx: float) -> float:
+    """Return over what the ladle's grip fades on a grid of cells so wide [m]."""
+    return max(GRIP, 0.75 * dx)
+
+
+def _boundary(band: float, options: FluidOptions) -> LadleInTank:
     return LadleInTank(
         half_width=TANK_WIDTH / 2,
         lid=HEADROOM,
         radius=BOWL,
         half_thickness=SHELL,
         height=HANDLE if options.handle else 0.0,
-        band=max(GRIP, 0.75 * dx),
+        band=band,
         friction=options.friction,
         slip=1.0 if options.walls == "slip" else 0.0,
     )
 
 
-def _bodies(pitch: float, options: FluidOptions) -> tuple[Body, Body]:
-    """Fill the tank with particles about `pitch` [m] apart, but for cube and ladle, all at hydrostatic pressure."""
+def _bodies(pitch: float, options: FluidOptions, seed: int = 0) -> tuple[Body, Body]:
+    """Fill the tank with particles about `pitch` [m] apart, but for cube and ladle, all at hydrostatic pressure.
+
+    They are a lattice; by a seed other than 0, the syrup's are moved from there at random, by JITTER at most.
+    """
     counts = round(TANK_WIDTH / pitch), round(FILL / pitch), round(TANK_WIDTH / pitch)
     sides = (TANK_WIDTH, FILL, TANK_WIDTH)
     grid = _lattice(counts, sides) + np.array([0.0, FILL / 2, 0.0])
     volume = _volume_outside_cube(grid, np.divide(sides, counts))
     free = (np.abs(grid - CUBE_CENTER).max(axis=1) >= CUBE_EDGE / 2) & (_distance_to_bowl(grid - RIM) >= SHELL)
+    moves = np.random.default_rng(seed).uniform(-JITTER, JITTER, grid.shape) * pitch if seed else np.zeros(3)
     edge = max(3, round(CUBE_EDGE / pitch))
     speed = options.sound_speed
     syrup = Liquid(SYRUP_DENSITY, SYRUP_DENSITY * speed**2, options.viscosity, options.smoothing)
     sugar = Elastic.with_wave_speed(options.cube_density, speed, poisson=0.3)
     return (
-        _body(syrup, grid[free], volume[free]),
+        _body(syrup, (grid + moves)[free], volume[free]),
         _body(sugar, _lattice((edge,) * 3, (CUBE_EDGE,) * 3) + CUBE_CENTER, np.full(edge**3, (CUBE_EDGE / edge) ** 3)),
     )
 

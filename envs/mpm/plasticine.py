@@ -17,7 +17,7 @@ from ... import __version__
 from ...landscapes import episode
 from ...landscapes.episode import Part, View
 from ...landscapes.space import ParameterSpace
-from ..base import Fidelity, ModelPart, Pool
+from ..base import Environment, Fidelity, ModelPart, Pool
 from ..controls import extend, hold, integrate_velocity, roll
 from ..engines.mpm import materials
 from ..engines.mpm.boundaries import Kind, Tool, ToolsInRoom
@@ -38,6 +38,8 @@ FLOOR, WALLS = 2.5 / 64, (2.5 / 64, 61.5 / 64)  # nodes outside belong to floor 
 ROOM = 0.15, 0.5  # least and most that the room extends beyond the bodies [m]
 BEYOND = 1e6  # where walls are that no body meets [m]
 MARGIN = 2  # nodes outside the walls
+SHIFTS = ("shift_x", "shift_y", "shift_z")  # settings of a fidelity: cells that the grid is moved by
+THIRDS = ((1 / 3, 2 / 3), (2 / 3, 1 / 3))  # of a cell along x and z: with 0, what has a cell's wavelength is seen whole
 
 
 def fidelities(*, draft: tuple[int, int, int], standard: tuple[int, int, int]) -> dict[str, Fidelity]:
@@ -161,13 +163,14 @@ def model(scene: Scene, fidelity: Fidelity, steps: int = STEPS, options: Physics
     dx = 1.0 / fidelity.resolution
     scene = scene.altered(options)
     lower, upper = scene.room()
-    first = np.floor(lower / dx).astype(int) - MARGIN
-    last = np.ceil(upper / dx).astype(int) + MARGIN
+    shift = np.array([fidelity.settings.get(name, 0.0) for name in SHIFTS])
+    first = np.floor(lower / dx - shift).astype(int) - MARGIN
+    last = np.ceil(upper / dx - shift).astype(int) + MARGIN
     return Model(
         precision=fidelity.precision,
-        bodies=_bodies(scene, fidelity.particles, dx),
+        bodies=_bodies(scene, fidelity, dx),
         boundary=_boundary(scene, fidelity.dt, options),
-        origin=tuple((first * dx).tolist()),
+        origin=tuple(((first + shift) * dx).tolist()),
         dx=dx,
         nodes=tuple((last - first + 1).tolist()),
         dt=fidelity.dt,
@@ -177,10 +180,15 @@ def model(scene: Scene, fidelity: Fidelity, steps: int = STEPS, options: Physics
     )
 
 
-def target(scene: Scene, particles: int) -> np.ndarray:
+def target(scene: Scene, fidelity: Fidelity) -> np.ndarray:
     """Return the particles of a target that is made of shapes [m], shape (particle, 3)."""
-    counts = shares([piece.shape for piece in scene.pieces], particles)
-    return np.concatenate([fill(shape, count) for shape, count in zip(scene.target, counts, strict=True)])
+    counts, seed = shares([piece.shape for piece in scene.pieces], fidelity.particles), _seed(fidelity)
+    return np.concatenate([fill(shape, count, seed) for shape, count in zip(scene.target, counts, strict=True)])
+
+
+def _seed(fidelity: Fidelity) -> int:
+    """Return the seed that particles are drawn by."""
+    return int(fidelity.settings.get("particle_seed", 0))
 
 
 def _boundary(scene: Scene, dt: float, options: PhysicsOptions) -> ToolsInRoom:
@@ -201,13 +209,13 @@ def _rub(tool: Tool, factor: float) -> Tool:
     return replace(tool, friction=factor * tool.friction)
 
 
-def _bodies(scene: Scene, particles: int, dx: float) -> tuple[Body, ...]:
+def _bodies(scene: Scene, fidelity: Fidelity, dx: float) -> tuple[Body, ...]:
     material = materials.Plasticine(1.0, YOUNG, scene.poisson, scene.yield_stress)
-    counts = shares([piece.shape for piece in scene.pieces], particles)
+    counts, seed = shares([piece.shape for piece in scene.pieces], fidelity.particles), _seed(fidelity)
     # at density 1 the volume is the mass
     masses = [np.full(n, piece.particles * PARTICLE / n) for piece, n in zip(scene.pieces, counts, strict=True)]
     return tuple(
-        Body(material, _sort_by_cell(fill(piece.shape, len(mass)), dx), volume=mass, ratio=np.ones(len(mass)))
+        Body(material, _sort_by_cell(fill(piece.shape, len(mass), seed), dx), volume=mass, ratio=np.ones(len(mass)))
         for piece, mass in zip(scene.pieces, masses, strict=True)
     )
 
@@ -361,6 +369,15 @@ class Plasticine(MpmScene):
         """Estimate the bytes one episode takes while it runs."""
         return super().memory() + Raster.bytes_per_row(self.model)
 
+    def replicas(self) -> Mapping[str, Environment]:
+        """Return the scene on grids moved along the floor by thirds of a cell, and of other particles.
+
+        Targets are each replica's own. Along y the grid stays, because the floor is as high as its highest node.
+        """
+        places = {f"grid moved by {x:.2f}, {z:.2f} cells": {"shift_x": x, "shift_z": z} for x, z in THIRDS}
+        changes = {**places, "other particles": {"particle_seed": 1}}
+        return self._replicas_of({name: {"settings": settings} for name, settings in changes.items()})
+
     def tools(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch step_plus_1 slot 3"]:
         """Return where tools are at the ends of control steps [m]; a roller's second slot is (spin, yaw, 0) [rad]."""
         shares, count = hold(x.view(len(x), SEGMENTS, -1), STEPS), self.model.steps
@@ -458,7 +475,7 @@ class Plasticine(MpmScene):
     def _target_particles(self) -> np.ndarray:
         """Return where the target's particles are [m]."""
         if self.scene.target:
-            return target(self.scene, self.model.particles)
+            return target(self.scene, self.fidelity)
         device = "cpu" if self.model.particle_substeps <= MAX_CPU_WORK else self.device
         model = f"model {self.version_on(self.engines[0])}, {__version__}"
         content = f"{self.scene} {self.fidelity} {self.examples[DEMONSTRATION]} {model}"

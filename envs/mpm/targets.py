@@ -113,9 +113,9 @@ def shares(shapes: Sequence[Shape], total: int) -> list[int]:
     return [int(count) for count in np.diff(bounds)]
 
 
-def fill(shape: Shape, count: int) -> np.ndarray:
+def fill(shape: Shape, count: int, seed: int = 0) -> np.ndarray:
     """Return particles that fill a shape evenly (a scrambled Sobol sequence) [m], shape (particle, 3)."""
-    return np.asarray(shape.place(sobol(count, 3, seed=0)).numpy())
+    return np.asarray(shape.place(sobol(count, 3, seed=seed)).numpy())
 
 
 SOLID = 1e-4  # mass at a node of a grid 1/64 m wide from which it is the target's [kg]; PlasticineLab's

@@ -91,6 +91,13 @@ class SheetScene(Environment):
         """Count steps of vertices."""
         return Work(len(self.sheet.x) * self.steps, "vertex-step")
 
+    def replicas(self) -> Mapping[str, Environment]:
+        """Return the sheet in time steps a little shorter: it meets a surface elsewhere within a step.
+
+        Its mesh has both diagonals in every cell, and its mirror image is the same mesh.
+        """
+        return self._replicas_of(self._shorter_steps(self.own_steps))
+
     def episode(self, x: Float[Tensor, " dim"]) -> Episode:
         """Return the sheet and its surroundings every hundredth of a second, and at the end."""
         drive = self._drive(self._row(x))

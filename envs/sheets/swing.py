@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from functools import cached_property
@@ -14,7 +15,7 @@ from torch import Tensor
 
 from ...landscapes.episode import Part, View
 from ...landscapes.space import ParameterSpace
-from ..base import Fidelity, ModelPart, copied
+from ..base import Environment, Fidelity, ModelPart, copied
 from ..engines.sheets.contact import Floor
 from ..engines.sheets.springs import Sheet
 from ..outlines import triangles
@@ -86,6 +87,13 @@ class Swing(SheetScene):
     def surface(self) -> Floor:
         """The floor, at height 0."""
         return Floor(friction=self.options.friction)
+
+    def replicas(self) -> Mapping[str, Environment]:
+        """Return the cloth in shorter time steps, and of a cell more or less along its edges, with its own target."""
+        cells, dt, steps = self.fidelity.resolution, self.fidelity.dt, self.own_steps
+        finer = dt * steps / math.ceil(steps * (1 + 1 / cells) ** 2)  # as far from instability
+        meshes = {"one cell more": {"resolution": cells + 1, "dt": finer}, "one cell less": {"resolution": cells - 1}}
+        return {**super().replicas(), **self._replicas_of(meshes)}
 
     def _sheet(self) -> Sheet:
         cells, options = self.fidelity.resolution, self.options
