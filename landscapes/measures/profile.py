@@ -160,8 +160,8 @@ def measure_profile(
 
     `rounding` is the engine's relative precision: `PRECISION` has that of float32 and of float64. `events` counts what
     happens in episodes, which explains jumps. Jumps are looked for from half the step on, from sample to sample, of a
-    ramp through the range of the losses. The numerical floor is the slice's own, or else measured now. Gradients are
-    held against differences of the same losses, whose numerics are the same, so that noise alone counts there.
+    ramp through the range of the losses. The numerical floor is the slice's own, or else measured now. Where
+    neighbours or their gradients are compared it does not count, but noise alone: their numerics are the same.
     """
     plane, objective = plane_of(dataset), _Within(objective)
     generator = torch.Generator().manual_seed(seed)
@@ -171,8 +171,9 @@ def measure_profile(
     fuzz = noise(objective, plane.lift(drawn), rounding=rounding, repeats=REPEATS, seed=seed)
     numerics = floor_of(dataset) or find_floor(objective, dataset, seed=seed)
     samples = dataset["loss"].size
-    floor = max(float(np.nan_to_num(fuzz.floor(samples))), counted_from(numerics, samples))
-    found = ruggedness(dataset, floor=floor)
+    noisy = float(np.nan_to_num(fuzz.floor(samples)))
+    floor = max(noisy, counted_from(numerics, samples))
+    found = ruggedness(dataset, floor=floor, noise=noisy)
     least = [max(floor, half_step(found.range, plane.resolution))]
     most = PAIRS_PER_POINT * points
     (jumps,) = find_jumps(objective, [dataset], least=least, most=most, seed=seed, events=events)

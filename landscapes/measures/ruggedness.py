@@ -246,7 +246,7 @@ class Ruggedness:
     `minima` counts those deeper than the floor, `minima_halved` what every second sample shows of them; `curve` counts
     by depths in fractions of the range. `zero` and `flat` are shares of samples whose gradient along the plane is
     exactly and effectively zero, `missing` of those that have a loss and, though it was asked for, no gradient; `level`
-    of those whose neighbours' losses differ by no more than the floor.
+    of those whose neighbours' losses differ by no more than the floor of noise.
     """
 
     samples: int
@@ -273,8 +273,18 @@ class Ruggedness:
     fitness_distance: Estimate
 
 
-def ruggedness(dataset: xr.Dataset, *, floor: float, estimate: Callable[..., Estimate] = jackknife) -> Ruggedness:
-    """Measure the ruggedness of a slice; `estimate` takes a statistic and samples, and gives its interval, too."""
+def ruggedness(
+    dataset: xr.Dataset,
+    *,
+    floor: float,
+    noise: float | None = None,
+    estimate: Callable[..., Estimate] = jackknife,
+) -> Ruggedness:
+    """Measure the ruggedness of a slice; `estimate` takes a statistic and samples, and gives its interval, too.
+
+    `noise` [loss unit] is the floor of repeats, by default `floor`. Neighbours are level by that one: their numerics
+    are the same, so that their difference is a slope, however fine the samples are.
+    """
     loss = dataset["loss"].transpose("v", "u", missing_dims="ignore").to_numpy()
     whole, found = span(loss), minima(loss)
     notable = found.sample[found.depth > max(floor, NOTABLE * whole)]
@@ -300,7 +310,7 @@ def ruggedness(dataset: xr.Dataset, *, floor: float, estimate: Callable[..., Est
         zero=None if slopes is None else share_of(_mean, _below(slopes, 0.0)),
         flat=None if slopes is None else share_of(_mean, _below(slopes, FLAT_SLOPE * whole)),
         missing=missing_gradients(dataset),
-        level=share_of(_mean, level_samples(loss, floor)),
+        level=share_of(_mean, level_samples(loss, floor if noise is None else noise)),
         correlation_length=along_axes(correlation_length, least=0.0, most=1.0),
         holder=along_axes(partial(holder_exponent, floor=floor), least=0.0),
         total_variation=along_axes(total_variation, least=1.0),

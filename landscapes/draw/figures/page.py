@@ -31,6 +31,7 @@ from numpy.typing import NDArray
 
 from ...identity import PACKAGE, VERSIONS, simulator_parts, stored_identity, stored_provenance
 from ...lattice import with_gradients
+from ...measures.slice_floor import floor_of
 from ...measures.undersampled import Undersampled
 from ...objective import Status
 from ...plane import Plane
@@ -152,7 +153,7 @@ def gradient_key(dataset: xr.Dataset) -> list[Patch]:
 
 
 def sampling_key(dataset: xr.Dataset) -> list[Patch]:
-    """Return legend entries of how exact a refined slice is, and which share of its cells is undersampled."""
+    """Return legend entries of how exact a refined slice is, what its samples hide, and its numerical floor."""
     refined = Refined.of(dataset)
     exact = (
         f"interpolated points: 95 % within {100 * refined.error:.2g} % of the range"
@@ -160,7 +161,8 @@ def sampling_key(dataset: xr.Dataset) -> list[Patch]:
         else ""
     )
     between = Undersampled.of(dataset)
-    lines = [exact, between.describe() if between else ""]
+    floor = floor_of(dataset)
+    lines = [exact, between.describe() if between else "", floor.sentence() if floor else ""]
     return [Patch(facecolor="none", edgecolor="none", label=said) for said in lines if said]
 
 
