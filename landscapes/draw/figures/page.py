@@ -298,8 +298,11 @@ def name_outer(ax: Axes, x: str, y: str) -> None:
     """Label the axes of one of several panels over the same plane, once for a row and once for a column."""
     spec = ax.get_subplotspec()
     assert spec is not None  # as `grid` made it
+    others = [other for panel in picture_of(ax).axes if (other := panel.get_subplotspec()) is not None]
+    lowest = not any(one.rowspan.start > spec.rowspan.start and one.colspan == spec.colspan for one in others)
     ax.label_outer()
-    name_axes(ax, x if spec.is_last_row() else "", y if spec.is_first_col() else "")
+    ax.tick_params(labelbottom=lowest)
+    name_axes(ax, x if lowest else "", y if spec.is_first_col() else "")
 
 
 def _name(ax: Axes, axis: Axis, said: str, room: Callable[[], float]) -> None:

@@ -23,6 +23,7 @@ from .. import style
 from . import page
 
 LOSS, FLOOR, SLOPE = 2.6, 1.4, 2.2  # height of the panels [inch]
+ROOM = 1.1  # of the numerical floor, against its largest value
 STRIP = 2.7  # height of a strip of event counts, in that of its type
 
 
@@ -98,7 +99,8 @@ def _draw_floor(ax: Axes, dataset: xr.Dataset, deviation: NDArray[np.float64]) -
     """Draw the standard deviation between replicas at every sample, from 0 on."""
     u = dataset["u"].to_numpy()
     ax.plot(u, deviation, color=style.INK, **page.sheet_of(ax).look(style.stroke(len(u))))
-    ax.set_ylim(bottom=0)
+    most = np.nanmax(deviation, initial=0.0)
+    ax.set_ylim(0, ROOM * most if most > 0 else 1)
     page.name_axes(ax, y=labelled("numerical floor", page.loss_unit(dataset)))
     return []
 
