@@ -130,7 +130,12 @@ class CensusJob(CheckpointedJob["Census"]):
         noise, replicas = NOISE_POINTS * (1 + REPEATS), NOISE_POINTS * (1 + len(self.env.replicas()))
         counts = [(self.env, len(self.tasks) - again, noise, replicas), (self.other, again, 0, 0)]
         return [
-            Work(env, count * without + fuzz, count * having + apart, 8.0 * count * (without + having * (1 + env.space.dim)))
+            Work(
+                env,
+                count * without + fuzz,
+                count * having + apart,
+                8.0 * count * (without + having * (1 + env.space.dim)),
+            )
             for env, count, fuzz, apart in counts
             if env is not None
         ]

@@ -72,7 +72,9 @@ MAX_DRAWING_SHARE = 0.1  # of the time, for pictures of an unfinished slice
 FIRST_PICTURE_SECONDS = 3.0  # no intermediate picture of slices that are faster than this
 MAX_NAME_LETTERS = 40  # letters of a folder's name that say along what a slice was cut
 JOINED = "joined"  # in the identity of a slice that was cut between points: their names
-Draw = Callable[..., "Figure"]  # draw(dataset, width=None, floor=None): a slice with its map of the numerical floor, for
+Draw = Callable[
+    ..., "Figure"
+]  # draw(dataset, width=None, floor=None): a slice with its map of the numerical floor, for
 # a screen, or for a page so wide [mm]
 
 
@@ -224,7 +226,7 @@ class SliceJob(SummaryJob[SliceSummary]):
         )  # fmt: skip
 
     def work(self) -> list[Work]:
-        """Return its samples and what looks between them, and the slices of its replicas where they are to be mapped."""
+        """Return its samples and what looks between them, and the replicas' slices where those are mapped."""
         every = self.store.every if self.store.grad else 0
         whole = [slice_work(self.objective, self.plane.resolution, every)]
         replicas = self.objective.replicas().values() if self.floor else []

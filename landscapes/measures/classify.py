@@ -22,7 +22,21 @@ VERY_SMOOTH, SMOOTH, RUGGED, EXTREME = "very smooth", "smooth with local minima"
 LARGE_FLAT, DISCONTINUOUS = "large flat regions", "discontinuous"
 GOOD, NOISY, OPPOSITE, ZERO = "gradients good", "gradients noisy", "gradients opposite", "gradients zero"
 FAILS, MISSING, BELOW = "mostly failed", "gradients missing", "flat within noise and numerics"
-WORDS = (FAILS, BELOW, VERY_SMOOTH, SMOOTH, RUGGED, EXTREME, LARGE_FLAT, DISCONTINUOUS, GOOD, NOISY, OPPOSITE, ZERO, MISSING)
+WORDS = (
+    FAILS,
+    BELOW,
+    VERY_SMOOTH,
+    SMOOTH,
+    RUGGED,
+    EXTREME,
+    LARGE_FLAT,
+    DISCONTINUOUS,
+    GOOD,
+    NOISY,
+    OPPOSITE,
+    ZERO,
+    MISSING,
+)
 
 FEW_TURNS = 0.1  # of the steps between samples: Himmelblau's function turns at 0.03, Levy's at 0.15 of them
 MANY_TURNS = 0.5  # Rastrigin's function turns at 0.45 of them, white noise at 0.65
@@ -81,7 +95,9 @@ def judge(found: Ruggedness, jumps: Jumps | None, average: float, uphill: float)
     if found.failed > MOSTLY * found.samples:
         return Verdict({FAILS: f"no loss at {found.failed / found.samples:.0%} of the samples"})
     if 0 < found.range <= found.floor:
-        return Verdict({BELOW: f"the losses range over {found.range:.2g}, noise or numerics alone over {found.floor:.2g}"})
+        return Verdict(
+            {BELOW: f"the losses range over {found.range:.2g}, noise or numerics alone over {found.floor:.2g}"}
+        )
     reasons = dict([_surface(found)])
     if found.level.value >= MUCH:
         reasons[LARGE_FLAT] = f"{found.level.value:.0%} of the samples are level with their neighbours"

@@ -195,7 +195,7 @@ def _reversals(walks: Values, floor: float) -> int:
         down, up = (way >= 0) & (high - at > floor), (way <= 0) & (at - low > floor)
         turned += int((way[down | up] != 0).sum())
         way = np.where(down, -1, np.where(up, 1, way))
-        high, low = np.where(down, at, high), np.where(up, at, low)
+        high, low = np.where(up, at, high), np.where(down, at, low)
     return turned
 
 

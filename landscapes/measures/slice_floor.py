@@ -51,7 +51,7 @@ def counted_from(floor: Floor | None, samples: int) -> float:
 def refuse_without_replicas(objective: Objective, *, refined: bool) -> None:
     """Raise ValueError where there is no numerical floor to map: without replicas, and of a refined slice."""
     if refined:
-        raise ValueError("--floor evaluates replicas at every sample; got --refine or --budget, so leave out one of both")
+        raise ValueError("--floor evaluates replicas at every sample; got --refine or --budget: leave out one")
     if not objective.replicas():
         raise ValueError(
             f"{objective.name} has no replicas, so its numerical floor is not known; leave out --floor, or offer the "
@@ -98,9 +98,9 @@ def find_floor(
 
 
 def spread_samples(dataset: xr.Dataset, points: int, *, seed: int = 0) -> NDArray[np.intp]:
-    """Return the numbers of at most so many samples with a loss, of those that were asked for a gradient, spread evenly.
+    """Return the numbers of at most so many samples with a loss, of those that were asked for a gradient.
 
-    They are the nearest to Sobol points, in fractions of the plane.
+    They are spread evenly: the nearest to Sobol points, in fractions of the plane.
     """
     from scipy.spatial.distance import cdist
 
