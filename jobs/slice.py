@@ -333,14 +333,17 @@ class SliceJob(SummaryJob[SliceSummary]):
         gradients, found = self.store.every if self.store.grad else 0, dict[str, xr.Dataset]()
         with watch.progress(len(replicas) * whole) as advance:
             for path, (name, replica) in zip(replica_paths(self.folder, list(replicas)), replicas.items(), strict=True):
-                before = len(found) * whole
+
+                def follow(now: Progress, before: int = len(found) * whole) -> None:
+                    advance(before + now.done)
+
                 store = SliceStore.open_or_create(
                     path, self.plane, replica.space, identity=with_stride(replica.identity(), gradients),
                     grad=gradients > 0,
                 )  # fmt: skip
                 found[name] = sample(
                     replica, self.plane, store, gradients=gradients, executor=self.executor, made=recipe(replica),
-                    progress=lambda now, before=before: advance(before + now.done),
+                    progress=follow,
                 )  # fmt: skip
                 replica.release()
         mapped = map_floor(self.objective, dataset, found)

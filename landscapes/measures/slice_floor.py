@@ -159,7 +159,7 @@ def map_floor(objective: Objective, dataset: xr.Dataset, replicas: Mapping[str, 
         cosines = np.stack([replica_cosines(own, one, sides) for one in found.values()])
         said = {"long_name": "median cosine of the gradient with those of its replicas"}
         arrays["cosine"] = (dims, median_known(cosines).reshape(shape), said)
-    axes = {str(name): dataset[name] for name in dims} | {"replica": list(replicas)}
+    axes = {str(name): dataset[name] for name in dims} | {"replica": np.array(list(replicas), object)}
     return xr.Dataset(arrays, axes, {OF: digest_of(dataset), **floor_attribute(floor)})
 
 
