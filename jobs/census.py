@@ -127,7 +127,8 @@ class CensusJob(CheckpointedJob["Census"]):
         """Return the samples of all slices, and what their noise and their numerical floor are measured by."""
         without, having = self.design.samples
         again = sum(task.other for task in self.tasks)
-        noise, replicas = NOISE_POINTS * (1 + REPEATS), NOISE_POINTS * (1 + len(self.env.replicas()))
+        noise, others = NOISE_POINTS * (1 + REPEATS), len(self.env.replicas())
+        replicas = NOISE_POINTS * (1 + others) if others else 0
         counts = [(self.env, len(self.tasks) - again, noise, replicas), (self.other, again, 0, 0)]
         return [
             Work(

@@ -163,7 +163,7 @@ made = gs.from_torch(ripples, gs.ParameterSpace.box(("a", "b"), -1.0, 1.0), repl
 
 def test_the_commands_take_a_users_replicas(run: Run, tmp_path: Path) -> None:
     (tmp_path / "my.py").write_text(FILE)
-    slice_ = "slice my.py:made --resolution 16 --out made --json".split()
+    slice_ = ["slice", "my.py:made", "--resolution", "16", "--out", "made", "--json"]
     first = run.ok(*slice_)
     assert first.json["floor"]["deviation"] == pytest.approx(APART)
     assert "numerical floor 0.81 % of the range; gradients of replicas: cosine 0.9" in first.stderr
@@ -172,11 +172,11 @@ def test_the_commands_take_a_users_replicas(run: Run, tmp_path: Path) -> None:
     assert (mapped.json["episodes"], mapped.json["floor"]["points"]) == (0, 256)
     assert np.array_equal(open_slice(tmp_path / "made")["loss"], losses)
     np.testing.assert_allclose(xr.open_zarr(tmp_path / "made" / FLOOR)["deviation"], APART)
-    said = run.ok(*"report made --env my.py:made --points-per-axis 2 --out said".split())
+    said = run.ok(*["report", "made", "--env", "my.py:made", "--points-per-axis", "2", "--out", "said"])
     assert "numerical floor 0.81 % of the range; gradients of replicas: cosine 0.9" in said.stdout
     assert run.ok(*slice_, "--force").json["floor"]["points"] < 256
     assert not (tmp_path / "made" / FLOOR).exists()
-    run.refuse(*"slice ackley --dims 0 1 --floor".split(), said="ackley has no replicas, so its numerical floor")
+    run.refuse(*["slice", "ackley", "--dims", "0", "1", "--floor"], said="ackley has no replicas, so its")
     run.refuse(*slice_[:2], "--refine", "5%", "--floor", said="got --refine or --budget: leave out one")
 
 
