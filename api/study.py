@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 @verb
 def study(
-    kind: Annotated[Literal["fidelity", "convergence", "model", "mixed", "extremes"], ARGUMENT],
+    kind: Annotated[Literal["fidelity", "convergence", "model", "mixed", "extremes", "symmetry"], ARGUMENT],
     scene: Scene,
     *,
     points: Annotated[int | None, at_least(2)] = None,
@@ -51,6 +51,9 @@ def study(
     setting is scanned and its first failure bisected; pairs of settings are mapped. The default fidelity is standard.
     `landscape envs NAME` shows what was found about the time step.
 
+    symmetry: the numerical floor: how much losses and gradients move where only the numerics change. The replicas are
+    the scene's own: a moved grid, other particles, another mesh, shorter steps. A function has them by replicas=.
+
     The folder then holds KIND.json and KIND.png. Stop at any time: the same command continues with the next variant.
 
     Raises ValueError for options that the kind does not take, and where there is nothing to compare; StoreMismatchError
@@ -61,9 +64,9 @@ def study(
     Parameters
     ----------
     kind
-        Study to run: fidelity, convergence, model, mixed or extremes.
+        Study to run: fidelity, convergence, model, mixed, extremes or symmetry.
     points
-        Number of points at which every variant is measured. The default is 64, and 16 for extremes.
+        Number of points at which every variant is measured. The default is 64, 16 for extremes and 32 for symmetry.
     settings
         Settings to change, a,b or repeated. Of fidelity: dt, resolution, particles, precision, stiffness, engine,
         device. Of convergence: dt, resolution, particles, joint, precision. Of extremes: dt, resolution, box, horizon

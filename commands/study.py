@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
     from ..studies.mixed import MixedRecord
     from ..studies.model import MeasuredPart, ModelRecord
     from ..studies.samples import Bootstrap, Comparison
+    from ..studies.symmetry import SymmetryRecord
     from ..studies.variants import StudyRecord
     from .terminal import Console
 
@@ -162,12 +164,33 @@ def _show_extremes(found: ExtremesRecord) -> Iterable[str | Table]:
     yield rows
 
 
+def _show_symmetry(found: SymmetryRecord) -> Iterable[str | Table]:
+    from ..studies.samples import Bootstrap
+
+    floor = found.floor
+    scale = f"range of the loss {floor.range:.4g} {found.loss_unit}".rstrip()
+    yield f"{found.env}: {found.fidelity} on {found.device} and its replicas at {found.points} points; {scale}"
+    rows = _table("replica", "losses apart", "rank", "cosine", "lower quartile", "failed")
+    for one in found.replicas:
+        ends = [None if math.isnan(end) else end for end in (one.apart.value, one.apart.low, one.apart.high)]
+        slopes = ["" if math.isnan(cosine) else f"{cosine:z.3f}" for cosine in (one.cosine.value, one.cosine_low)]
+        failed = str(one.failed) if one.failed else ""
+        rows.add_row(one.name, _share(Bootstrap(*ends)), _number(one.spearman), *slopes, failed)
+    yield rows
+    yield (
+        "losses apart: standard deviation between the scene's and the replica's, as a share of the range (95 % "
+        "interval); rank: Spearman's correlation of losses; cosine: of gradients, median and lower quartile"
+    )
+    yield from found.sentences()
+
+
 SHOWN: dict[str, Any] = {
     "fidelity": _show_fidelity,
     "convergence": _show_convergence,
     "model": _show_model,
     "mixed": _show_mixed,
     "extremes": _show_extremes,
+    "symmetry": _show_symmetry,
 }
 
 

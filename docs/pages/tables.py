@@ -12,6 +12,7 @@ import argparse
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import Any, cast
 
@@ -32,6 +33,7 @@ from gradscape.studies.variants import StudyRecord
 from .text import cell, table
 
 ROOT = Path(__file__).parents[2]
+FLOORS = DATA / "floors.json"  # which benchmarks/symmetry.py writes
 UNMEASURED, MISSING = "not measured since the scene changed", "not measured"
 FAINT = 0.01  # of the range of the losses of all slices of a census
 COLUMNS = {  # of README: what a slice may be, and the words that say so, of which a slice has one at most
@@ -150,9 +152,28 @@ def _margin(limit: Limit) -> list[str]:
 
 
 def fidelities() -> str:
-    """What draft and standard keep of their claims, against the reference."""
-    rows = [[f"`{scene}`", claim.name, *_fidelity(scene, claim)] for scene in scenes() for claim in CLAIMS]
-    return table(("scene", "fidelity", "device", "rank", "cosine", "95 % error", "ms", "claim"), rows)
+    """What draft and standard keep of their claims, against the reference, and what numerics alone move."""
+    rows = []
+    for scene, claim in product(scenes(), CLAIMS):
+        *cells, kept = _fidelity(scene, claim)
+        rows.append([f"`{scene}`", claim.name, *cells, *_floor(scene, claim.name), kept])
+    floor = ("numerical floor", "cosine of replicas")
+    return table(("scene", "fidelity", "device", "rank", "cosine", "95 % error", "ms", *floor, "claim"), rows)
+
+
+def _floor(scene: str, fidelity: str, file: Path = FLOORS) -> list[str]:
+    """Return the cells of a fidelity's floor, of losses and gradients, of the scene and settings that are there now."""
+    now = environment_class(scene).fidelities[fidelity].record()
+    measured = [
+        row["floor"]
+        for row in (read_json(file)["floors"] if file.exists() else ())
+        if (row["env"], row["identity"]["settings"]) == (scene, now) and present(row)
+    ]
+    if not measured:
+        return ["not measured", ""]
+    share, cosine = measured[-1]["share"], measured[-1]["cosine"]
+    low, high = (f"{100 * share[end]:.2g}" for end in ("low", "high"))
+    return [f"{100 * share['value']:.2g} % ({low} to {high})", _number(cosine and cosine["value"], 3)]
 
 
 def _fidelity(scene: str, claim: Claim) -> list[str]:

@@ -92,7 +92,10 @@ class Swing(SheetScene):
         """Return the cloth in shorter time steps, and of a cell more or less along its edges, with its own target."""
         cells, dt, steps = self.fidelity.resolution, self.fidelity.dt, self.own_steps
         finer = dt * steps / math.ceil(steps * (1 + 1 / cells) ** 2)  # as far from instability
-        meshes = {"one cell more": {"resolution": cells + 1, "dt": finer}, "one cell less": {"resolution": cells - 1}}
+        meshes: dict[str, dict[str, Any]] = {
+            "one cell more": {"resolution": cells + 1, "dt": finer},
+            "one cell less": {"resolution": cells - 1},
+        }
         return {**super().replicas(), **self._replicas_of(meshes)}
 
     def _sheet(self) -> Sheet:

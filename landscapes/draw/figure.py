@@ -26,6 +26,7 @@ FIGURES = {
     "FidelityRecord": "landscapes.draw.figures.accuracy:fidelity_figure",
     "MixedRecord": "landscapes.draw.figures.accuracy:mixed_figure",
     "ModelRecord": "landscapes.draw.figures.accuracy:model_figure",
+    "SymmetryRecord": "landscapes.draw.figures.symmetry:symmetry_figure",
     "SliceComparison": "landscapes.draw.figures.comparison:comparison_figure",
 }
 _PACKAGE = __name__.partition(".landscapes.")[0]

@@ -48,7 +48,12 @@ class Floor:
         said = f"numerical floor {100 * self.share.value:.2g} % of the range"
         if self.cosine is None or not math.isfinite(self.cosine.value):
             return said
-        return f"{said}; gradients of replicas: cosine {self.cosine.value:.2g}"
+        return f"{said}; gradients of replicas: cosine {format_cosine(self.cosine.value)}"
+
+
+def format_cosine(cosine: float) -> str:
+    """Return a cosine with two decimals, and with three where two would make it 1."""
+    return f"{cosine:z.2f}" if abs(cosine) < 0.995 else f"{cosine:z.3f}"
 
 
 def measure_floor(

@@ -32,7 +32,7 @@ def test_the_floor_of_a_ripple_is_the_ripple() -> None:
     assert found.range == pytest.approx(2, abs=0.01)
     assert found.share.value == found.deviation / found.range
     assert found.share.low < SIZE / 4 < found.share.high < 1.2 * found.share.low
-    assert found.sentence() == "numerical floor 0.5 % of the range; gradients of replicas: cosine 1"
+    assert found.sentence() == "numerical floor 0.5 % of the range; gradients of replicas: cosine 1.000"
     losses_only = measure_floor(env, x, evaluation=env.evaluate(x, grad=False), range=4.0)
     assert losses_only is not None
     assert losses_only.cosine is None

@@ -17,6 +17,7 @@ from gradscape.landscapes.draw import style
 from gradscape.landscapes.measures.card import Card, CardSlice, ClosedFormError, FailedCheck, Grade
 from gradscape.landscapes.measures.census import MEASURES, Census, CensusDesign, SurveyedSlice, conclude
 from gradscape.landscapes.measures.classify import WORDS
+from gradscape.landscapes.measures.floor import Floor
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.landscapes.statistics import Estimate, share
 from gradscape.optim.registry import methods
@@ -34,6 +35,7 @@ from gradscape.studies.fidelity import FidelityRecord
 from gradscape.studies.order import Shapes
 from gradscape.studies.samples import Bootstrap
 from gradscape.studies.stability import STABLE, Cell
+from gradscape.studies.symmetry import MeasuredReplica, SymmetryRecord
 
 from ....made_studies import VARIANTS, fidelities, variant
 
@@ -89,6 +91,21 @@ def convergence() -> ConvergenceRecord:
         remainders=(Remainder("standard", near(0.1), near(0.4)), Remainder("reference", near(0.004), near(0.02))),
         divergence=None, distributions=apart, refused=(), identity={}, provenance=MEASURED,
         command=COMMAND.format("study convergence"),
+    )  # fmt: skip
+
+
+def symmetry() -> SymmetryRecord:
+    """Return a study of replicas with long names, one of which is not known well."""
+    names = ("grid moved by 0.33, 0.67 cells", "other particles", "time steps 2 % shorter", "one cell less across")
+    near, unknown = Estimate(0.02, 0.013, 0.041), Estimate(0.0, float("nan"), float("nan"))
+    replicas = tuple(
+        MeasuredReplica(name, near if number else unknown, Bootstrap(0.99, 0.98, 1.0), Estimate(0.9, 0.8, 0.95), 0.1, 0)
+        for number, name in enumerate(names)
+    )
+    return SymmetryRecord(
+        env="swing-stiffness", fidelity="standard", points=64, seed=0, loss_unit="m", refused=(), identity={},
+        floor=Floor(names, 64, 0, 0.02, 1.0, near, Estimate(0.9, 0.8, 0.95)), replicas=replicas, provenance=MEASURED,
+        command=COMMAND.format("study symmetry"),
     )  # fmt: skip
 
 

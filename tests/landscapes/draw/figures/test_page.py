@@ -40,6 +40,7 @@ from gradscape.landscapes.draw.figures.profile import profile_figure
 from gradscape.landscapes.draw.figures.quality import quality_figure
 from gradscape.landscapes.draw.figures.search import league_figure, race_figure, run_figure
 from gradscape.landscapes.draw.figures.sweep import Scales, frame_figure
+from gradscape.landscapes.draw.figures.symmetry import symmetry_figure
 from gradscape.landscapes.draw.render.surface import surface_figure
 from gradscape.landscapes.episode import Episode, Part, View
 from gradscape.landscapes.measures import gradient_quality as gradients
@@ -51,7 +52,7 @@ from gradscape.optim.registry import methods
 
 from ....made_studies import fidelities, study
 from ...test_overlay import LAID, SLICE
-from .records import card, census, checked, convergence, extremes, league, mixed
+from .records import card, census, checked, convergence, extremes, league, mixed, symmetry
 from .test_contour import BOUNCES, DATASET, LINE, Bowl, plane
 from .test_search import race, table
 from .test_sweep import SWEEP
@@ -159,6 +160,7 @@ FIGURES: dict[str, list[Callable[[float | None], page.Picture]]] = {
         lambda width: check_figure(checked((), kinds={}), width=width),
     ],
     "extremes_figure": [lambda width: extremes_figure(extremes(), width=width)],
+    "symmetry_figure": [lambda width: symmetry_figure(symmetry(), width=width)],
     "league_figure": [lambda width: league_figure(league(), width=width)],
     "frame_figure": [lambda width: frame_figure(SWEEP, 1, Scales.of(SWEEP), width=width)],
     "episode_figure": [lambda width: episode_figure(EPISODE, caption=CAPTION, width=width)],

@@ -1,0 +1,213 @@
+"""The study `symmetry`: how much of losses and gradients is the scene's, and how much its numerics'.
+
+The same points are evaluated under every replica of a scene, which computes the same physics otherwise.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+import torch
+
+from ..envs.records import Fidelity
+from ..envs.registry import as_environment
+from ..landscapes.measures.floor import Floor, floor_between, format_cosine, refuse_other_space, replica_cosines
+from ..landscapes.objective import Evaluation
+from ..landscapes.plain import digest
+from ..landscapes.statistics import Estimate, spearman
+from .samples import Bootstrap, Sample, evaluate_points
+from .variants import Expected, StudyRecord, Variant, VariantStudy, samples_of
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from ..envs.base import Environment
+    from ..jobs.watch import Watch
+    from .samples import Follow
+    from .variants import StudyOptions
+
+OWN, REPLICA = "the scene itself", "replica"
+HOOK = (
+    "a function takes replicas={'other grid': fn}, and a class has a method `replicas` that returns environments by "
+    "what was changed (docs/measures.md)"
+)
+
+
+@dataclass(frozen=True)
+class MeasuredReplica:
+    """Hold one replica against the scene itself.
+
+    `apart` is the root mean square over points of the standard deviation between both losses, as a share of the range;
+    `spearman` the rank correlation of losses; `cosine` the median of gradients' cosines, `cosine_low` their lower
+    quartile. At `failed` points one of both has no loss.
+    """
+
+    name: str
+    apart: Estimate
+    spearman: Bootstrap
+    cosine: Estimate
+    cosine_low: float
+    failed: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class SymmetryRecord(StudyRecord):
+    """Hold the replicas of a scene at the same points, each against the scene itself, and the floor of all together."""
+
+    kind: ClassVar[str] = "symmetry"
+
+    fidelity: str
+    floor: Floor
+    replicas: tuple[MeasuredReplica, ...]
+
+    def to_keep(self) -> None:
+        """Return nothing: no other verb reads it."""
+
+    def table(self) -> pd.DataFrame:
+        """Return a row for each replica, indexed by `name`.
+
+        Columns: `apart`, the standard deviation between its losses and the scene's as a share of their range, with the
+        ends of the 95 % interval; `spearman`; `cosine` and `cosine_low`, median and lower quartile; `failed`, points.
+        """
+        import pandas as pd
+
+        columns = [
+            {
+                **{
+                    "name": one.name,
+                    "apart": one.apart.value,
+                    "apart_low": one.apart.low,
+                    "apart_high": one.apart.high,
+                },
+                **{"spearman": one.spearman.value, "cosine": one.cosine.value, "cosine_low": one.cosine_low},
+                "failed": one.failed,
+            }
+            for one in self.replicas
+        ]
+        return pd.DataFrame(columns, columns=list(columns[0]) if columns else ["name"]).set_index("name")
+
+    def sentences(self) -> list[str]:
+        """Return the numerical floor with its intervals, and which replica is farthest away."""
+        found = self.floor
+        said = [f"{found.sentence()}{self._intervals()}"]
+        known = [one for one in self.replicas if one.apart.value > 0]
+        if len(known) > 1:
+            farthest = max(known, key=lambda one: one.apart.value)
+            said.append(
+                f"farthest from the scene itself: {farthest.name}, {percent(farthest.apart.value)} of the range"
+            )
+        if found.failed:
+            said.append(f"{found.failed} of {self.points} points left out, where the scene or a replica fails")
+        return said
+
+    def _intervals(self) -> str:
+        """Return the ends of both 95 % intervals, in brackets; nothing where points are too few."""
+        share, cosine = self.floor.share, self.floor.cosine
+        if not math.isfinite(share.low):
+            return ""
+        slopes = ""
+        if cosine is not None and math.isfinite(cosine.low):
+            slopes = f" and {format_cosine(cosine.low)} to {format_cosine(cosine.high)}"
+        return f" (95 % intervals {percent(share.low)} to {percent(share.high)}{slopes})"
+
+
+class SymmetryStudy(VariantStudy):
+    """A scene and its replicas."""
+
+    kind = "symmetry"
+    what = "replicas"
+    default_points = 32
+    advice = "compiling kernels comes on top; --points and a cheaper --fidelity lower it"
+
+    def __init__(self, env: Environment, options: StudyOptions) -> None:
+        self._replicas = {name: as_environment(one) for name, one in env.replicas().items()}
+        if not self._replicas:
+            raise ValueError(f"{env.name} has no replicas, which compute the same physics otherwise: {HOOK}")
+        for name, one in self._replicas.items():
+            refuse_other_space(env, name, one)
+        super().__init__(env, options)
+
+    @classmethod
+    def choose_fidelity(
+        cls, scene: Environment | type[Environment], given: Fidelity | str | None
+    ) -> Fidelity | str | None:
+        """Return the fidelity of which there are replicas: the one that is given."""
+        return given
+
+    def identity(self) -> dict[str, Any]:
+        """Return what decides the numbers, as plain JSON; a study of other replicas is not continued."""
+        return {**super().identity(), "replicas": {name: one.identity() for name, one in self._replicas.items()}}
+
+    @cached_property
+    def variants(self) -> list[Variant]:
+        """The scene itself, and each of its replicas."""
+        own = replace(Variant.of(self.env), name=OWN, changed="")
+        return [own, *(replace(own, name=name, changed=REPLICA) for name in self._replicas)]
+
+    def part(self, variant: Variant) -> str:
+        """Return the name of a variant's part of the checkpoint."""
+        if variant.changed != REPLICA:
+            return "own"
+        slug = re.sub(r"[^a-z0-9]+", "-", variant.name.lower()).strip("-")
+        return f"replica-{slug}-{digest(variant.name)}"
+
+    def measure(self, variant: Variant, follow: Follow) -> Mapping[str, Any]:
+        """Return the arrays that are measured of a variant, and give back its memory."""
+        env = self._make(variant)
+        found = evaluate_points(env, self.x, follow).arrays()
+        env.release()
+        return found
+
+    def _make(self, variant: Variant) -> Environment:
+        return self._replicas[variant.name] if variant.changed == REPLICA else self.env
+
+    def _expect(self, variant: Variant, env: Environment) -> Expected:
+        return Expected(variant.name, self.env, len(self.x))  # as much work, whatever a replica counts it in
+
+    def run(self, watch: Watch, provenance: Mapping[str, Any], command: str) -> SymmetryRecord:
+        """Measure what is missing and return the record.
+
+        Raises ValueError where neither the scene itself nor any replica can be measured.
+        """
+        found = {name: _evaluation(one) for name, one in samples_of(self.measure_all(watch)).items()}
+        own = found.pop(OWN)
+        if not found:
+            raise ValueError(f"no replica of {self.env.name} can be measured: {next(iter(self.refused.values()))}")
+        return SymmetryRecord(
+            **self.about(provenance, command),
+            fidelity=self.env.fidelity.name,
+            floor=floor_between(own, found, seed=self.seed),
+            replicas=tuple(_measure(name, own, one, self.seed) for name, one in found.items()),
+        )
+
+
+def percent(share: float) -> str:
+    """Return a share in per cent."""
+    return f"{100 * share:.2g} %"
+
+
+def _evaluation(sample: Sample) -> Evaluation:
+    """Return what a sample holds; its gradients are per width of the box already."""
+    return Evaluation(torch.from_numpy(sample.loss), torch.from_numpy(sample.grad), torch.from_numpy(sample.status))
+
+
+def _measure(name: str, own: Evaluation, replica: Evaluation, seed: int) -> MeasuredReplica:
+    """Hold a replica against the scene itself."""
+    found = floor_between(own, {name: replica}, seed=seed)
+    both = (own.has_loss & replica.has_loss).numpy()
+    cosines = replica_cosines(own, replica)
+    known = cosines[np.isfinite(cosines)]
+    return MeasuredReplica(
+        name=name,
+        apart=found.share,
+        spearman=Bootstrap.of(spearman, own.loss.numpy()[both], replica.loss.numpy()[both], seed=seed),
+        cosine=found.cosine or Estimate(math.nan, math.nan, math.nan),
+        cosine_low=float(np.quantile(known, 0.25)) if len(known) else math.nan,
+        failed=found.failed,
+    )
