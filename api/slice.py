@@ -49,6 +49,7 @@ def slice(
     window: Window | None = None,
     refine: Share | None = None,
     budget: Annotated[int | None, at_least(1)] = None,
+    floor: bool = False,
     policy: str | None = None,
     gradients: Gradients = True,
     scheduler: Scheduler = None,
@@ -88,6 +89,9 @@ def slice(
         as 1%.
     budget
         Adaptive sampling with at most this many episodes, alone or together with --refine.
+    floor
+        Evaluate the replicas of the environment, the same physics computed otherwise, at every sample. The standard
+        deviation between their losses, the numerical floor, is drawn as a map. Each replica costs as much as the slice.
     policy
         Sample over the weights of a neural policy instead of the parameters of the environment: mlp:32x32 has two
         hidden layers of 32. It has losses only.
@@ -106,13 +110,14 @@ def slice(
     begun: dict[str, Any] = {"out": as_path(out), "gradients": stride, "refinement": Refinement.of(fine, budget)}
     plane = spec.make(objective, None if force or in_memory else begun)
     if in_memory:
-        return _sample_in_memory(BoxedObjective(objective) if along else objective, plane, begun["refinement"], stride)
+        boxed = BoxedObjective(objective) if along else objective
+        return _sample_in_memory(boxed, plane, begun["refinement"], stride, floor)
     from ..jobs.slice import SliceJob
     from ..jobs.workers import workers
 
     with workers(scheduler, env.device) as executor:
         job = SliceJob.of(
-            objective, plane, command=call.command, cut=spec.cut, force=force,
+            objective, plane, command=call.command, cut=spec.cut, force=force, floor=floor,
             executor=executor, prints=as_widths(figure_width_mm), **begun,
         )  # fmt: skip
         job.run(call.watch)
@@ -198,30 +203,42 @@ def as_slice(given: str | Path | Slice, *, env: Scene = None) -> Slice:
 
 def _open(path: Path, env: Scene, remake: Callable[[], Objective] | None) -> Slice:
     from ..landscapes.slice import Slice
+    from ..landscapes.storage.floor_map import open_floor_map, with_map
     from ..landscapes.storage.store import open_slice
 
     dataset = open_slice(path)
+    mapped = open_floor_map(path, dataset)
     folder = path if path.suffix != ".zarr" else None
-    return Slice(dataset, folder, remake or (lambda: environment_of(dataset, "auto", env)))
+    return Slice(with_map(dataset, mapped), folder, remake or (lambda: environment_of(dataset, "auto", env)), mapped)
 
 
-def _sample_in_memory(objective: Objective, plane: Plane, refinement: Refinement | None, gradients: int) -> Slice:
-    from ..jobs.slice import look_between
+def _sample_in_memory(
+    objective: Objective, plane: Plane, refinement: Refinement | None, gradients: int, floor: bool
+) -> Slice:
+    from ..jobs.slice import conclude_slice
     from ..landscapes.lattice import check_gradients
+    from ..landscapes.measures.slice_floor import map_floor, refuse_without_replicas
     from ..landscapes.sampling.fill import describe, sample
     from ..landscapes.sampling.refine import refine
     from ..landscapes.slice import Slice
+    from ..landscapes.storage.floor_map import with_map
     from ..landscapes.storage.store import SliceStore
 
     gradients = check_gradients(gradients, plane, refined=refinement is not None)
+    if floor:
+        refuse_without_replicas(objective, refined=refinement is not None)
     with current().watch.progress(math.prod(plane.resolution), "evaluations") as advance:
         how: dict[str, Any] = {
             "progress": lambda now: advance(now.done),
-            "conclude": lambda whole: look_between(objective, whole),
+            "conclude": lambda whole: conclude_slice(objective, whole),
         }
         if refinement is None:
             dataset = sample(objective, plane, gradients=gradients, **how)
         else:
             store = SliceStore.in_memory(plane, objective.space, **describe(objective), grad=gradients > 0)
             dataset = refine(objective, plane, store, refinement, **how)
-    return Slice(dataset, None, lambda: objective)
+    mapped = None
+    if floor:
+        found = {name: sample(one, plane, gradients=gradients) for name, one in objective.replicas().items()}
+        mapped = map_floor(objective, dataset, found)
+    return Slice(with_map(dataset, mapped), None, lambda: objective, mapped)

@@ -16,6 +16,8 @@ def show(found: Census, console: Console) -> None:
 
     many = f"{len(found.slices)} slices, {found.episodes} episodes"
     console.print(f"{found.env} · {found.fidelity}: {many}")
+    if found.floor:
+        console.print(found.floor.sentence())
     words = table("word", "slices that it fits", box=SIMPLE)
     for word, share in sorted(found.words.items(), key=lambda one: -one[1].value):
         if share.value > 0:

@@ -9,10 +9,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 
 from ..landscapes.capacity import Need, require
 from ..landscapes.convert import from_json
 from ..landscapes.cost import duration
+from ..landscapes.objective import Evaluation, evaluate
 from ..landscapes.sampling.distribution import PortableObjective, run_tasks, workers_of
 from ..landscapes.sampling.memory import MemoryBound
 from ..landscapes.storage.files import replacing
@@ -27,11 +29,13 @@ from .workers import recipe
 if TYPE_CHECKING:
     from ..envs.base import Environment
     from ..landscapes.measures.census import Census, CensusDesign, SurveyedSlice
+    from ..landscapes.measures.floor import Floor
     from ..landscapes.plane import Plane
 
 RECORD, LOSSES, PICTURE = CENSUS.files
 SLICES, RESOLUTION = 64, 24
 NOISE_POINTS, REPEATS = 16, 4
+OWN, SAMPLES = "original", ("loss", "grad", "status")  # of what replicas are held against
 COPIES = 4  # of the losses and gradients of a slice
 
 
@@ -120,21 +124,29 @@ class CensusJob(CheckpointedJob["Census"]):
         return whole + (again if self.other else [])
 
     def work(self) -> list[Work]:
-        """Return the samples of all slices, and what their noise is measured by."""
+        """Return the samples of all slices, and what their noise and their numerical floor are measured by."""
         without, having = self.design.samples
         again = sum(task.other for task in self.tasks)
-        counts = [(self.env, len(self.tasks) - again, NOISE_POINTS * (1 + REPEATS)), (self.other, again, 0)]
+        noise, others = NOISE_POINTS * (1 + REPEATS), len(self.env.replicas())
+        replicas = NOISE_POINTS * (1 + others) if others else 0
+        counts = [(self.env, len(self.tasks) - again, noise, replicas), (self.other, again, 0, 0)]
         return [
-            Work(env, count * without + noise, count * having, 8.0 * count * (without + having * (1 + env.space.dim)))
-            for env, count, noise in counts
+            Work(
+                env,
+                count * without + fuzz,
+                count * having + apart,
+                8.0 * count * (without + having * (1 + env.space.dim)),
+            )
+            for env, count, fuzz, apart in counts
             if env is not None
         ]
 
     def compute(self, watch: Watch) -> Census:
         """Survey what is missing, and return the census."""
-        deviation = self._noise(watch)
+        deviation, replicas = self._noise(watch), self._replicas(watch)
+        numerics = float(np.nan_to_num(self._floor(replicas, None).deviation)) if replicas else 0.0
         self._announce(watch)
-        return self._conclude(self._survey(deviation, watch))
+        return self._conclude(self._survey(deviation, numerics, watch), replicas)
 
     def write(self, found: Census) -> list[str]:
         """Draw and write the census, the losses in a file of their own."""
@@ -169,6 +181,32 @@ class CensusJob(CheckpointedJob["Census"]):
             self.checkpoint.save("noise", **kept)
         return float(np.nan_to_num(kept["deviation"]))
 
+    def _replicas(self, watch: Watch) -> dict[str, Evaluation]:
+        """Return what the environment and its replicas are at random points, by name; nothing where it has none."""
+        from ..landscapes.measures.floor import evaluate_replicas
+
+        if not (replicas := self.env.replicas()):
+            return {}
+        names = [OWN, *replicas]
+        if (kept := self.checkpoint.load("floor")) is None or kept["names"].tolist() != names:
+            with watch.busy(f"{self.env.name}: its numerical floor"):
+                x = self.env.space.uniform(NOISE_POINTS, seed=self.seed)
+                own = evaluate(self.env, x, grad=True)
+                found = [own, *evaluate_replicas(self.env, x, replicas, grad=True).values()]
+            parts = {part: torch.stack([getattr(one, part) for one in found]).numpy() for part in SAMPLES}
+            kept = {"names": np.array(names), **parts}
+            self.checkpoint.save("floor", **kept)
+        each = zip(*(torch.from_numpy(kept[part]) for part in SAMPLES), strict=True)
+        return {name: Evaluation(*one) for name, one in zip(names, each, strict=True)}
+
+    def _floor(self, replicas: Mapping[str, Evaluation], whole: float | None) -> Floor:
+        """Return the numerical floor, of a range of losses; by default that at the points."""
+        from ..landscapes.measures.floor import floor_between
+
+        others = {name: one for name, one in replicas.items() if name != OWN}
+        sides = self.env.space.upper - self.env.space.lower
+        return floor_between(replicas[OWN], others, sides=sides, range=whole, seed=self.seed)
+
     def _announce(self, watch: Watch) -> None:
         left, samples = self.left(), self.design.resolution**2
         bases, cuts = len(self.design.bases), len(self.design.cuts)
@@ -185,22 +223,22 @@ class CensusJob(CheckpointedJob["Census"]):
             lower = "--slices, --resolution and --gradients"
             watch.note(f"about {duration(len(left) * each)} here; {lower} change it")
 
-    def _survey(self, deviation: float, watch: Watch) -> dict[str, SurveyedSlice]:
+    def _survey(self, deviation: float, numerics: float, watch: Watch) -> dict[str, SurveyedSlice]:
         from ..landscapes.measures.census import SurveyedSlice
 
         left = self.left()
         with watch.progress(len(self.tasks), "slices") as advance:
             done = len(self.tasks) - len(left)
             advance(done)
-            for piece, arrays in self._do(left, deviation):
+            for piece, arrays in self._do(left, deviation, numerics):
                 self.checkpoint.save(piece, **arrays)
                 advance(done := done + 1)
         pieces = {task.piece: self.checkpoint.load(task.piece) for task in self.tasks}
         return {name: SurveyedSlice.of_arrays(arrays) for name, arrays in pieces.items() if arrays is not None}
 
-    def _do(self, tasks: Sequence[Task], deviation: float) -> Iterator[tuple[str, Mapping[str, Any]]]:
+    def _do(self, tasks: Sequence[Task], deviation: float, numerics: float) -> Iterator[tuple[str, Mapping[str, Any]]]:
         """Survey slices, here or by workers, so many abreast as fill a batch, and yield what each one's piece holds."""
-        how = {"deviation": deviation, "seed": self.seed, "gradients": self.design.gradients}
+        how = {"deviation": deviation, "numerics": numerics, "seed": self.seed, "gradients": self.design.gradients}
         workers = workers_of(self.executor) if self.executor else 1
         for other in (False, True):
             env = self.other if other else self.env
@@ -218,11 +256,14 @@ class CensusJob(CheckpointedJob["Census"]):
             for found in run_tasks(self.executor, _survey_there, [(sent, group, how) for group in groups]):
                 yield from found
 
-    def _conclude(self, found: Mapping[str, SurveyedSlice]) -> Census:
+    def _conclude(self, found: Mapping[str, SurveyedSlice], replicas: Mapping[str, Evaluation]) -> Census:
         from ..landscapes.measures.census import conclude
+        from ..landscapes.measures.ruggedness import span
 
         whole = [found[task.piece] for task in self.tasks if not task.other]
         others = {task.number: found[task.piece] for task in self.tasks if task.other}
+        ranges = [span(one.loss) for one in whole if np.isfinite(one.loss).any()]
+        median_range = float(np.median(ranges)) if ranges else None
         return conclude(
             self.design,
             whole,
@@ -235,6 +276,7 @@ class CensusJob(CheckpointedJob["Census"]):
             identity=self.env.identity(),
             provenance=provenance(self.env, self.command),
             command=self.command,
+            floor=self._floor(replicas, median_range) if replicas else None,
         )
 
 

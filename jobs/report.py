@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import json
 import math
 import shutil
@@ -22,7 +21,7 @@ from torch import Tensor
 from ..landscapes.capacity import Need, require, size
 from ..landscapes.convert import NOT_JSON, from_json, to_json
 from ..landscapes.cost import duration
-from ..landscapes.identity import MODEL_VERSION, plane_of, stored_identity
+from ..landscapes.identity import MODEL_VERSION, digest_of, plane_of, stored_identity
 from ..landscapes.measures.classify import QuotedWord
 from ..landscapes.measures.doubled_resolution import DoubledResolution
 from ..landscapes.measures.profile import Profile
@@ -244,7 +243,7 @@ def report_work(env: Environment, shape: tuple[int, ...], points: int) -> Work:
     """Return what measuring a slice evaluates at most, its growth with the horizon included, of shorter episodes."""
     from ..landscapes.measures.profile import effort
 
-    losses, gradients = effort(len(shape), points, shape)
+    losses, gradients = effort(len(shape), points, shape, len(env.replicas()))
     return Work(env, losses, gradients + growth_effort(env))
 
 
@@ -311,10 +310,12 @@ def _announce(env: Environment, dataset: xr.Dataset, points: int, watch: Watch) 
 def _open(subject: ReportedSlice) -> xr.Dataset:
     """Read a slice that can be reported on; raise ValueError for one that cannot."""
     from ..landscapes.lattice import sampled_lattice
+    from ..landscapes.storage.floor_map import open_floor_map, with_map
     from ..landscapes.storage.paths import is_finished
     from ..landscapes.storage.store import open_slice
 
     dataset = open_slice(subject.store)
+    dataset = with_map(dataset, open_floor_map(subject.store, dataset))
     if "grad" not in dataset or min(dataset["loss"].shape) < 3:
         raise ValueError(f"{subject.name}: report needs a slice with gradients and three samples per axis; got another")
     missing = int((dataset["status"] == 0).sum())
@@ -392,12 +393,6 @@ def _leave_measures(folder: Path, report: Report) -> None:
         if read_json(folder / MEASURES) == report.measures:
             return
     write_record(folder / MEASURES, report.measures)
-
-
-def digest_of(dataset: xr.Dataset) -> str:
-    """Return what a slice is known by in its report."""
-    identity = json.dumps(json.loads(dataset.attrs["identity"]), sort_keys=True).encode()  # as it is stored
-    return hashlib.sha256(identity + dataset["loss"].to_numpy().tobytes()).hexdigest()[:12]
 
 
 def _holds(folder: Path, key: ReportKey) -> bool:
@@ -537,6 +532,8 @@ class Report:
     def verdict_lines(self) -> list[str]:
         """Return the words, each with its reason, and whether the paper has them, a line each."""
         lines = [f"{word}: {self.profile.verdict.reasons[word]}" for word in self.words]
+        if self.profile.floor:
+            lines.append(self.profile.floor.sentence())
         if self.profile.doubled:
             lines.append(_describe_changes(self.profile.doubled))
         if self.paper:

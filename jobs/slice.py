@@ -6,9 +6,9 @@ import json
 import math
 import time
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -25,6 +25,16 @@ from ..landscapes.cost import duration, seconds_per_episode
 from ..landscapes.directions import barrier
 from ..landscapes.identity import plane_of, stored_identity, with_stride
 from ..landscapes.lattice import check_gradients, count_gradients
+from ..landscapes.measures.floor import Floor
+from ..landscapes.measures.slice_floor import (
+    counted_from,
+    find_floor,
+    floor_attribute,
+    floor_of,
+    map_floor,
+    refuse_without_replicas,
+    split_effort,
+)
 from ..landscapes.measures.undersampled import Undersampled, find_undersampled, probes
 from ..landscapes.objective import BoxedObjective, Objective, Status, describe_errors, failed
 from ..landscapes.plain import plain_name
@@ -34,6 +44,14 @@ from ..landscapes.sampling.fill import Progress, sample
 from ..landscapes.sampling.refine import Refined, Refinement, partly_refined, refine
 from ..landscapes.storage.arrays import Tile, need_of
 from ..landscapes.storage.files import clear
+from ..landscapes.storage.floor_map import (
+    FLOOR,
+    discard_floor_map,
+    open_floor_map,
+    replica_paths,
+    save_floor_map,
+    with_map,
+)
 from ..landscapes.storage.paths import is_slice, slice_exists
 from ..landscapes.storage.store import SliceStore
 from ..landscapes.verification import verify_dataset
@@ -54,7 +72,10 @@ MAX_DRAWING_SHARE = 0.1  # of the time, for pictures of an unfinished slice
 FIRST_PICTURE_SECONDS = 3.0  # no intermediate picture of slices that are faster than this
 MAX_NAME_LETTERS = 40  # letters of a folder's name that say along what a slice was cut
 JOINED = "joined"  # in the identity of a slice that was cut between points: their names
-Draw = Callable[..., "Figure"]  # draw(dataset, width=None): a slice for a screen, or for a page so wide [mm]
+Draw = Callable[
+    ..., "Figure"
+]  # draw(dataset, width=None, floor=None): a slice with its map of the numerical floor, for
+# a screen, or for a page so wide [mm]
 
 
 @dataclass(frozen=True)
@@ -64,6 +85,7 @@ class SliceSummary:
     Gradients are at every `gradients_every` samples along each axis. `episodes` are those of the samples;
     `undersampled` has those that looked between them, and what they found, None where nothing is known of it.
     `barrier` [loss unit] is that between the ends of a line. `error` is what the first point that raised said.
+    `floor` is what replicas of the objective differ by, None where it has none.
     """
 
     env: str | None
@@ -86,6 +108,7 @@ class SliceSummary:
     files: list[str]
     barrier: float | None = None
     error: str = ""
+    floor: Floor | None = None
 
     def outcome(self) -> str:
         """Say in a line what the slice cost and what came out."""
@@ -100,8 +123,9 @@ class SliceSummary:
         flat = f"; gradient exactly zero at {share:.1%} of points" if share else ""
         barred = "" if self.barrier is None else f"; barrier of {self.barrier:.4g} above the line between its ends"
         hidden = f"; {said}" if self.undersampled and (said := self.undersampled.describe()) else ""
+        numerics = f"; {self.floor.sentence()}" if self.floor else ""
         spent = f"{self.episodes} episodes in {duration(self.seconds)}"
-        return f"{spent}; {ends}{raised}; {losses}{flat}{barred}{refined}{hidden}"
+        return f"{spent}; {ends}{raised}; {losses}{flat}{barred}{refined}{hidden}{numerics}"
 
 
 @dataclass(frozen=True)
@@ -120,19 +144,29 @@ class SliceCost:
 def slice_work(objective: Objective, shape: tuple[int, ...], every: int, *, between: bool = True) -> Work:
     """Return what a slice evaluates: gradients at every so many samples along each axis, `every`, 0 for none.
 
-    Losses `between` its samples, which a single slice looks at, are at most so many.
+    A single slice looks `between` its samples, and how far its replicas are apart: at most so many times.
     """
     points, having = math.prod(shape), count_gradients(shape, every)
     need = need_of(shape, objective.space.dim, grad=every > 0)
-    losses = points - having + (probes(points, grad=every == 1) if between else 0)
+    losses = points - having
+    if between:
+        losses += probes(points, grad=every == 1)
+        again = floor_episodes(objective, points)
+        losses, having = (losses, having + again) if every else (losses + again, having)
     return Work(objective, losses, having, need.disk, need.memory)
+
+
+def floor_episodes(objective: Objective, samples: int) -> int:
+    """Return how many episodes of its replicas tell the numerical floor of a slice of so many samples."""
+    replicas = len(objective.replicas())
+    return math.prod(split_effort(samples, replicas)) if replicas else 0
 
 
 @dataclass(frozen=True, kw_only=True)
 class SliceJob(SummaryJob[SliceSummary]):
     """A slice to sample, and how to draw it, here or by the workers of an `executor`, each with what `remake` returns.
 
-    With a `refinement` it is sampled only where it has to be.
+    With a `refinement` it is sampled only where it has to be. With `floor` its replicas are evaluated at every sample.
     """
 
     results = SLICE
@@ -143,6 +177,7 @@ class SliceJob(SummaryJob[SliceSummary]):
     executor: Executor | None = None
     remake: Callable[[], Objective] | None = None
     refinement: Refinement | None = None
+    floor: bool = False
 
     @classmethod
     def of(
@@ -160,15 +195,19 @@ class SliceJob(SummaryJob[SliceSummary]):
         executor: Executor | None = None,
         prints: Sequence[float] = (),
         refinement: Refinement | None = None,
+        floor: bool = False,
     ) -> SliceJob:
         """Continue the slice in `out`, by default a folder under `root` named after it, or begin it there.
 
         Losses are at all samples, gradients at every so many along each axis, `gradients`, 0 for none. `boxed` leaves
         out what lies beyond the parameters' bounds. With a `cut`, how it was cut along directions, it is boxed; of one
         that was begun, `kept_plane` has the plane. With an `executor` its workers compute. `force` begins again where
-        another slice is. Raises ValueError where gradients cannot be so far apart and where the folder holds something
+        another slice is. `floor` also maps the numerical floor, which is no setting of the slice. Raises ValueError
+        where gradients cannot be so far apart, where there is no floor to map, and where the folder holds something
         else, StoreMismatchError where it holds another slice.
         """
+        if floor:
+            refuse_without_replicas(objective, refined=refinement is not None)
         gradients = check_gradients(gradients, plane, refined=refinement is not None)
         identity = _identity(objective, gradients, boxed=boxed, cut=cut)
         folder = out or default_folder(identity, plane.resolution, plane, gradients > 0, root, refinement)
@@ -183,12 +222,15 @@ class SliceJob(SummaryJob[SliceSummary]):
         return cls(
             objective=BoxedObjective(objective) if boxed else objective, remake=None if boxed else recipe(objective),
             plane=plane, store=store, plot=picture_of(objective, plane), folder=folder, command=command,
-            executor=executor, prints=prints, refinement=refinement,
+            executor=executor, prints=prints, refinement=refinement, floor=floor,
         )  # fmt: skip
 
     def work(self) -> list[Work]:
-        """Return its samples, and what looks between them."""
-        return [slice_work(self.objective, self.plane.resolution, self.store.every if self.store.grad else 0)]
+        """Return its samples and what looks between them, and the replicas' slices where those are mapped."""
+        every = self.store.every if self.store.grad else 0
+        whole = [slice_work(self.objective, self.plane.resolution, every)]
+        replicas = self.objective.replicas().values() if self.floor else []
+        return whole + [slice_work(one, self.plane.resolution, every, between=False) for one in replicas]
 
     def cost(self) -> SliceCost:
         """Estimate what is left; workers that compute it do, which warms them, and leaves a GPU of theirs alone."""
@@ -203,8 +245,13 @@ class SliceJob(SummaryJob[SliceSummary]):
         self._announce(watch)
         start = time.monotonic()
         dataset, computed = self._sample(watch)
-        printed = self.draw(partial(self.plot, dataset))
-        return self._summary(dataset, computed, time.monotonic() - start, [STORE, PICTURE, *printed, SUMMARY])
+        mapped = open_floor_map(self.folder, dataset)
+        if mapped is None and self.floor:
+            mapped = self._map_floor(dataset, watch)
+        dataset = with_map(dataset, mapped)
+        printed = self.draw(partial(self.plot, dataset, floor=mapped))
+        files = [STORE, *([] if mapped is None else [FLOOR]), PICTURE, *printed, SUMMARY]
+        return self._summary(dataset, computed, time.monotonic() - start, files)
 
     def holding(self, watch: Watch) -> AbstractContextManager[None]:
         """Leave the finest complete picture where it is stopped."""
@@ -270,13 +317,38 @@ class SliceJob(SummaryJob[SliceSummary]):
 
             def conclude(dataset: xr.Dataset) -> dict[str, Any]:
                 advance(dataset["status"].size, "checks between samples")
-                return look_between(evaluator(self.objective, self.executor, self.remake), dataset)
+                return conclude_slice(self.objective, dataset, self.executor, self.remake)
 
             how: dict[str, Any] = {"executor": self.executor, "made": self.remake}
             how |= {"progress": follow, "conclude": conclude}
             if self.refinement is None:
                 return sample(self.objective, self.plane, self.store, gradients=int(self.store.grad), **how), computed
             return refine(self.objective, self.plane, self.store, self.refinement, **how), computed
+
+    def _map_floor(self, dataset: xr.Dataset, watch: Watch) -> xr.Dataset:
+        """Sample the slices of the replicas, as far as they are missing, and leave the map of how far all are apart."""
+        replicas, whole = self.objective.replicas(), math.prod(self.plane.resolution)
+        watch.note(f"numerical floor: {len(replicas)} x {whole} episodes of replicas, {', '.join(replicas)}")
+        self.objective.release()
+        gradients, found = self.store.every if self.store.grad else 0, dict[str, xr.Dataset]()
+        with watch.progress(len(replicas) * whole) as advance:
+            for path, (name, replica) in zip(replica_paths(self.folder, list(replicas)), replicas.items(), strict=True):
+
+                def follow(now: Progress, before: int = len(found) * whole) -> None:
+                    advance(before + now.done)
+
+                store = SliceStore.open_or_create(
+                    path, self.plane, replica.space, identity=with_stride(replica.identity(), gradients),
+                    grad=gradients > 0,
+                )  # fmt: skip
+                found[name] = sample(
+                    replica, self.plane, store, gradients=gradients, executor=self.executor, made=recipe(replica),
+                    progress=follow,
+                )  # fmt: skip
+                replica.release()
+        mapped = map_floor(self.objective, dataset, found)
+        save_floor_map(self.folder, mapped)
+        return mapped
 
     def _summary(self, dataset: xr.Dataset, computed: int, seconds: float, files: list[str]) -> SliceSummary:
         identity, status = self.store.identity, dataset["status"].to_numpy()
@@ -301,6 +373,7 @@ class SliceJob(SummaryJob[SliceSummary]):
             files=files,
             barrier=barrier_of(dataset),
             error=self.store.error,
+            floor=floor_of(dataset),
         )
 
 
@@ -317,6 +390,7 @@ def _open_store(folder: Path, plane: Plane, space: ParameterSpace, *, force: boo
         return SliceStore.open_or_create(folder / STORE, plane, space, **settings)
     store = SliceStore.create(folder / STORE, plane, space, overwrite=True, **settings)
     clear(folder, (PICTURE, SUMMARY), PICTURE)
+    discard_floor_map(folder)
     return store
 
 
@@ -330,16 +404,16 @@ def kind_of(store: SliceStore) -> str:
 def picture_of(objective: Objective, plane: Plane) -> Draw:
     """Return how a slice is drawn: a map, or a profile over a line with the events of an environment's episodes."""
 
-    def surface(dataset: xr.Dataset, width: float | None = None) -> Figure:
+    def surface(dataset: xr.Dataset, width: float | None = None, floor: xr.Dataset | None = None) -> Figure:
         from ..landscapes.draw.figures.contour import landscape_figure
 
-        return landscape_figure(dataset, width=width)
+        return landscape_figure(dataset, floor=floor, width=width)
 
-    def profile(dataset: xr.Dataset, width: float | None = None) -> Figure:
+    def profile(dataset: xr.Dataset, width: float | None = None, floor: xr.Dataset | None = None) -> Figure:
         from ..landscapes.draw.figures.profile import profile_figure
 
         u = torch.tensor(dataset["u"].to_numpy())
-        return profile_figure(dataset, events=objective.events(plane.lift(u[:, None])), width=width)
+        return profile_figure(dataset, events=objective.events(plane.lift(u[:, None])), floor=floor, width=width)
 
     return surface if plane.rank == 2 else profile
 
@@ -455,20 +529,56 @@ def kept_plane(
     return found if same and found.resolution == resolution else None
 
 
-def look_between(objective: Objective, dataset: xr.Dataset) -> dict[str, Any]:
+def conclude_slice(
+    objective: Objective,
+    dataset: xr.Dataset,
+    executor: Executor | None = None,
+    remake: Callable[[], Objective] | None = None,
+) -> dict[str, Any]:
+    """Return the attributes of a slice that say what is real of it: its numerical floor, and what its samples hide.
+
+    With an `executor` its workers evaluate.
+    """
+    floor = look_at_replicas(objective, dataset, executor)
+    least = counted_from(floor, dataset["loss"].size)
+    hidden = look_between(evaluator(objective, executor, remake), dataset, floor=least)
+    return {**(floor_attribute(floor) if floor else {}), **hidden}
+
+
+def look_at_replicas(objective: Objective, dataset: xr.Dataset, executor: Executor | None = None) -> Floor | None:
+    """Measure the numerical floor of a slice, None where there are no replicas.
+
+    Replicas that raise are warned of, and nothing is said.
+    """
+    with _sampled_all_the_same(f"{objective.name}'s replicas raised, so its numerical floor is not known"):
+        return find_floor(objective, dataset, through=lambda one: evaluator(one, executor, recipe(one)))
+    return None
+
+
+def look_between(objective: Objective, dataset: xr.Dataset, *, floor: float = 0.0) -> dict[str, Any]:
     """Return the attribute of a slice that says which share of its cells is undersampled.
 
-    An objective that raises between them has been sampled all the same: that is warned of, and nothing is said.
+    `floor` [loss unit] is the least difference that counts. An objective that raises between them has been sampled all
+    the same: that is warned of, and nothing is said.
+    """
+    with _sampled_all_the_same(f"{objective.name} raised between the samples, so what they hide is not known"):
+        found = find_undersampled(objective, dataset, floor=floor)
+        return found.attribute() if found else {}
+    return {}
+
+
+@contextmanager
+def _sampled_all_the_same(said: str) -> Iterator[None]:
+    """Warn of what is raised after a slice was sampled, and go on; lost workers and a full disk pass.
+
+    Once they are there again, the slice is finished.
     """
     try:
-        found = find_undersampled(objective, dataset)
-        return found.attribute() if found else {}
-    except (OSError, MemoryError):  # lost workers, a full disk: the slice is finished once they are there again
+        yield
+    except (OSError, MemoryError):
         raise
     except Exception as error:
-        said = f"{objective.name} raised between the samples, so what they hide is not known: {error}"
-        warnings.warn(said, RuntimeWarning, stacklevel=2)
-        return {}
+        warnings.warn(f"{said}: {error}", RuntimeWarning, stacklevel=4)
 
 
 def barrier_of(dataset: xr.Dataset) -> float | None:

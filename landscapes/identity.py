@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -153,6 +154,12 @@ def plane_of(dataset: xr.Dataset) -> Plane:
     from .plane import Plane
 
     return Plane.from_record(stored_identity(dataset)["plane"])
+
+
+def digest_of(dataset: xr.Dataset) -> str:
+    """Return what a slice is known by in what is measured of it: of its identity and its losses."""
+    identity = json.dumps(json.loads(dataset.attrs["identity"]), sort_keys=True).encode()  # as it is stored
+    return hashlib.sha256(identity + dataset["loss"].to_numpy().tobytes()).hexdigest()[:12]
 
 
 def _decode(dataset: xr.Dataset, name: str) -> dict[str, Any]:

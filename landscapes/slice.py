@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from .draw.figure import Picture
+    from .measures.floor import Floor
     from .measures.profile import Profile
 
 
@@ -39,12 +40,14 @@ class Slice:
     `data` is an xarray dataset of loss(v, u), grad(v, u, dim) unless sampled without, and status(v, u); a line has no
     v. Along a logarithmic parameter a coordinate is the decimal logarithm of the value, and has the attribute `scale`,
     "log10"; gradients are by it. `folder` is where its files are, None for one in memory. `remake` makes the objective
-    again that it was sampled from, for what has to be evaluated again.
+    again that it was sampled from, for what has to be evaluated again. `floor_map` has the standard deviation between
+    replicas of the objective at every sample, deviation(v, u), None where it was not mapped.
     """
 
     data: xr.Dataset
     folder: Path | None = None
     remake: Callable[[], Objective] | None = None
+    floor_map: xr.Dataset | None = None
 
     @cached_property
     def identity(self) -> dict[str, Any]:
@@ -71,6 +74,13 @@ class Slice:
             raise ValueError("this slice was sampled without gradients; sample it again with gradients=True")
         found: NDArray[np.float64] = self.plane.slope(torch.from_numpy(self.data["grad"].to_numpy())).numpy()
         return found
+
+    @property
+    def floor(self) -> Floor | None:
+        """The numerical floor: how far replicas of the objective are apart, None where it was not measured."""
+        from .measures.slice_floor import floor_of
+
+        return floor_of(self.data)
 
     @property
     def errors(self) -> str:
@@ -113,10 +123,10 @@ class Slice:
         if self.plane.rank == 2:
             from .draw.figures.contour import landscape_figure
 
-            return landscape_figure(self.data, width=width)
+            return landscape_figure(self.data, floor=self.floor_map, width=width)
         from .draw.figures.profile import profile_figure
 
-        return profile_figure(self.data, events=self._events(), width=width)
+        return profile_figure(self.data, events=self._events(), floor=self.floor_map, width=width)
 
     def report(self, points: int = 6, seed: int = 0) -> Profile:
         """Measure what the landscape is like here: ruggedness, noise, jumps, gradients at several scales, in words.
@@ -153,8 +163,9 @@ class Slice:
         finite = f"losses from {low:.4g} to {high:.4g}" if low <= high else "no finite loss"
         where = f" in {self.folder}" if self.folder else ""
         raised = f"; {self.errors}" if self.errors else ""
+        numerics = f"; {self.floor.sentence()}" if self.floor else ""
         over = ", ".join(self.plane.labels)
-        return f"<Slice of {' · '.join(about)} over {over}: {points} points, {finite}{raised}{where}>"
+        return f"<Slice of {' · '.join(about)} over {over}: {points} points, {finite}{numerics}{raised}{where}>"
 
     def _events(self) -> dict[str, Any]:
         """Count what happens in the episodes along a line, where an environment says what does."""

@@ -21,6 +21,7 @@ from ...landscapes.identity import plane_of, stored_identity, stored_provenance
 from ...landscapes.lattice import own_cells
 from ...landscapes.measures.classify import WORDS
 from ...landscapes.measures.profile import Profile
+from ...landscapes.measures.slice_floor import floor_of
 from ...landscapes.measures.undersampled import Undersampled, contradicted_cells
 from ...landscapes.objective import NOT_EVALUATED, Status, failed
 from ...landscapes.overlay import improvements, lay
@@ -41,7 +42,8 @@ Column = Sequence[float | None]  # of numbers, None for what is not finite
 class Numbers:
     """Say how a slice's points ended, the ends of their losses, and at what share of them the gradient is zero.
 
-    `undersampled` is the share of its cells whose loss its samples do not show, with its interval, where it is known.
+    `undersampled` is the share of its cells whose loss its samples do not show, with its interval, where it is known;
+    `floor` is its numerical floor in words.
     """
 
     points: int
@@ -50,6 +52,7 @@ class Numbers:
     highest: float | None
     flat: float | None
     undersampled: Mapping[str, float | None] | None = None
+    floor: str = ""
 
 
 @dataclass(frozen=True)
@@ -256,7 +259,7 @@ class FigureEntry:
 def count_numbers(dataset: xr.Dataset) -> Numbers:
     """Count how the points of a slice ended, and find the range of their losses."""
     loss, status, flat = dataset["loss"].to_numpy(), dataset["status"].to_numpy(), flat_points(dataset)
-    between = Undersampled.of(dataset)
+    between, floor = Undersampled.of(dataset), floor_of(dataset)
     finite, evaluated = loss[np.isfinite(loss)], int(np.isin(status, NOT_EVALUATED, invert=True).sum())
     return Numbers(
         points=int(status.size),
@@ -265,6 +268,7 @@ def count_numbers(dataset: xr.Dataset) -> Numbers:
         highest=float(finite.max()) if finite.size else None,
         flat=None if flat is None or not evaluated else flat / evaluated,
         undersampled=to_json(between.share) if between else None,
+        floor=floor.sentence().removeprefix("numerical floor ") if floor else "",
     )
 
 

@@ -33,6 +33,7 @@ BEYOND, LOST = "#9a7b00", "#c94f4f"  # points there that are outside the window,
 LOSS_MAP: Colormap = colormaps["viridis"]
 RANK_MAP: Colormap = ListedColormap(colormaps["viridis_r"](np.linspace(0.0, 0.92, 256)), "viridis, 1 is light")
 SLOPE_MAP: Colormap = ListedColormap(colormaps["magma"](np.linspace(0.08, 0.77, 256)), "magma, legible on white")
+FLOOR_MAP: Colormap = colormaps["cividis"]
 SLOPE_MAP_DARK: Colormap = ListedColormap(colormaps["magma"](np.linspace(0.42, 1.0, 256)), "magma, legible on black")
 
 FAILURES = {Status.NONFINITE: "not finite", Status.ESCAPED: "outside the domain", Status.ERROR: "error"}
@@ -282,6 +283,12 @@ class Scale:
         """Span the finite logarithms of magnitudes."""
         low, high, extend = _span(values)
         return cls(Normalize(low, high), extend)
+
+    @classmethod
+    def of_deviation(cls, values: NDArray[np.float64]) -> Scale:
+        """Span finite standard deviations from zero on."""
+        _, high, extend = _span(values)
+        return cls(Normalize(0.0, high), "max" if extend in ("max", "both") else "neither")
 
     @property
     def ends(self) -> tuple[float, float]:

@@ -26,6 +26,7 @@ from ..space import ParameterSpace
 from ..statistics import CONFIDENCE, Estimate
 from .classify import WORDS, Verdict, classify, likeness
 from .discontinuities import EVALUATIONS_PER_PAIR, Jumps, find_jumps
+from .floor import Floor
 from .gradient_quality import compare_samples
 from .noise import noise_floor
 from .ruggedness import Ruggedness, half_step, ruggedness
@@ -164,18 +165,27 @@ class SurveyedSlice:
 
 
 def survey(
-    objective: Objective, planes: Sequence[Plane], *, deviation: float, seed: int, gradients: int = 1
+    objective: Objective,
+    planes: Sequence[Plane],
+    *,
+    deviation: float,
+    seed: int,
+    gradients: int = 1,
+    numerics: float = 0.0,
 ) -> list[SurveyedSlice]:
-    """Sample and measure slices, their points in one batch; `deviation` [loss unit] is that of the losses' noise.
+    """Sample and measure slices, their points in one batch.
 
+    `deviation` and `numerics` [loss unit] are the standard deviations of the losses' noise and between replicas. The
+    larger one is what measures of losses count nothing below, as `noise_floor` has it.
     Measures are those of a report, without their intervals within the slice: what counts here is how they differ from
     slice to slice. Those of gradients are of every so many samples along each axis, `gradients`, and hold them against
     the losses of all. Jumps are looked for in at most `STEEP` pairs of samples of a slice.
     """
     wholes = sample_cuts(objective, planes, gradients=gradients)
-    rugged = [_ruggedness(whole, deviation) for whole in wholes]
+    apart = max(deviation, numerics)
+    rugged = [_ruggedness(whole, apart, deviation) for whole in wholes]
     least = [
-        max(noise_floor(deviation, whole["loss"].size), half_step(found.range, plane.resolution))
+        max(noise_floor(apart, whole["loss"].size), half_step(found.range, plane.resolution))
         for plane, whole, found in zip(planes, wholes, rugged, strict=True)
     ]
     jumps = find_jumps(objective, wholes, least=least, most=STEEP, seed=seed)
@@ -183,7 +193,7 @@ def survey(
     for plane, whole, found, steep in zip(planes, wholes, rugged, jumps, strict=True):
         measures, verdict = _measure(whole, found, steep, deviation)
         thin = thin_out(whole)
-        halved, _ = _measure(thin, _ruggedness(thin, deviation), None, deviation)
+        halved, _ = _measure(thin, _ruggedness(thin, apart, deviation), None, deviation)
         samples = plane.grid().reshape(-1, plane.dim)
         asked = len(samples) if objective.beyond_box else int(in_box(objective.space, samples).sum())
         loss, episodes = whole["loss"].to_numpy(), asked + EVALUATIONS_PER_PAIR * steep.checked
@@ -234,8 +244,9 @@ def _dataset(plane: Plane, loss: Array, grad: Array, status: Array) -> xr.Datase
     return xr.Dataset(columns, attrs=about)
 
 
-def _ruggedness(dataset: xr.Dataset, deviation: float) -> Ruggedness:
-    return ruggedness(dataset, floor=noise_floor(deviation, dataset["loss"].size), estimate=_alone)
+def _ruggedness(dataset: xr.Dataset, apart: float, deviation: float) -> Ruggedness:
+    floor, noise = (noise_floor(one, dataset["loss"].size) for one in (apart, deviation))
+    return ruggedness(dataset, floor=floor, noise=noise, estimate=_alone)
 
 
 def _measure(dataset: xr.Dataset, found: Ruggedness, steep: Jumps | None, deviation: float) -> tuple[Array, Verdict]:
@@ -324,7 +335,8 @@ class Census:
     `words` says of every word which share of the slices it fits, `spreads` and `parts` say of every measure how it is
     distributed and what its variance goes with. `other` is the fidelity that some slices were measured at, too, empty
     where there is none. Slices have gradients at every so many samples along each axis, `gradients`. `losses`
-    [loss unit] are those of the slices, shape (slice, v, u), in a file of their own.
+    [loss unit] are those of the slices, shape (slice, v, u), in a file of their own. `floor` is what replicas of the
+    environment differ by at random points, against the median range of the slices; None where it has none.
     """
 
     env: str
@@ -343,6 +355,7 @@ class Census:
     identity: dict[str, Any]
     provenance: dict[str, Any]
     command: str
+    floor: Floor | None = None
     losses: NDArray[np.float32] = field(
         default_factory=lambda: np.zeros(0, np.float32), metadata=NOT_JSON, repr=False, compare=False
     )
@@ -391,6 +404,7 @@ def conclude(
     identity: Mapping[str, Any],
     provenance: Mapping[str, Any],
     command: str,
+    floor: Floor | None = None,
 ) -> Census:
     """Sum up the slices of a design, and those that were measured at another fidelity, too, by their numbers."""
     drawn = bootstrap(design.places, seed=seed)
@@ -422,6 +436,7 @@ def conclude(
         identity=dict(identity),
         provenance=dict(provenance),
         command=command,
+        floor=floor,
     )
 
 

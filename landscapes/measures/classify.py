@@ -21,8 +21,22 @@ from .ruggedness import Ruggedness
 VERY_SMOOTH, SMOOTH, RUGGED, EXTREME = "very smooth", "smooth with local minima", "rugged", "extremely rugged"
 LARGE_FLAT, DISCONTINUOUS = "large flat regions", "discontinuous"
 GOOD, NOISY, OPPOSITE, ZERO = "gradients good", "gradients noisy", "gradients opposite", "gradients zero"
-FAILS, MISSING = "mostly failed", "gradients missing"
-WORDS = (FAILS, VERY_SMOOTH, SMOOTH, RUGGED, EXTREME, LARGE_FLAT, DISCONTINUOUS, GOOD, NOISY, OPPOSITE, ZERO, MISSING)
+FAILS, MISSING, BELOW = "mostly failed", "gradients missing", "flat within noise and numerics"
+WORDS = (
+    FAILS,
+    BELOW,
+    VERY_SMOOTH,
+    SMOOTH,
+    RUGGED,
+    EXTREME,
+    LARGE_FLAT,
+    DISCONTINUOUS,
+    GOOD,
+    NOISY,
+    OPPOSITE,
+    ZERO,
+    MISSING,
+)
 
 FEW_TURNS = 0.1  # of the steps between samples: Himmelblau's function turns at 0.03, Levy's at 0.15 of them
 MANY_TURNS = 0.5  # Rastrigin's function turns at 0.45 of them, white noise at 0.65
@@ -64,7 +78,8 @@ def classify(found: Ruggedness, jumps: Jumps | None, cosine: Values) -> Verdict:
 
     `cosine` is that of its gradients with differences over two samples, NaN where neither shows a slope. A gradient
     of zero is no direction, so it counts for the word zero only. What jumps is not called very smooth, and gradients
-    are not called good where many are missing. Where most samples failed nothing else is said.
+    are not called good where many are missing. Where most samples failed, or the losses differ by no more than noise or
+    numerics alone would make them, nothing else is said.
     """
     return judge(found, jumps, *likeness(cosine))
 
@@ -79,6 +94,10 @@ def judge(found: Ruggedness, jumps: Jumps | None, average: float, uphill: float)
     """Put a landscape into words, of whose gradients the mean cosine and the share uphill are known."""
     if found.failed > MOSTLY * found.samples:
         return Verdict({FAILS: f"no loss at {found.failed / found.samples:.0%} of the samples"})
+    if 0 < found.range <= found.floor:
+        return Verdict(
+            {BELOW: f"the losses range over {found.range:.2g}, noise or numerics alone over {found.floor:.2g}"}
+        )
     reasons = dict([_surface(found)])
     if found.level.value >= MUCH:
         reasons[LARGE_FLAT] = f"{found.level.value:.0%} of the samples are level with their neighbours"

@@ -25,6 +25,7 @@ from ..statistics import Estimate, Values, mean
 from .classify import judge, likeness
 from .discontinuities import Jumps
 from .gradient_quality import agreement
+from .noise import noise_floor
 from .ruggedness import FLAT_SLOPE, Ruggedness, box_slopes
 
 PART = 0.1  # of the cells
@@ -79,7 +80,8 @@ def double_resolution(
     drawn = np.array([blocks[at] for at in np.sort(chosen)])
     losses, slopes, episodes = _sample(objective, dataset, loss, drawn)
     steps = np.array(loss.shape) - 1
-    rules = partial(_measure, floor=found.floor, whole=found.range, deviation=deviation)
+    noise = float(np.nan_to_num(noise_floor(deviation, found.samples)))
+    rules = partial(_measure, floor=found.floor, noise=noise, whole=found.range, deviation=deviation)
     own = tuple([slice(None), *[slice(None, None, 2)] * loss.ndim])
     now = [rules(*block, steps) for block in zip(losses[own], slopes[own], strict=True)]
     then = [rules(*block, 2 * steps) for block in zip(losses, slopes, strict=True)]
@@ -141,14 +143,21 @@ def _places(rank: int, *, every: bool) -> tuple[NDArray[np.intp], NDArray[np.int
 
 
 def _measure(
-    loss: Values, slope: Values, steps: NDArray[np.intp], *, floor: float, whole: float, deviation: float
+    loss: Values,
+    slope: Values,
+    steps: NDArray[np.intp],
+    *,
+    floor: float,
+    noise: float,
+    whole: float,
+    deviation: float,
 ) -> list[float]:
     """Return the measures `LOCAL` of a block whose samples are one of so many steps of the slice apart."""
     inner = tuple([slice(1, -1)] * loss.ndim)
     rises, turned = list[Values](), list[Values]()
     for axis in range(loss.ndim):
         difference = np.diff(loss, axis=axis)
-        sign = np.sign(np.where(np.abs(difference) > whole / steps[axis] / 2, difference, 0.0))
+        sign = np.sign(np.where(np.abs(difference) > max(floor, whole / steps[axis] / 2), difference, 0.0))
         before, after = (np.take(sign, range(start, start + loss.shape[axis] - 2), axis) for start in (0, 1))
         turned.append((before * after < 0).ravel())
         central = np.take(loss, range(2, loss.shape[axis]), axis) - np.take(loss, range(loss.shape[axis] - 2), axis)
@@ -159,7 +168,7 @@ def _measure(
         "cosine"
     ]
     average, uphill = likeness(cosine)
-    level = float((np.max(apart, axis=0) <= floor).mean())
+    level = float((np.max(apart, axis=0) <= noise).mean())
     sizes = np.linalg.norm(slope[inner], axis=-1)
     sizes = sizes[np.isfinite(sizes)]
     flat = float((sizes <= FLAT_SLOPE * whole).mean()) if sizes.size else math.nan

@@ -21,9 +21,11 @@ from . import gradient_quality as gradients
 from .classify import Verdict, classify, thresholds
 from .discontinuities import Count, Jumps, find_jumps
 from .doubled_resolution import DoubledResolution, double_resolution, doubling_episodes
+from .floor import Floor
 from .lyapunov import GradientGrowth
 from .noise import Noise, noise
 from .ruggedness import Ruggedness, half_step, ruggedness
+from .slice_floor import counted_from, find_floor, floor_of, split_effort
 from .undersampled import Undersampled, find_undersampled, probes
 
 PRECISION = {"float32": 2.0**-23, "float64": 2.0**-52}  # relative, of an engine that computes in it
@@ -44,6 +46,9 @@ class OutsideBounds:
 class Profile:
     """Hold the measures of a slice: of its losses, of its noise, of its jumps and of its gradients at several scales.
 
+    `floor` is what replicas of the objective differ by, None where it has none. No measure of losses counts what is
+    below `losses.floor`, which is that of noise or that of numerics, whichever is larger.
+
     `differences`, `differences_of_samples` and `smoothing` sum up `quality`, which is drawn. `beyond_the_box` counts
     the probes that the objective does not allow. `undersampled` and `doubled` say what the samples hide, None where
     that is not known; `errors` says how many of them raised and what the first of them said. `growth` is that of
@@ -63,6 +68,7 @@ class Profile:
     doubled: DoubledResolution | None
     errors: str
     growth: GradientGrowth | None = None
+    floor: Floor | None = None
     quality: gradients.GradientQuality | None = field(default=None, metadata=NOT_JSON, compare=False, repr=False)
 
     @property
@@ -84,7 +90,9 @@ class Profile:
             "Local minima above the noise": f"{losses.minima} ({fewest} to {most} at half the resolution)",
             "Local minima deeper than 1 % of the range": str(losses.notable),
             "Basin of the lowest sample": _percent(losses.lowest_basin),
-            "Noise floor": f"{losses.floor:.2g}",
+            "Noise floor": f"{losses.floor:.2g}{self._describe_source()}",
+            "Numerical floor, of the range": _shares(self.floor.share) if self.floor else "",
+            "Cosine of gradients of replicas": _number(self.floor.cosine) if self.floor and self.floor.cosine else "",
             "Gradient effectively zero": _shares(losses.flat),
             "Samples level with their neighbours": _shares(losses.level),
             "Neighbours with a jump between them": _shares(jumps.share),
@@ -107,11 +115,16 @@ class Profile:
             named[f"First order biased, smoothed over {row.width:.0%} of the box"] = _shares(row.biased)
         return {name: text for name, text in named.items() if text}
 
+    def _describe_source(self) -> str:
+        """Say that the floor is not that of repeats."""
+        numerical = self.floor is not None and self.floor.deviation > np.nan_to_num(self.noise.deviation)
+        return ", that of numerics" if numerical else ""
 
-def effort(rank: int, points: int, shape: Sequence[int] = ()) -> tuple[int, int]:
+
+def effort(rank: int, points: int, shape: Sequence[int] = (), replicas: int = 0) -> tuple[int, int]:
     """Return how many losses, at most, and how many gradients `measure_profile` evaluates.
 
-    Without the `shape` of the slice those are left out that look between its samples.
+    Without the `shape` of the slice those are left out that look between its samples, and at its `replicas`.
     """
     places = points**2
     losses = NOISE_POINTS * (2 + 2 * REPEATS) + PAIRS_PER_POINT * points * 14
@@ -120,6 +133,7 @@ def effort(rank: int, points: int, shape: Sequence[int] = ()) -> tuple[int, int]
     if shape:
         finer = doubling_episodes(shape)
         losses, slopes = losses + probes(math.prod(shape), grad=True) + finer[0], slopes + finer[1]
+        slopes += math.prod(split_effort(math.prod(shape), replicas)) if replicas else 0
     return losses, slopes
 
 
@@ -146,7 +160,8 @@ def measure_profile(
 
     `rounding` is the engine's relative precision: `PRECISION` has that of float32 and of float64. `events` counts what
     happens in episodes, which explains jumps. Jumps are looked for from half the step on, from sample to sample, of a
-    ramp through the range of the losses.
+    ramp through the range of the losses. The numerical floor is the slice's own, or else measured now. Where
+    neighbours or their gradients are compared it does not count, but noise alone: their numerics are the same.
     """
     plane, objective = plane_of(dataset), _Within(objective)
     generator = torch.Generator().manual_seed(seed)
@@ -154,16 +169,19 @@ def measure_profile(
     shares = torch.rand(NOISE_POINTS, plane.rank, generator=generator, dtype=torch.float64)
     drawn = plane.lower + (plane.upper - plane.lower) * shares
     fuzz = noise(objective, plane.lift(drawn), rounding=rounding, repeats=REPEATS, seed=seed)
-    floor = float(np.nan_to_num(fuzz.floor(dataset["loss"].size)))
-    found = ruggedness(dataset, floor=floor)
+    numerics = floor_of(dataset) or find_floor(objective, dataset, seed=seed)
+    samples = dataset["loss"].size
+    noisy = float(np.nan_to_num(fuzz.floor(samples)))
+    floor = max(noisy, counted_from(numerics, samples))
+    found = ruggedness(dataset, floor=floor, noise=noisy)
     least = [max(floor, half_step(found.range, plane.resolution))]
     most = PAIRS_PER_POINT * points
     (jumps,) = find_jumps(objective, [dataset], least=least, most=most, seed=seed, events=events)
     deviation = float(np.nan_to_num(fuzz.deviation))
     steps = gradients.compare_differences(objective, plane, places, deviation=deviation)
     smooth = gradients.smoothed_slopes(objective, plane, places, pairs=PAIRS, seed=seed)
-    samples = gradients.compare_samples(dataset, deviation=deviation)
-    cosine = samples["cosine"].isel(scale=0).to_numpy()
+    near = gradients.compare_samples(dataset, deviation=deviation)
+    cosine = near["cosine"].isel(scale=0).to_numpy()
     between = Undersampled.of(dataset) or find_undersampled(objective, dataset, floor=floor, seed=seed)
     doubled = double_resolution(objective, dataset, found, jumps, cosine, deviation=deviation, seed=seed)
     return Profile(
@@ -171,7 +189,7 @@ def measure_profile(
         noise=fuzz,
         jumps=jumps,
         differences=gradients.scale_table(steps),
-        differences_of_samples=gradients.scale_table(samples),
+        differences_of_samples=gradients.scale_table(near),
         smoothing=gradients.width_table(smooth),
         verdict=classify(found, jumps, cosine),
         thresholds=thresholds(),
@@ -179,7 +197,8 @@ def measure_profile(
         undersampled=between,
         doubled=doubled,
         errors=errors_of(dataset),
-        quality=gradients.GradientQuality(steps, samples, smooth),
+        floor=numerics,
+        quality=gradients.GradientQuality(steps, near, smooth),
     )
 
 

@@ -170,21 +170,33 @@ def information_content(loss: Values) -> tuple[float, float]:
     return float(entropy.max()), math.log10(settled[0]) if len(settled) else math.nan
 
 
-def turns(loss: Values) -> float:
+def turns(loss: Values, floor: float = 0.0) -> float:
     """Return the share of steps between samples that turn back, small steps passed over.
 
     Small is less than half the step of a ramp through the range of the losses. The partial information content M of
-    Munoz et al. 2015, eq. 10, but that a walk which never turns has none.
+    Munoz et al. 2015, eq. 10, but that a walk which never turns has none, and that one which goes back by no more than
+    `floor` [loss unit] has not turned.
     """
     turned = steps = 0
     for axis in range(loss.ndim):
         small = span(loss) / (loss.shape[axis] - 1) / 2
-        for line in _lines(loss, axis):
-            difference = np.diff(line)
-            steps += int(np.isfinite(difference).sum())
-            way = np.sign(difference[np.abs(difference) > small])
-            turned += int((way[1:] != way[:-1]).sum())
+        difference = np.diff(_lines(loss, axis), axis=1)
+        steps += int(np.isfinite(difference).sum())
+        turned += _reversals(np.where(np.abs(difference) > small, difference, 0.0).cumsum(axis=1), floor)
     return turned / steps if steps else math.nan
+
+
+def _reversals(walks: Values, floor: float) -> int:
+    """Count how often walks from 0, shape (walk, step), go back from their last extreme by more than `floor`."""
+    high, low = np.zeros(len(walks)), np.zeros(len(walks))
+    way, turned = np.zeros(len(walks), int), 0  # 0 while a walk has gone nowhere
+    for at in walks.T:
+        high, low = np.maximum(high, at), np.minimum(low, at)
+        down, up = (way >= 0) & (high - at > floor), (way <= 0) & (at - low > floor)
+        turned += int((way[down | up] != 0).sum())
+        way = np.where(down, -1, np.where(up, 1, way))
+        high, low = np.where(up, at, high), np.where(down, at, low)
+    return turned
 
 
 def dispersion(loss: Values) -> float:
@@ -229,12 +241,12 @@ def fitness_distance(loss: Values) -> float:
 
 @dataclass(frozen=True)
 class Ruggedness:
-    """Hold the measures of a slice's losses; `floor` [loss unit] is the range that noise alone would give them.
+    """Hold the measures of a slice's losses; `floor` [loss unit] is the range that noise or numerics alone would give.
 
     `minima` counts those deeper than the floor, `minima_halved` what every second sample shows of them; `curve` counts
     by depths in fractions of the range. `zero` and `flat` are shares of samples whose gradient along the plane is
     exactly and effectively zero, `missing` of those that have a loss and, though it was asked for, no gradient; `level`
-    of those whose neighbours' losses differ by no more than the floor.
+    of those whose neighbours' losses differ by no more than the floor of noise.
     """
 
     samples: int
@@ -261,8 +273,18 @@ class Ruggedness:
     fitness_distance: Estimate
 
 
-def ruggedness(dataset: xr.Dataset, *, floor: float, estimate: Callable[..., Estimate] = jackknife) -> Ruggedness:
-    """Measure the ruggedness of a slice; `estimate` takes a statistic and samples, and gives its interval, too."""
+def ruggedness(
+    dataset: xr.Dataset,
+    *,
+    floor: float,
+    noise: float | None = None,
+    estimate: Callable[..., Estimate] = jackknife,
+) -> Ruggedness:
+    """Measure the ruggedness of a slice; `estimate` takes a statistic and samples, and gives its interval, too.
+
+    `noise` [loss unit] is the floor of repeats, by default `floor`. Neighbours are level by that one: their numerics
+    are the same, so that their difference is a slope, however fine the samples are.
+    """
     loss = dataset["loss"].transpose("v", "u", missing_dims="ignore").to_numpy()
     whole, found = span(loss), minima(loss)
     notable = found.sample[found.depth > max(floor, NOTABLE * whole)]
@@ -282,19 +304,19 @@ def ruggedness(dataset: xr.Dataset, *, floor: float, estimate: Callable[..., Est
         minima=found.count(floor),
         minima_halved=minima_of_halves(loss, floor),
         notable=len(notable),
-        curve={f"{part:g}": found.count(part * whole) for part in THRESHOLDS},
+        curve={f"{part:g}": found.count(max(floor, part * whole)) for part in THRESHOLDS},
         largest_basin=float(shares.max()),
         lowest_basin=float(shares[0]),
         zero=None if slopes is None else share_of(_mean, _below(slopes, 0.0)),
         flat=None if slopes is None else share_of(_mean, _below(slopes, FLAT_SLOPE * whole)),
         missing=missing_gradients(dataset),
-        level=share_of(_mean, level_samples(loss, floor)),
+        level=share_of(_mean, level_samples(loss, floor if noise is None else noise)),
         correlation_length=along_axes(correlation_length, least=0.0, most=1.0),
         holder=along_axes(partial(holder_exponent, floor=floor), least=0.0),
         total_variation=along_axes(total_variation, least=1.0),
         information=share_of(lambda part: information_content(part)[0], loss),
         settling=estimate(lambda part: information_content(part)[1], loss),
-        turns=share_of(turns, loss),
+        turns=share_of(partial(turns, floor=floor), loss),
         dispersion=estimate(dispersion, loss, least=0.0),
         fitness_distance=estimate(fitness_distance, loss, least=-1.0, most=1.0),
     )

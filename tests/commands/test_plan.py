@@ -12,6 +12,7 @@ from gradscape.landscapes.measures.undersampled import probes
 
 from ..command import Run
 
+FLOOR = 4  # evaluations of a replica of bounce, at least
 EACH = {False: 0.5, True: 2.0}  # seconds of a loss and of a gradient
 
 
@@ -27,8 +28,9 @@ def priced(monkeypatch: pytest.MonkeyPatch) -> None:
         ("slice branin --resolution 8", probes(64, grad=True), 64),
         ("slice branin --resolution 8 --no-gradients", 64 + probes(64, grad=False), 0),
         ("slice branin --resolution 9 --gradients 4", 81 - 9 + probes(81, grad=False), 9),
-        ("slice bounce --along random:1 --window 0.2 --resolution 5", probes(25, grad=True), 25),
-        ("bounce --axis y --resolution 16", probes(16, grad=True), 16),
+        ("slice bounce --along random:1 --window 0.2 --resolution 5", probes(25, grad=True), 25 + FLOOR),
+        ("slice bounce --dims 0 1 --resolution 5 --floor", probes(25, grad=True), 3 * 25 + FLOOR),
+        ("bounce --axis y --resolution 16", probes(16, grad=True), 16 + FLOOR),
         ("sweep ackley --set dim=3 --dims 0 1 --over 2 --frames 3 --resolution 5", 0, 75),
         ("optimize branin --method random --budget 30", 30, 0),
         ("optimize branin --method descents --budget 30", 0, 30),
@@ -67,7 +69,7 @@ def test_what_samples_a_slice_first_is_planned_by_that_slice(run: Run, tmp_path:
         ("overlay cut run --through best --resolution 6", 36),
     ):
         found = run.json("plan", *words.split())
-        assert found["gradients"] == points
+        assert found["gradients"] == points + FLOOR
     assert "simulates nothing" in run("plan overlay cut run").stderr
     assert sorted(tmp_path.rglob("*")) == before
 

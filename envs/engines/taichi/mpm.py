@@ -440,12 +440,13 @@ def _laws(name: str) -> SimpleNamespace:
         return t * ti.max(real(0.0), real(1.0) + friction * normal / speed)
 
     @ti.func
-    def touch(v, body, n, share, friction, slip: ti.template()):
+    def touch(v, body, n, share, held, friction, slip: ti.template()):
+        """Take a share of the velocity that goes into a body, and what of it is held of that which goes out."""
         u = v - body
         normal = u.dot(n)
         t = u - normal * n
-        felt = ti.select(normal < real(0.0), share, real(0.0))
-        return v + felt * (rub(t, normal, friction, slip) - u)
+        felt = ti.select(normal < real(0.0), share, held)
+        return v + felt * (rub(t, -ti.abs(normal), friction, slip) - u)
 
     return SimpleNamespace(motion=motion, rub=rub, touch=touch)
 
@@ -453,13 +454,13 @@ def _laws(name: str) -> SimpleNamespace:
 @no_type_check
 def _bowl(ladle: LadleInTank, name: str) -> Any:
     real, laws, bowl = real_type(name), _laws(name), _shapes(name).bowl
-    fade = _fade(ladle.band, name)
+    grip, held = _ladle_shares(ladle, name)
 
     @ti.func
     def contact(p, v, e, tools: ti.template(), step, fraction, rate):
         rim, body = laws.motion(tools, e, step, 0, fraction, rate)
         n, d = bowl(p - rim, real(ladle.radius), real(ladle.half_thickness))
-        return laws.touch(v, body, n, fade(d), real(ladle.friction), LADLE_SLIP)
+        return laws.touch(v, body, n, grip(d), held(d), real(ladle.friction), LADLE_SLIP)
 
     return contact
 
@@ -468,7 +469,7 @@ def _bowl(ladle: LadleInTank, name: str) -> Any:
 def _handle(ladle: LadleInTank, name: str) -> Any:
     """Return the contact with an upright capsule that stands on the bowl's rim."""
     real, laws, capsule = real_type(name), _laws(name), _shapes(name).capsule
-    fade = _fade(ladle.band, name)
+    grip, held = _ladle_shares(ladle, name)
 
     @ti.func
     def contact(p, v, e, tools: ti.template(), step, fraction, rate):
@@ -477,7 +478,7 @@ def _handle(ladle: LadleInTank, name: str) -> Any:
         middle = rim + ti.Vector([-real(ladle.radius), half, real(0.0)])
         up = ti.Vector([real(0.0), real(1.0), real(0.0)])
         n, d = capsule(p - middle, up, half, real(ladle.half_thickness))
-        return laws.touch(v, body, n, fade(d), real(ladle.friction), LADLE_SLIP)
+        return laws.touch(v, body, n, grip(d), held(d), real(ladle.friction), LADLE_SLIP)
 
     return contact
 
@@ -500,15 +501,24 @@ def _drag(tank: LadleInTank, name: str) -> Any:
 
 
 @no_type_check
-def _fade(band: float, name: str) -> Any:
+def _ladle_shares(ladle: LadleInTank, name: str) -> tuple[Any, Any]:
+    """Return which share of what goes into the ladle a node at a distance loses, and of what goes out."""
     real = real_type(name)
 
     @ti.func
-    def fade(d):
-        s = ti.max(real(0.0), ti.min(real(1.0) - d / real(band), real(1.0)))
+    def fade(s):
+        s = ti.max(real(0.0), ti.min(s, real(1.0)))
         return s * s * (real(3.0) - real(2.0) * s)
 
-    return fade
+    @ti.func
+    def grip(d):
+        return fade(real(1.0) - d / real(ladle.band))
+
+    @ti.func
+    def held(d):
+        return fade(-d / real(ladle.half_thickness))
+
+    return grip, held
 
 
 @no_type_check
@@ -526,7 +536,7 @@ def _tool(tool: Tool, slot: int, influence: Any, name: str) -> Any:
             axis = ti.Vector([ti.sin(angles[1]), real(0.0), ti.cos(angles[1])])
             body += (spin[0] * axis + spin[1] * up).cross(local)
         n, d = distance(local, axis)
-        return laws.touch(v, body, n, influence(d), real(tool.friction), TOOL_SLIP)
+        return laws.touch(v, body, n, influence(d), real(0.0), real(tool.friction), TOOL_SLIP)
 
     return contact
 

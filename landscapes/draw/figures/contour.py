@@ -12,12 +12,12 @@ from matplotlib.axes import Axes
 from matplotlib.collections import QuadMesh
 from matplotlib.colors import Colormap
 from matplotlib.lines import Line2D
-from matplotlib.patches import PathPatch
+from matplotlib.patches import Patch, PathPatch
 from matplotlib.path import Path
 from numpy.typing import NDArray
 
 from ...identity import gradient_stride, plane_of, stored_identity
-from ...large import in_unit
+from ...large import in_unit, unit_of
 from ...lattice import own_cells, with_gradients
 from ...objective import Status
 from ...plane import Plane
@@ -30,27 +30,31 @@ Grid = NDArray[np.float64]
 PITCH = 6.0  # room of a map with its colour bar on a screen [inch]
 
 
-def landscape_figure(dataset: xr.Dataset, *, width: float | None = None) -> page.Picture:
+def landscape_figure(
+    dataset: xr.Dataset, *, floor: xr.Dataset | None = None, width: float | None = None
+) -> page.Picture:
     """Draw a slice of rank 2: the loss as colours above, its negated gradients as arrows below, or next to it.
 
     Each cell is one sample, or for a coarse or a refined slice the part of the box nearest to it; nothing is
     interpolated. All
     arrows are equally long and point down the steepest slope of the picture as it is seen, its axes scaled to the same
     length; their colour is the magnitude of the gradient along the plane. Failures are hatched and counted, and
-    among the arrows samples with a loss and no gradient are dotted. `width` is that of a page for print [mm]; as for
-    every picture, without it the picture is as large as suits a screen.
+    among the arrows samples with a loss and no gradient are dotted. `floor` is the map of the slice's numerical floor,
+    a panel of its own. `width` is that of a page for print [mm]; as for every picture, without it the picture is as
+    large as suits a screen.
 
     Raises ValueError where the slice is a line, or the page too narrow or too wide.
     """
     plane = plane_of(dataset)
     if plane.rank != 2:
         raise ValueError(f"landscape_figure draws planes; got a slice of rank {plane.rank}, so use profile_figure")
-    panels = 2 if "grad" in dataset else 1
+    panels = 1 + ("grad" in dataset) + (floor is not None)
     sheet = style.Sheet.of(width, pitch=PITCH, panels=panels)
-    picture = page.Picture(sheet, panels / sheet.columns * sheet.pitch)
+    picture = page.Picture(sheet, -(-panels // sheet.columns) * sheet.pitch)
     axes = page.grid(picture, panels, share=True)
     entries = loss_panel(axes[0], in_unit(dataset))
-    entries += arrow_panel(axes[1], dataset) if panels == 2 else []
+    entries += [] if floor is None else floor_panel(axes[1], dataset, floor)
+    entries += arrow_panel(axes[-1], dataset) if "grad" in dataset else []
     for ax in axes:
         frame(ax, dataset, plane)
         page.name_outer(ax, *plane.labels)
@@ -115,6 +119,24 @@ def cell_map(ax: Axes, dataset: xr.Dataset, values: Grid, scale: style.Scale, co
     return ax.pcolormesh(
         *cell_edges(dataset), np.ma.masked_invalid(values), cmap=colours, norm=scale.norm, rasterized=True
     )
+
+
+def floor_panel(ax: Axes, dataset: xr.Dataset, floor: xr.Dataset) -> list[Artist]:
+    """Draw the standard deviation between replicas at every sample; return the legend's entries.
+
+    Hatched are samples that have a loss, while a replica has none there.
+    """
+    unit = unit_of(dataset["loss"].to_numpy())
+    deviation = floor["deviation"].transpose("v", "u").to_numpy() / unit
+    scale = style.Scale.of_deviation(deviation)
+    mesh = cell_map(ax, dataset, deviation, scale, style.FLOOR_MAP)
+    page.colour_bar(ax, mesh, labelled("numerical floor", page.loss_unit(in_unit(dataset))), scale)
+    lost = np.isfinite(dataset["loss"].to_numpy()) & ~np.isfinite(deviation)
+    if not lost.any():
+        return []
+    look = style.STATUS_LOOKS[Status.ERROR]
+    ax.add_patch(cells_patch(*cell_edges(dataset), lost, **look, zorder=1.5))
+    return [Patch(**look, label=f"no loss in a replica: {int(lost.sum())} of {page.evaluated(dataset)}")]
 
 
 def arrow_panel(ax: Axes, dataset: xr.Dataset, scale: style.Scale | None = None) -> list[Artist]:

@@ -125,12 +125,13 @@ def census_figure(census: Census, *, width: float | None = None) -> page.Picture
         empty.set_axis_off()
     page.colour_bar(axes[0], drawn, labelled("loss", census.loss_unit), scale, beside=axes)
     many = f"{len(census.slices)} slices, the least rugged first"
+    numerics = [census.floor.sentence()] if census.floor else []
     page.entitle(picture, f"{census.env} · census at {census.fidelity} · {many}")
     page.finish(
         picture,
         _words(census),
         columns=2,
-        heading=" · ".join([*page.made_by(census, "device", "created"), *filter(None, [census.command])]),
+        heading=" · ".join([*numerics, *page.made_by(census, "device", "created"), *filter(None, [census.command])]),
     )
     return picture
 

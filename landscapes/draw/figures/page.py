@@ -31,6 +31,7 @@ from numpy.typing import NDArray
 
 from ...identity import PACKAGE, VERSIONS, simulator_parts, stored_identity, stored_provenance
 from ...lattice import with_gradients
+from ...measures.slice_floor import floor_of
 from ...measures.undersampled import Undersampled
 from ...objective import Status
 from ...plane import Plane
@@ -152,7 +153,7 @@ def gradient_key(dataset: xr.Dataset) -> list[Patch]:
 
 
 def sampling_key(dataset: xr.Dataset) -> list[Patch]:
-    """Return legend entries of how exact a refined slice is, and which share of its cells is undersampled."""
+    """Return legend entries of how exact a refined slice is, what its samples hide, and its numerical floor."""
     refined = Refined.of(dataset)
     exact = (
         f"interpolated points: 95 % within {100 * refined.error:.2g} % of the range"
@@ -160,7 +161,8 @@ def sampling_key(dataset: xr.Dataset) -> list[Patch]:
         else ""
     )
     between = Undersampled.of(dataset)
-    lines = [exact, between.describe() if between else ""]
+    floor = floor_of(dataset)
+    lines = [exact, between.describe() if between else "", floor.sentence() if floor else ""]
     return [Patch(facecolor="none", edgecolor="none", label=said) for said in lines if said]
 
 
@@ -296,8 +298,11 @@ def name_outer(ax: Axes, x: str, y: str) -> None:
     """Label the axes of one of several panels over the same plane, once for a row and once for a column."""
     spec = ax.get_subplotspec()
     assert spec is not None  # as `grid` made it
+    others = [other for panel in picture_of(ax).axes if (other := panel.get_subplotspec()) is not None]
+    lowest = not any(one.rowspan.start > spec.rowspan.start and one.colspan == spec.colspan for one in others)
     ax.label_outer()
-    name_axes(ax, x if spec.is_last_row() else "", y if spec.is_first_col() else "")
+    ax.tick_params(labelbottom=lowest)
+    name_axes(ax, x if lowest else "", y if spec.is_first_col() else "")
 
 
 def _name(ax: Axes, axis: Axis, said: str, room: Callable[[], float]) -> None:

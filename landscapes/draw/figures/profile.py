@@ -14,7 +14,7 @@ from matplotlib.axes import Axes
 from numpy.typing import ArrayLike, NDArray
 
 from ...identity import plane_of
-from ...large import LARGEST, in_unit
+from ...large import LARGEST, in_unit, unit_of
 from ...lattice import sampled_line, with_gradients
 from ...objective import Status
 from ...plane import Plane
@@ -22,33 +22,40 @@ from ...space import labelled
 from .. import style
 from . import page
 
-LOSS, SLOPE = 2.6, 2.2  # height of the panels [inch]
+LOSS, FLOOR, SLOPE = 2.6, 1.4, 2.2  # height of the panels [inch]
+ROOM = 1.1  # of the numerical floor, against its largest value
 STRIP = 2.7  # height of a strip of event counts, in that of its type
 
 
 def profile_figure(
-    dataset: xr.Dataset, *, events: Mapping[str, ArrayLike] | None = None, width: float | None = None
+    dataset: xr.Dataset,
+    *,
+    events: Mapping[str, ArrayLike] | None = None,
+    floor: xr.Dataset | None = None,
+    width: float | None = None,
 ) -> page.Picture:
     """Draw a slice of rank 1: the loss above, its derivative along the line below with central differences behind it.
 
     `events` maps a name to a whole number per point (how many bounces, say): each is a strip on top, labelled where
-    there is room, and a thin line through the panels wherever it changes. Failures are hatched and counted.
+    there is room, and a thin line through the panels wherever it changes. Failures are hatched and counted. `floor` is
+    the map of the slice's numerical floor: a panel of its own, between both.
 
     Raises ValueError where the slice is a plane, or the page too narrow or too wide.
     """
     plane = plane_of(dataset)
     if plane.rank != 1:
         raise ValueError(f"profile_figure draws lines; got a slice of rank {plane.rank}, so use landscape_figure")
-    dataset = in_unit(dataset)
+    unit, dataset = unit_of(dataset["loss"].to_numpy()), in_unit(dataset)
     counted = {name: _counts(name, values, dataset.sizes["u"]) for name, values in (events or {}).items()}
     places, whole, dataset = dataset["u"].to_numpy(), dataset, sampled_line(dataset)
     sheet = style.Sheet.of(width, pitch=page.LINE_PITCH)
     heights = [STRIP * sheet.small / 72] * len(counted)
-    heights += [max(page.FLATTEST, sheet.zoom) * height for height in (LOSS, SLOPE)[: 1 + ("grad" in dataset)]]
+    heights += [max(page.FLATTEST, sheet.zoom) * height for height in _heights("grad" in dataset, floor is not None)]
     picture, axes = page.stack(sheet, heights)
     strips, panels = axes[: len(counted)], axes[len(counted) :]
     entries = _draw_loss(panels[0], dataset)
-    entries += _draw_slope(panels[1], dataset, plane) if "grad" in dataset else []
+    entries += [] if floor is None else _draw_floor(panels[1], whole, floor["deviation"].to_numpy() / unit)
+    entries += _draw_slope(panels[-1], dataset, plane) if "grad" in dataset else []
     for ax in panels:
         _frame(ax, dataset, plane)
     for strip, (name, counts) in zip(strips, counted.items(), strict=True):
@@ -82,6 +89,20 @@ def _draw_loss(ax: Axes, dataset: xr.Dataset) -> list[Artist]:
         label=f"lowest sample: {style.number(loss[lowest])}",
     )  # fmt: skip
     return [star]
+
+
+def _heights(grad: bool, floor: bool) -> list[float]:
+    return [LOSS, *([FLOOR] if floor else []), *([SLOPE] if grad else [])]
+
+
+def _draw_floor(ax: Axes, dataset: xr.Dataset, deviation: NDArray[np.float64]) -> list[Artist]:
+    """Draw the standard deviation between replicas at every sample, from 0 on."""
+    u = dataset["u"].to_numpy()
+    ax.plot(u, deviation, color=style.INK, **page.sheet_of(ax).look(style.stroke(len(u))))
+    most = np.nanmax(deviation, initial=0.0)
+    ax.set_ylim(0, ROOM * most if most > 0 else 1)
+    page.name_axes(ax, y=labelled("numerical floor", page.loss_unit(dataset)))
+    return []
 
 
 def _draw_slope(ax: Axes, dataset: xr.Dataset, plane: Plane) -> list[Artist]:
