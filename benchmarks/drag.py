@@ -32,6 +32,7 @@ TERMS, BLUR = 40, 0.02  # of the sum over waves; how wide a force is spread [m],
 RADIUS = fluid.CUBE_EDGE * (3 / (4 * np.pi)) ** (1 / 3)  # of the sphere of the cube's volume [m]
 SETTLED = slice(15, 30)  # control steps over which speeds in the middle are taken
 STARTS = {"top at the surface": -0.5, "half in": 0.0, "on the surface": 0.5}  # centre above the surface, in edges
+DURATION = 0.5  # of an episode of horizon 1 [s]
 WETTED = 0.01  # how deep a cube's top is that has gone under [m]
 
 
@@ -63,7 +64,9 @@ def print_middle(speeds: list[float], known: float) -> None:
     """Print what the speeds of a heavy and a light cube say of drag and buoyancy."""
     half, drift = (speeds[0] - speeds[1]) / 2, (speeds[0] + speeds[1]) / 2
     error = drift / half * EXCESS / fluid.SYRUP_DENSITY
-    print(f"middle: {half / known:.2f} of the known speed; buoyancy {100 * error:+.1f} % of what is displaced", flush=True)
+    print(
+        f"middle: {half / known:.2f} of the known speed; buoyancy {100 * error:+.1f} % of what is displaced", flush=True
+    )
 
 
 def print_start(name: str, height: np.ndarray, known: float) -> None:
@@ -71,7 +74,9 @@ def print_start(name: str, height: np.ndarray, known: float) -> None:
     depth = fluid.FILL - height - fluid.CUBE_EDGE / 2
     falls = -np.gradient(height, fluid.SPAN)
     under = np.flatnonzero(depth > WETTED)
-    first = f"its top {WETTED * 1e3:g} mm deep after {under[0] * fluid.SPAN:.2f} s" if len(under) else "does not go under"
+    first = (
+        f"its top {WETTED * 1e3:g} mm deep after {under[0] * fluid.SPAN:.2f} s" if len(under) else "does not go under"
+    )
     shares = falls[10:].min() / known, falls[-10:].mean() / known
     print(f"{name}: {first}; slowest {shares[0]:.2f}, at the end {shares[1]:.2f} of the known speed", flush=True)
 
@@ -87,8 +92,8 @@ def heights(
     """Return how high a cube's centre is at the ends of control steps, without a ladle [m]."""
     fluid.CUBE_CENTER = (0.0, start, 0.0)
     steps = round(seconds / fluid.SPAN)
-    settings = {"viscosity": viscosity, "cube_density": density, "horizon": steps / fluid.STEPS}
-    scene = fluid.Fluid(fidelity=fidelity, device=device, **settings)
+    horizon = steps * fluid.SPAN / DURATION
+    scene = fluid.Fluid(fidelity=fidelity, device=device, viscosity=viscosity, cube_density=density, horizon=horizon)
     away = torch.tensor([0.0, 10.0, 0.0], dtype=torch.float64).expand(1, steps + 1, 1, 3)
     with scene._solvers.lend() as stage:
         stage.solver.run(away.to(scene.device))

@@ -43,8 +43,9 @@ class Fluid(_Material):
 
     Its pressure grows with log J, so that however hard a droplet is hit it pushes back, and a lone particle oscillates
     at sqrt(12) c/dx whatever its J (stable for c dt/dx < 0.57). It bears tension up to a volume larger by 4 %, then
-    tears: J grows no further. Before each control step a share `smoothing`, from 0 to 1, of what the J of a particle
-    differs from that of its neighbours is taken from it.
+    tears: J grows no further. Smoothed, it comes nowhere near that, and tension holds no surface (`fluid`). Before each
+    control step a share `smoothing`, from 0 to 1, of what the J of a particle differs from that of its neighbours is
+    taken from it.
     """
 
     density: float
