@@ -2,10 +2,10 @@
 
 A particle closer to a wall than half a cell meets nodes beyond it, and a node next to the wall lacks what particles
 beyond it would give. A wall that only stops its nodes pushes too little there: the pressure of a liquid at rest rises
-by an eighth in the last cell before a wall, and drives a current of 16 mm/s through the tank of `fluid` (at `standard`),
+by an eighth in the last cell before a wall, and drives a current of 16 mm/s through the tank of `fluid` (`standard`),
 which takes 8 % of its volume in 3 s to the floor's edges. So what nodes beyond a wall hold is added to their images
 before it, and their velocity is the image of theirs (`native/mirrors.h`); then the liquid is still. Both are linear,
-and each is the other's adjoint.
+and each is the other's adjoint. A wall lies on nodes or half-way between them.
 """
 
 from functools import cache
@@ -33,7 +33,7 @@ def mirror_kernels(name: str) -> SimpleNamespace:
 @cache
 @no_type_check
 def mirrors_of_columns(name: str) -> SimpleNamespace:
-    """Return `unfold` of one precision for a GPU, over [environment, place in the grid]; sums are folded as added up."""
+    """Return `unfold` of one precision for a GPU, over [environment, place in the grid]; sums are folded themselves."""
     Nodes, Lattice, Listed, take_node = precision(name).rows[2], lattice(name), list_struct(), node_taker()
 
     @cpp.func_native()
