@@ -22,7 +22,7 @@ from ..engines.mpm.materials import Fluid as Liquid
 from ..engines.mpm.model import Body, Model
 from ..outlines import skin
 from ..records import EpisodeOptions
-from .scene import SEGMENTS, STEPS, MpmScene, Stage
+from .scene import SEGMENTS, SHIFTS, STEPS, MpmScene, Stage
 
 TANK_WIDTH, TANK_HEIGHT, FILL = 0.4, 0.2, 0.15  # the tank, and the depth of the syrup [m]
 HEADROOM = 0.6  # what the grid covers above the floor [m]
@@ -140,21 +140,17 @@ class Fluid(MpmScene):
         return torch.cat([path, depth], dim=2)[:, :, None]
 
     def replicas(self) -> Mapping[str, Environment]:
-        """Return the scene on grids of a cell more or less across the tank, and with the syrup's particles elsewhere.
+        """Return the scene on grids moved by half a cell, sideways and upwards, and with the syrup's other particles.
 
-        Walls own their nodes, so that a grid moved by a part of a cell would make the tank a cell wider. A cell more or
-        less moves the nodes by half a cell in the middle and by none at the walls. The mirrored scene is the same grid.
-        At 12 points of standard they are 1.1 and 2 % of the range apart, and other particles 0.1 %. With ladle and cube
-        moved by half a cell instead it is 1.4 % along x and 0.7 % along z, of which 0.6 and 0.1 % are their new place.
+        Walls that reflect may lie half-way between nodes. Others are as wide as their nodes say, so that a tank with
+        walls=stick has the other particles alone. The mirrored scene is the same grid.
         """
-        cells, sampling = self.fidelity.resolution, self.fidelity.sampling
-        band, inset = _band(TANK_WIDTH / cells), _inset(TANK_WIDTH / cells)  # with the particles, they stay
-        across = round(cells * sampling)
-        changes: dict[str, dict[str, Any]] = {
-            name: {"resolution": other, "sampling": across / other, "settings": {"band": band, "inset": inset}}
-            for name, other in (("one cell more across", cells + 1), ("one cell less across", cells - 1))
-        }
-        return self._replicas_of({**changes, "other particles": {"settings": {"particle_seed": 1}}})
+        changes: dict[str, dict[str, float]] = {"other particles": {"particle_seed": 1}}
+        if self.options.walls == "slip":
+            sideways, upwards = {"shift_x": 0.5, "shift_z": 0.5}, {"shift_y": 0.5}
+            moved = {"grid moved half a cell sideways": sideways, "grid moved half a cell upwards": upwards}
+            changes = {**moved, **changes}
+        return self._replicas_of({name: {"settings": settings} for name, settings in changes.items()})
 
     def cube(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch 3"]:
         """Return where the cube's centre is at the end of the episode [m]."""
@@ -212,12 +208,13 @@ class Fluid(MpmScene):
 def _model(fidelity: Fidelity, options: FluidOptions) -> Model:
     dx = TANK_WIDTH / fidelity.resolution
     across = fidelity.resolution + 1 + 2 * MARGIN
-    corner, seed = -TANK_WIDTH / 2 - MARGIN * dx, int(fidelity.settings.get("particle_seed", 0))
+    moved = np.array([fidelity.settings.get(name, 0.0) for name in SHIFTS]) - MARGIN
+    origin = np.array([-TANK_WIDTH / 2, 0.0, -TANK_WIDTH / 2]) + moved * dx
     return Model(
         precision=fidelity.precision,
-        bodies=_bodies(dx / fidelity.sampling, fidelity.settings.get("inset", _inset(dx)), options, seed),
-        boundary=_boundary(fidelity.settings.get("band", _band(dx)), options),
-        origin=(corner, -MARGIN * dx, corner),
+        bodies=_bodies(dx / fidelity.sampling, _inset(dx), options, int(fidelity.settings.get("particle_seed", 0))),
+        boundary=_boundary(dx, options),
+        origin=tuple(origin.tolist()),
         dx=dx,
         nodes=(across, int(np.ceil(HEADROOM / dx)) + 1 + 2 * MARGIN, across),
         dt=fidelity.dt,
@@ -235,19 +232,14 @@ def _inset(dx: float) -> float:
     return min(dx / 2, CUBE_EDGE / 3)
 
 
-def _band(dx: float) -> float:
-    """Return over what the ladle's grip fades on a grid of cells so wide [m]."""
-    return max(GRIP, 0.75 * dx)
-
-
-def _boundary(band: float, options: FluidOptions) -> LadleInTank:
+def _boundary(dx: float, options: FluidOptions) -> LadleInTank:
     return LadleInTank(
         half_width=TANK_WIDTH / 2,
         lid=HEADROOM,
         radius=BOWL,
         half_thickness=SHELL,
         height=HANDLE if options.handle else 0.0,
-        band=band,
+        band=max(GRIP, 0.75 * dx),
         friction=options.friction,
         slip=1.0 if options.walls == "slip" else 0.0,
     )

@@ -26,7 +26,7 @@ from ..engines.mpm.raster import Raster
 from ..engines.mpm.solver import Solver
 from ..outlines import rotate_about
 from ..records import EpisodeOptions
-from .scene import SEGMENTS, STEPS, MpmScene, Stage
+from .scene import SEGMENTS, SHIFTS, STEPS, MpmScene, Stage
 from .targets import Ball, Box, Point, Shape, Target, compare, contact, fill, load_or_make, shares
 
 # ---- What a plasticine scene is made of, and the model a solver simulates it by.
@@ -38,7 +38,6 @@ FLOOR, WALLS = 2.5 / 64, (2.5 / 64, 61.5 / 64)  # nodes outside belong to floor 
 ROOM = 0.15, 0.5  # least and most that the room extends beyond the bodies [m]
 BEYOND = 1e6  # where walls are that no body meets [m]
 MARGIN = 2  # nodes outside the walls
-SHIFTS = ("shift_x", "shift_y", "shift_z")  # settings of a fidelity: cells that the grid is moved by
 THIRDS = ((1 / 3, 2 / 3), (2 / 3, 1 / 3))  # of a cell along x and z: with 0, what has a cell's wavelength is seen whole
 
 

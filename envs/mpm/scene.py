@@ -21,6 +21,7 @@ from ..engines.mpm.model import Model
 from ..engines.mpm.solver import Solver, capacity, memory
 
 SEGMENTS, STEPS = 5, 50  # of the controls; control steps in an episode of horizon 1
+SHIFTS = ("shift_x", "shift_y", "shift_z")  # settings of a fidelity: cells that the grid is moved by
 
 
 @dataclass(frozen=True, eq=False)

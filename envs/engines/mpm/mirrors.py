@@ -5,7 +5,7 @@ beyond it would give. A wall that only stops its nodes pushes too little there: 
 by an eighth in the last cell before a wall. In a tank 0.2 m wide, in cells of 12.5 mm, that drives a current of 16
 mm/s, which takes 6 % of the syrup's volume in 3 s to the floor's edges. So what nodes beyond a wall hold is added to
 their images before it, and their velocity is the image of theirs (`native/mirrors.h`); then the liquid is still. Both
-are linear, and each is the other's adjoint.
+are linear, and each is the other's adjoint. A wall lies on nodes or half-way between them.
 """
 
 from functools import cache, partial

@@ -17,7 +17,7 @@ from .stencil import lattice
 BOX_MARGIN = 1  # cells around the particles that a control step begins with
 SPREAD = 1.5  # times the nodes that bodies touch at rest, for which memory is estimated, too
 TRAVEL = 5  # cells that bodies move beyond where they were at rest, for estimates of memory
-ON_NODE = 1e-4  # cells between a wall and its nodes, at most
+ON_NODE = 2e-4  # halves of a cell between a wall and its nodes, at most
 EMPTY = 1e-8  # nodes lighter than this part of the lightest particle carry no velocity
 
 
@@ -172,16 +172,16 @@ def place_grid(model: Model, box: Box | None = None) -> Any:
 
 
 def walls_that_reflect(model: Model) -> tuple[list[int], list[int]]:
-    """Return which node is on a wall that reflects, the lower and the upper one along each axis; 0 where none is.
+    """Return where walls are that reflect, the lower and the upper one along each axis; 0 where none is.
 
-    A wall reflects only where it has nodes of its own.
+    Places are in halves of a cell from the grid's first node. A wall reflects only on nodes and half-way between them.
     """
     found: tuple[list[int], list[int]] = ([0, 0, 0], [0, 0, 0])
     for side, places in enumerate(model.boundary.mirrors):
         for axis, place in enumerate(places):
-            node = (place - model.origin[axis]) / model.dx if place is not None else 0.0
-            if 0.5 < node < model.nodes[axis] - 1.5 and abs(node - round(node)) < ON_NODE:
-                found[side][axis] = round(node)
+            halves = 2 * (place - model.origin[axis]) / model.dx if place is not None else 0.0
+            if 1.5 < halves < 2 * model.nodes[axis] - 3.5 and abs(halves - round(halves)) < ON_NODE:
+                found[side][axis] = round(halves)
     return found
 
 

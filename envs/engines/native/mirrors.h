@@ -1,63 +1,69 @@
 // Walls that reflect: what is beyond such a wall is the image of what is before it.
 //
-// A wall has nodes of its own, and particles before it also meet the nodes next to it, beyond. `fold` adds what those
-// hold to their images, the nodes next to the wall before it, and leaves nothing of a wall's own momentum into it.
-// `unfold` gives nodes beyond a wall the image of what those before it hold. Each is the adjoint of the other. A lattice
-// names the nodes `below` and `above` which there is a wall, along each axis, counted in the whole grid; 0 is none.
+// A wall lies on nodes or half-way between them, and particles before it also meet nodes beyond, one or two deep. `fold`
+// adds what those hold to their images, and leaves nothing of a wall's own momentum into it. `unfold` gives nodes beyond
+// a wall the image of what those before it hold. Each is the adjoint of the other. A lattice says where walls are that
+// reflect, `below` and `above` along each axis, in halves of a cell from the whole grid's first node; 0 is none.
 #pragma once
 #include "layout.h"
 
 namespace gradscape {
 
-// Along one axis: the image of node i of the box and whether it is beyond a wall, or on it, or next to it before it.
+constexpr int farthest = 3;  // halves of a cell beyond a wall that particles before it meet
+
+// Along one axis: the image of node i of the box and whether it is beyond a wall, or on it, or before it within reach.
 struct Seen {
     int image;
     bool beyond, on, before;
 };
 template <typename Lattice> inline CUDA_CALLABLE Seen see(const Lattice& lattice, int axis, int i) {
-    const int k = i + lattice.first[axis], low = lattice.below[axis], high = lattice.above[axis];
-    const int from_low = low ? k - low : 2, from_high = high ? high - k : 2;  // how far before a wall
-    const int image = from_low * from_low == 1 ? i - 2 * from_low : from_high * from_high == 1 ? i + 2 * from_high : i;
-    const bool beyond = from_low == -1 || from_high == -1;
+    const int k = 2 * (i + lattice.first[axis]), low = lattice.below[axis], high = lattice.above[axis];
+    const int from_low = low ? k - low : farthest + 1, from_high = high ? high - k : farthest + 1;  // before a wall
+    const bool by_low = from_low * from_low <= farthest * farthest, by_high = from_high * from_high <= farthest * farthest;
+    const int image = by_low ? i - from_low : by_high ? i + from_high : i;
+    const bool beyond = (by_low && from_low < 0) || (by_high && from_high < 0);
     return {image, beyond, from_low == 0 || from_high == 0, image != i && !beyond};
 }
 
 // ---- a CPU: the rows of environments
 
+// Call `at(axis, before, beyond)` of pairs of nodes that are images of each other, and of a wall's own with itself.
 template <typename Lattice, typename At> inline void each_image(const Lattice& lattice, bool last_first, At at) {
     const int n[3] = {lattice.nx, lattice.ny, lattice.nz}, step[3] = {lattice.ny * lattice.nz, lattice.nz, 1};
     for (int a = 0; a < 3; ++a) {
         const int axis = last_first ? 2 - a : a, b = (axis + 1) % 3, c = (axis + 2) % 3;
         for (int side = 0; side < 2; ++side) {
-            const int wall = (side ? lattice.above : lattice.below)[axis], on = wall - lattice.first[axis];
-            if (wall == 0 || on < 0 || on >= n[axis]) continue;
-            const int before = on > 0 && on < n[axis] - 1 ? (side ? -step[axis] : step[axis]) : 0;
-            for (int i = 0; i < n[b]; ++i)
-                for (int j = 0; j < n[c]; ++j) at(axis, on * step[axis] + i * step[b] + j * step[c], before);
+            const int wall = (side ? lattice.above : lattice.below)[axis], inwards = side ? -1 : 1;
+            for (int far = wall % 2; wall && far <= farthest; far += 2) {
+                const int before = (wall + inwards * far) / 2 - lattice.first[axis];
+                const int beyond = (wall - inwards * far) / 2 - lattice.first[axis];
+                if (before < 0 || before >= n[axis] || beyond < 0 || beyond >= n[axis]) continue;  // where no particle is
+                for (int i = 0; i < n[b]; ++i)
+                    for (int j = 0; j < n[c]; ++j) {
+                        const int along = i * step[b] + j * step[c];
+                        at(axis, before * step[axis] + along, beyond * step[axis] + along);
+                    }
+            }
         }
     }
 }
 template <typename Lattice, typename Real>
 inline void fold(int e, const Lattice& lattice, const Rows<Vec4<Real>>& grid) {
     Vec4<Real>* G = &wp::index(grid, e, 0);
-    each_image(lattice, false, [&](int axis, int on, int before) {
-        G[on][axis] = Real(0.0);
-        if (!before) return;  // then no particle meets nodes beyond
-        Vec4<Real> image = G[on - before];
-        image[axis] = -image[axis];
-        G[on + before] = G[on + before] + image;
-        G[on - before] = Vec4<Real>();
+    each_image(lattice, false, [&](int axis, int before, int beyond) {
+        Vec4<Real> image = G[beyond];
+        image[axis] = before == beyond ? Real(0.0) : -image[axis];
+        G[before] = before == beyond ? image : G[before] + image;
+        if (before != beyond) G[beyond] = Vec4<Real>();
     });
 }
 template <typename Lattice, typename Real>
 inline void unfold(int e, const Lattice& lattice, const Rows<Vec4<Real>>& grid) {
     Vec4<Real>* G = &wp::index(grid, e, 0);
-    each_image(lattice, true, [&](int axis, int on, int before) {
-        G[on][axis] = Real(0.0);
-        if (!before) return;
-        Vec4<Real> image = G[on + before];
-        image[axis] = -image[axis];
-        G[on - before] = image;
+    each_image(lattice, true, [&](int axis, int before, int beyond) {
+        Vec4<Real> image = G[before];
+        image[axis] = before == beyond ? Real(0.0) : -image[axis];
+        G[beyond] = image;
     });
 }
 

@@ -662,7 +662,13 @@ class Solver:
         self.origin = ti.Vector(model.origin)
         self.empty = EMPTY * float(model.mass.min())
         walls = zip(walls_that_reflect(model), (1, -1), strict=True)
-        self.images = [(axis, node, before) for nodes, before in walls for axis, node in enumerate(nodes) if node]
+        self.images = [  # planes before and beyond a wall, or its own
+            (axis, (wall + inwards * far) // 2, (wall - inwards * far) // 2)
+            for places, inwards in walls
+            for axis, wall in enumerate(places)
+            for far in range(wall % 2, 4, 2)
+            if wall
+        ]
         self.smooth = [b for b, body in enumerate(model.bodies) if body.material.smoothing]
         self.checkpoints = self._states(model.steps + 1)
         self.tape = self._states(model.substeps + 1)
@@ -743,20 +749,24 @@ class Solver:
 
     def _fold(self, vectors: torch.Tensor, masses: torch.Tensor | None = None) -> None:
         """Add what nodes beyond walls that reflect hold to their images (`mirrors`); the adjoint of `_unfold`."""
-        for axis, on, before in self.images:
+        for axis, before, beyond in self.images:
+            if before == beyond:
+                vectors.movedim(axis + 1, 0)[before, ..., axis] = 0.0
+                continue
             for values in (vectors,) if masses is None else (vectors, masses):
                 across = values.movedim(axis + 1, 0)
-                across[on + before] += self._image(across[on - before], axis)
-                across[on - before] = 0.0
-            vectors.movedim(axis + 1, 0)[on, ..., axis] = 0.0
+                across[before] += self._image(across[beyond], axis)
+                across[beyond] = 0.0
 
     def _unfold(self, vectors: torch.Tensor, masses: torch.Tensor | None = None) -> None:
         """Give nodes beyond walls that reflect the image of what those before them hold."""
-        for axis, on, before in reversed(self.images):
+        for axis, before, beyond in reversed(self.images):
+            if before == beyond:
+                vectors.movedim(axis + 1, 0)[before, ..., axis] = 0.0
+                continue
             for values in (vectors,) if masses is None else (vectors, masses):
                 across = values.movedim(axis + 1, 0)
-                across[on - before] = self._image(across[on + before], axis)
-            vectors.movedim(axis + 1, 0)[on, ..., axis] = 0.0
+                across[beyond] = self._image(across[before], axis)
 
     def _image(self, values: torch.Tensor, axis: int) -> torch.Tensor:
         """Return what a plane of nodes [environment, j, k] of vectors or masses looks like in a wall."""
