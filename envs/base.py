@@ -460,7 +460,9 @@ class Environment(Objective):
             share: max(steps + place, round(steps * (1 + share))) for place, share in enumerate(SHORTER, start=1)
         }
         dt = self.fidelity.dt
-        return {f"time steps {100 * share:.0f} % shorter": {"dt": dt * steps / count} for share, count in shorter.items()}
+        return {
+            f"time steps {100 * share:.0f} % shorter": {"dt": dt * steps / count} for share, count in shorter.items()
+        }
 
     def _observe(self, x: Float[Tensor, "batch dim"], decision: int) -> Float[Tensor, "batch feature"]:
         """Return the state just before a decision, in units that make it about one."""
