@@ -121,6 +121,13 @@ class MadeKeywords(TypedDict, total=False):
             "taichi, as an independent reference."
         ),
     ]
+    preset: Annotated[
+        str | None,
+        Parameter(
+            help="Options that are set together, such as paper: the settings of the paper. `landscape envs NAME` lists "
+            "them, and --set changes single ones."
+        ),
+    ]
     options: SceneOptions
 
 

@@ -15,7 +15,7 @@ from .values import as_settings
 if TYPE_CHECKING:
     from ..envs.base import Environment
 
-OWN = {*SceneSpec.__dataclass_fields__, "self", "what"}  # names that no option of a scene may have
+OWN = {*SceneSpec.__dataclass_fields__, "preset", "self", "what"}  # names that no option of a scene may have
 
 
 def spec_of(scene: Scene, keywords: SceneKeywords, *, dims: Sequence[int | str] | None = None) -> SceneSpec:
@@ -25,26 +25,35 @@ def spec_of(scene: Scene, keywords: SceneKeywords, *, dims: Sequence[int | str] 
     parameters `dims` are numbered as the scene's class has them; its options may change that.
     """
     named = cast("dict[str, Any]", dict(keywords))
+    preset = named.pop("preset", None)
     if "options" in named:
         named["options"] = as_settings(named["options"])
         if taken := OWN & set(named["options"]):
             name = min(taken)
             raise ValueError(f"--set takes a scene's own options; {name} is none, and chosen by --{name} if at all")
     if isinstance(scene, SceneSpec):
-        return replace(scene, **named)
+        return _with_preset(replace(scene, **named), preset)
     if not isinstance(scene, str):
         from ..envs.registry import find_environment
 
-        return SceneSpec(find_environment(scene), **named)
+        return _with_preset(SceneSpec(find_environment(scene), **named), preset)
     spec = SceneSpec(scene, **named)
     if scene:
-        words = [str(dim) for dim in dims or ()] if not spec.options else []
+        words = [str(dim) for dim in dims or ()] if not (spec.options or preset) else []
         refuse_unknown(scene, fidelity=spec.fidelity, device=spec.device, engine=spec.engine, dims=words)
         if spec.tolerance is not None:
             from ..jobs.scene import tolerance_of
 
             tolerance_of(spec)
+        spec = _with_preset(spec, preset)
     return spec
+
+
+def _with_preset(spec: SceneSpec, preset: str | None) -> SceneSpec:
+    """Return the spec with the options of a preset, too. Raises ValueError where the scene has none of that name."""
+    if preset is None:
+        return spec
+    return replace(spec, options={**spec.kind.preset_options(preset), **spec.options})
 
 
 def environment(scene: Scene, keywords: SceneKeywords, *, dims: Sequence[int | str] | None = None) -> Environment:

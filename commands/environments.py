@@ -59,8 +59,18 @@ def show_environment(env: Environment, console: Console) -> None:
         console.print(said)
     console.print(in_full(env.Options))
     console.print(f"examples: {', '.join(env.examples) or 'none'}")
+    console.print(f"presets: {_presets(env)}")
     if words := read_paper().words.get(env.name):
         console.print(f"the paper says: {words}")
+
+
+def _presets(env: Environment) -> str:
+    """Return every preset with the options it sets; one that sets none has the scene as it is."""
+    said = [
+        f"{name} ({', '.join(f'{option}={value}' for option, value in options.items()) or 'the defaults'})"
+        for name, options in env.presets.items()
+    ]
+    return ", ".join(said) or "none"
 
 
 def describe_environment(env: Environment) -> dict[str, Any]:
@@ -78,6 +88,7 @@ def describe_environment(env: Environment) -> dict[str, Any]:
         "fidelities": [fidelity.record() for fidelity in env.fidelities.values()],
         "engines": list(env.engines),
         "options": asdict(env.options),
+        "presets": {name: dict(options) for name, options in env.presets.items()},
         "examples": list(env.examples),
     }
 

@@ -23,7 +23,7 @@ from torch import Tensor
 from ..landscapes.episode import Episode as Episode
 from ..landscapes.identity import MODEL_VERSION
 from ..landscapes.objective import Evaluation, Objective, SimulatorError, Status, check_points
-from ..landscapes.options import NoOptions, read_options
+from ..landscapes.options import NoOptions, read_options, record_options
 from ..landscapes.sampling.memory import free_memory, is_out_of_memory
 from ..landscapes.space import ParameterSpace, as_tensor
 from .engines import EXTRAS, Engine, find_engine
@@ -119,6 +119,11 @@ def map_parts(
             raise
 
 
+def describe_presets(presets: Mapping[str, Mapping[str, Any]]) -> str:
+    """Return the names of presets as the end of a sentence about a scene."""
+    return f"preset{'s' if len(presets) > 1 else ''} {', '.join(presets)}" if presets else "no presets"
+
+
 FLOAT32 = torch.finfo(torch.float32).max
 SHORTER = (0.01, 0.02)  # by which the time steps of replicas are shorter: longer ones might be unstable
 PROBES = 8  # points besides the centre that are tried where a whole batch raised
@@ -141,6 +146,7 @@ class Environment(Objective):
     fidelities: ClassVar[Mapping[str, Fidelity]] = {"default": Fidelity("default", dt=0.0, precision="float64")}
     examples: ClassVar[Mapping[str, tuple[float, ...]]] = {}
     Options: ClassVar[type[Any]] = NoOptions
+    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {}  # name -> options that are set together, by their names
     devices: ClassVar[tuple[str, ...]] = ("cpu",)
     engines: ClassVar[tuple[str, ...]] = ("warp",)
     horizon_option: ClassVar[str] = (
@@ -190,7 +196,7 @@ class Environment(Objective):
         """Return what decides the numbers, as plain JSON: scene and its version, options, fidelity, device, engine."""
         return {
             "objective": self.name,
-            "options": asdict(self.options),
+            "options": record_options(self.options),
             "fidelity": self.fidelity.name,
             "settings": self.fidelity.record(),
             "device": self.device,
@@ -248,6 +254,14 @@ class Environment(Objective):
         if found.error:
             self._refuse_broken(x, found)
         return found
+
+    @final
+    @classmethod
+    def preset_options(cls, name: str) -> dict[str, Any]:
+        """Return the options that a preset sets. Raises ValueError where there is none of that name."""
+        if name not in cls.presets:
+            raise ValueError(f"{cls.name} has {describe_presets(cls.presets)}; got preset {name!r}")
+        return dict(cls.presets[name])
 
     @final
     @classmethod
@@ -459,10 +473,8 @@ class Environment(Objective):
         shorter = {
             share: max(steps + place, round(steps * (1 + share))) for place, share in enumerate(SHORTER, start=1)
         }
-        dt = self.fidelity.dt
-        return {
-            f"time steps {100 * share:.0f} % shorter": {"dt": dt * steps / count} for share, count in shorter.items()
-        }
+        names = {share: f"time steps {100 * share:.0f} % shorter" for share in shorter}
+        return {names[share]: {"dt": self.fidelity.dt * steps / count} for share, count in shorter.items()}
 
     def _observe(self, x: Float[Tensor, "batch dim"], decision: int) -> Float[Tensor, "batch feature"]:
         """Return the state just before a decision, in units that make it about one."""

@@ -90,6 +90,7 @@ class Cartpole(Environment):
         ModelPart("joint damping", {"joint_damping": 0.02}, "joints brake by 0.02 N m s/rad", missing=True),
     )
     Options: ClassVar[type[Any]] = CartpoleOptions
+    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {"paper": {}}  # the scene as it is
     examples: ClassVar[dict[str, tuple[float, ...]]] = {
         "upright": tuple(float(np.interp(k, KNOTS, values)) for k in range(CONTROLS) for values in UPRIGHT)
     }

@@ -19,7 +19,7 @@ from ..envs.points import point
 from ..envs.registry import entries, environment_class, make
 from ..jobs.plan import simulation_seconds
 from ..jobs.race import RaceJob
-from ..jobs.report import ReportedSlice, ReportJob, digest_of
+from ..jobs.report import ReportedSlice, ReportJob
 from ..jobs.scene import SceneSpec
 from ..jobs.slice import SliceJob
 from ..jobs.study import StudyJob
@@ -27,7 +27,7 @@ from ..jobs.sweep import SweepJob
 from ..jobs.watch import Watch
 from ..landscapes.convert import to_json
 from ..landscapes.cost import episode_cost
-from ..landscapes.identity import gradient_stride, plane_of, stored_identity
+from ..landscapes.identity import digest_of, gradient_stride, plane_of, stored_identity
 from ..landscapes.measures.profile import effort
 from ..landscapes.objective import Evaluation, Status, evaluate
 from ..landscapes.plane import Plane

@@ -22,6 +22,7 @@ from ..envs.engines.runtime import cores, device_names, free_memory
 from ..landscapes.capacity import Need, require
 from ..landscapes.cost import duration
 from ..landscapes.objective import Evaluation, ObjectiveWrapper
+from ..landscapes.options import record_options
 from ..landscapes.plane import Plane
 from ..landscapes.sampling.fill import sample
 from ..landscapes.storage.store import SliceStore
@@ -216,7 +217,7 @@ class BenchJob:
         return Bench(
             env=env.name,
             fidelity=env.fidelity.name,
-            options=asdict(env.options),
+            options=record_options(env.options),
             device=env.device,
             hardware=device_names()[0] if env.device == "cuda" else f"{cores()} cores",
             engine=env.engine,

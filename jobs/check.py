@@ -20,6 +20,7 @@ from ..landscapes.checks.usefulness import Usefulness
 from ..landscapes.convert import to_json
 from ..landscapes.cost import duration, episode_cost
 from ..landscapes.identity import check_identity
+from ..landscapes.options import record_options
 from ..landscapes.plain import jsonable, plain_json
 from ..landscapes.storage.files import until_full
 from ..landscapes.storage.records import read_json, reading
@@ -184,7 +185,7 @@ class CheckJob:
             env=env.name,
             fidelity=env.fidelity.name,
             settings=env.fidelity.record(),
-            options=asdict(env.options),
+            options=record_options(env.options),
             device=env.device,
             engine=env.engine,
             power=self.power,

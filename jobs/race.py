@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..landscapes.convert import to_json
 from ..landscapes.cost import EpisodeCost, duration, episode_cost
+from ..landscapes.options import record_options
 from ..landscapes.sampling.distribution import PortableObjective, run_tasks, workers_of
 from ..landscapes.space import as_whole
 from ..landscapes.storage.files import check_free, clear, refuse_others, visible_files
@@ -145,7 +146,7 @@ class RaceJob(Job[Race]):
             "fidelity": env.fidelity.name,
             "device": env.device,
             "engine": env.engine,
-            "options": asdict(env.options),
+            "options": record_options(env.options),
             "loss_unit": env.loss_unit,
             "methods": self.methods,
             "method_options": {one.method: one.run.identity["method_options"] for one in self.competitors},

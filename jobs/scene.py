@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import cache
 from importlib import resources
@@ -15,6 +15,7 @@ from .. import __version__
 from ..envs.engines import installed_version
 from ..envs.registry import find_environment, make, registered_environment
 from ..landscapes.identity import MODEL_VERSION, PACKAGE, VERSIONS
+from ..landscapes.options import record_options
 from ..landscapes.plain import digest, plain_json, read_share
 from ..landscapes.storage.files import moved_by
 from ..landscapes.storage.records import read_json, reading
@@ -322,15 +323,14 @@ def _time(env: Environment, variants: Sequence[Environment]) -> dict[str, float]
 
     It is kept so that the same command chooses the same variant, and continues what it began.
     """
-    from dataclasses import asdict
-
     from ..landscapes.plain import number
     from ..landscapes.storage.files import write_json
     from ..landscapes.storage.records import read_json, reading
     from ..studies import variants as timing
     from ..studies.kept import own_folder
 
-    of = digest([asdict(env.options), env.engine, env.version_on(env.engine), __version__])  # others take another time
+    # Others take another time.
+    of = digest([record_options(env.options), env.engine, env.version_on(env.engine), __version__])
     path = own_folder() / f"{env.name}-{env.device}-{of}.seconds.json"
     known: dict[str, float] = {}
     if path.is_file():
@@ -434,7 +434,7 @@ def best_of_league(env: Environment) -> tuple[Tensor, float] | None:
 
 def has_options(identity: Mapping[str, Any], env: Environment) -> bool:
     """Say whether what has this identity was made with the environment's options."""
-    return bool(identity.get("options") == plain_json(asdict(env.options), "options"))
+    return bool(identity.get("options") == plain_json(record_options(env.options), "options"))
 
 
 def league_file(env: str) -> Path:

@@ -8,6 +8,8 @@ import math
 from collections.abc import Mapping
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
+ADDED = "added"  # in a field's metadata
+
 
 @dataclasses.dataclass(frozen=True)
 class NoOptions:
@@ -24,6 +26,22 @@ def read_options(owner: str, declared: type[Any], given: Mapping[str, Any]) -> A
         if name not in known:
             raise ValueError(f"{owner} has no option {name!r}; it has {describe(declared) or 'none'}")
     return declared(**{name: _read(owner, known[name], value) for name, value in given.items()})
+
+
+def record_options(options: Any) -> dict[str, Any]:
+    """Return options by name, as identities hold them.
+
+    An option that was added later, whose field has the metadata ADDED, is left out while it has its default: results
+    of before do not have it, and are the same.
+    """
+    later = [f for f in dataclasses.fields(options) if f.metadata.get(ADDED)]
+    left = {f.name for f in later if getattr(options, f.name) == f.default}
+    return {name: value for name, value in dataclasses.asdict(options).items() if name not in left}
+
+
+def added(default: Any, **metadata: Any) -> Any:
+    """Declare an option that results of before do not have: its default is what they were made with."""
+    return dataclasses.field(default=default, metadata={ADDED: True, **metadata})
 
 
 def describe(declared: type[Any]) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from dataclasses import asdict
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar, cast
@@ -13,6 +12,7 @@ from platformdirs import user_data_path
 
 from ..landscapes.convert import from_json, to_json
 from ..landscapes.identity import MODEL_VERSION, current_identity
+from ..landscapes.options import record_options
 from ..landscapes.plain import digest, number, text
 from ..landscapes.storage.files import moved_by
 from ..landscapes.storage.records import read_json, reading, write_record
@@ -82,7 +82,7 @@ def find_fidelity(env: Environment, device: str) -> tuple[FidelityRecord, Path] 
     """
     from .fidelity import FidelityRecord
 
-    options, own = asdict(env.options), own_folder()
+    options, own = record_options(env.options), own_folder()
     found = [
         (path, record)
         for path, record in kept_studies(FidelityRecord, env.name)
@@ -113,7 +113,7 @@ def describe_margins(env: Environment) -> list[str]:
     for _, record in kept_studies(ExtremesRecord, env.name):
         known = record.identity
         key = digest([known["settings"], known["options"], known["engine"], known["device"]])
-        if key not in seen and known["options"] == asdict(env.options):
+        if key not in seen and known["options"] == record_options(env.options):
             said += record.margin_sentences(env)
         seen.add(key)
     return list(dict.fromkeys(said)) or [f"stability: not measured; `landscape study extremes {env.name}` measures it"]

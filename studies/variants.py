@@ -6,7 +6,7 @@ import abc
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -14,6 +14,7 @@ from ..envs.records import Fidelity
 from ..landscapes.capacity import Need, require
 from ..landscapes.cost import episode_cost
 from ..landscapes.identity import MODEL_VERSION
+from ..landscapes.options import record_options
 from ..landscapes.sampling.memory import free_memory
 from ..landscapes.storage.checkpoint import Checkpoint
 from .samples import Sample, evaluate_points
@@ -51,7 +52,7 @@ class Variant:
     @classmethod
     def of(cls, env: Environment) -> Variant:
         """Return the variant that an environment is."""
-        return cls(env.fidelity.name, "named", env.fidelity, env.engine, env.device, asdict(env.options))
+        return cls(env.fidelity.name, "named", env.fidelity, env.engine, env.device, record_options(env.options))
 
     @classmethod
     def all_named(cls, env: Environment) -> list[Variant]:

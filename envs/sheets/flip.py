@@ -60,6 +60,7 @@ class Flip(SheetScene):
     between.
     Loss [m]: mean distance of the left-, right-, back- and frontmost vertices to where they were at the start, left and
     right exchanged. Example `flip` was found by CMA-ES at draft (2400 episodes) and flips at every fidelity.
+    Preset paper: contact changes the velocity of vertices that are in contact, as the supplement says (contact=start).
     Simplifications: the pan has no handle and no mass; the pancake is a sheet without thickness; pan and floor are
     smooth, as contact takes the normal part of a velocity alone.
     Source: task Flip of "Rethinking Optimization with Differentiable Simulation from a Global Perspective" (CoRL 2022),
@@ -90,6 +91,7 @@ class Flip(SheetScene):
     decisions = SEGMENTS
     duration: ClassVar[float] = 1.0
     Options: ClassVar[type[Any]] = FlipOptions
+    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {"paper": {"contact": "start"}}
     view: ClassVar[View] = View((-0.24, FLOOR, -0.2), (0.24, 0.26, 0.2), eye=(0.2, 0.5, 1.0), ground=FLOOR)
     space = ParameterSpace(
         tuple(f"pan {what}, segment {k}" for k in range(1, SEGMENTS + 1) for what in ("x", "y", "tilt")),

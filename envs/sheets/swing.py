@@ -14,9 +14,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ...landscapes.episode import Part, View
+from ...landscapes.options import added
 from ...landscapes.space import ParameterSpace
 from ..base import Environment, Fidelity, ModelPart, copied
-from ..engines.sheets.contact import Floor
+from ..engines.sheets.contact import AnchoredFloor, Floor
 from ..engines.sheets.springs import Sheet
 from ..outlines import triangles
 from . import lattice
@@ -24,7 +25,8 @@ from .sheets import Drive, SheetOptions, SheetScene
 
 SIDE, HEIGHT = 0.2, 0.1  # the cloth's edge, and how far above the floor it is held [m]
 AREAL_DENSITY = 0.2  # [kg/m^2]
-STIFFNESS, SWING = 10.0, (1.0, -0.5, 0.0)  # where they are no parameters [N/m], [m/s]
+STIFFNESS, SWING = 10.0, (1.0, -0.5, 0.0)  # where they are no parameters, and of anchors that swing [N/m], [m/s]
+BRAKING = 0.4  # in which anchors that swing come to rest [s], on the floor
 PATCHES = 4  # along each edge
 BEND = 3e-4  # bending stiffness [N m]
 DAMPING, DRAG, GRAVITY = 8e-3, 0.5, 9.81  # [N s/m], [1/s], [m/s^2]
@@ -36,6 +38,10 @@ class SwingOptions(SheetOptions):
 
     `damping` is that of springs [N s/m], `drag` that of air [1/s], `gravity` [m/s^2]; `bending` is the stiffness
     against it [N m], `shear` scales the shear springs; `friction` is the floor's coefficient.
+
+    `anchors`: still, or swing, where they set out at (1, -0.5, 0) m/s and slow down evenly, to rest after 0.4 s, 20 cm
+    to the right on the floor. `bending_springs`: the share of the springs along the lattice
+    that join what is a sixth of the edge apart instead, so that what is stiffer bends less, too.
     """
 
     loss: Literal["single", "corner", "mesh"] = "single"
@@ -45,6 +51,8 @@ class SwingOptions(SheetOptions):
     bending: float = BEND
     shear: float = 1.0
     friction: float = 0.0
+    anchors: Literal["still", "swing"] = added("still")
+    bending_springs: float = added(0.0)
 
 
 class Swing(SheetScene):
@@ -55,8 +63,15 @@ class Swing(SheetScene):
     An episode is 0.5 s: longer ones sway on, and meshes differ more.
     Loss [m] against where example `target` brings the cloth at the same fidelity: the centre of mass's distance
     (single), or the mean distance of the corners (corner) or of all vertices (mesh), by option. Two of the four corners
-    are held and never miss their places, so that `corner` is half the mean distance of the two that move.
-    Simplifications: the anchors stand still, since what they hold is what makes the cloth swing; air is felt as a drag
+    are held: where anchors stand still these never miss their places, and `corner` is half the mean of the other two.
+    Preset paper: the supplement's two anchors swing the cloth onto the floor (anchors=swing), and contact changes the
+    velocity of vertices that are in contact (contact=start). Its cloth is springs alone: bending springs, four fifths
+    of those along the lattice (bending_springs=0.8, as in flip), resist bending instead of a plate (bending=0), so that
+    patches of stiffness decide how it folds: their random losses reach 33 mm instead of 8. How anchors swing is ours.
+    They do so alike whatever velocity the cloth starts with: its landscape is then as rugged, and its gradients are as
+    often opposite to the slope, as the paper shows; with anchors that set out at that velocity it is smooth.
+    Simplifications: by default the anchors stand still, since what they hold makes the cloth swing anyway, and contact
+    stops vertices on the floor, since what else it does hangs on the time step; air is felt as a drag
     of 0.5/s; stretching is resisted by 10 N/m, softer than fabric, so that a step may be long; the resistance to
     bending is ours, so that folds are wider than a few cells. Coarse meshes do not fold as fine ones do: of 32 points
     against 40 cells (1/10000 s), losses of standard (28 cells) have rank correlations of 0.99 (velocity and stiffness)
@@ -80,13 +95,21 @@ class Swing(SheetScene):
         ModelPart("exact contact", {"contact": "start"}, "vertices stop once they are inside"),
         ModelPart("friction", {"friction": 0.3}, "friction of the floor", missing=True),
     )
+    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
+        "paper": {"contact": "start", "anchors": "swing", "bending_springs": 0.8, "bending": 0.0}
+    }
     duration: ClassVar[float] = 0.5
-    view: ClassVar[View] = View((-0.2, 0.0, -0.11), (0.15, 0.12, 0.11), eye=(-0.45, 0.5, 1.0), ground=-0.003)
+
+    @property
+    def view(self) -> View:  # type: ignore[override] # read only
+        """How it is seen, to where the anchors swing it."""
+        right = 0.15 if self.options.anchors == "still" else 0.3
+        return View((-0.2, 0.0, -0.11), (right, 0.12, 0.11), eye=(-0.45, 0.5, 1.0), ground=-0.003)
 
     @property
     def surface(self) -> Floor:
         """The floor, at height 0."""
-        return Floor(friction=self.options.friction)
+        return (Floor if self.options.anchors == "still" else AnchoredFloor)(friction=self.options.friction)
 
     def replicas(self) -> Mapping[str, Environment]:
         """Return the cloth in shorter time steps, and of a cell more or less along its edges, with its own target."""
@@ -102,7 +125,8 @@ class Swing(SheetScene):
         cells, options = self.fidelity.resolution, self.options
         points = lattice.square(cells)
         pitch = SIDE / cells
-        springs = lattice.springs(points, reach=1, bend=0.0, shear=options.shear)
+        reach = max(1, round(cells / 6))  # of bending springs
+        springs = lattice.springs(points, reach=reach, bend=options.bending_springs, shear=options.shear)
         pairs, rest, weight, plate = lattice.merge(points, springs, lattice.plate(points))
         x = np.stack(
             [points[:, 0] * pitch - SIDE, np.full(len(points), HEIGHT), points[:, 1] * pitch - SIDE / 2], axis=1
@@ -121,8 +145,10 @@ class Swing(SheetScene):
             plate=options.bending / pitch**2 * plate,
         )
 
-    def _energy(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch step"]:
-        """Return kinetic energy, that of height above the floor, and that of the springs."""
+    def _energy(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch step"] | None:
+        """Return kinetic energy, that of height above the floor, and that of the springs, where no anchor drives it."""
+        if self.options.anchors != "still":
+            return None
         drive, sheet = self._drive(x), self.sheet
         with self._solvers.lend() as solver:
             frames = copied(solver.run(*drive.detach()))
@@ -159,7 +185,7 @@ class Swing(SheetScene):
 
     def _surroundings(self, poses: Float[Tensor, "frame 3"]) -> Mapping[str, Float[Tensor, "frame 3"]]:
         held = torch.from_numpy(self.sheet.x[list(self._corners()[2:])])
-        return {f"anchor {number}": place.expand(len(poses), 3) for number, place in enumerate(held, start=1)}
+        return {f"anchor {number}": place + poses for number, place in enumerate(held, start=1)}
 
     def _parts(self, frames: Float[Tensor, "frame vertex 3"], poses: Float[Tensor, "frame 3"]) -> tuple[Part, ...]:
         faces = triangles(lattice.square(self.fidelity.resolution))
@@ -170,8 +196,13 @@ class Swing(SheetScene):
             Part("sheet", "target", self._target.expand_as(frames), faces=faces),
         )
 
-    def _rest_poses(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch step_plus_1 3"]:
-        return x.new_zeros(1, 1, 3).expand(len(x), self.steps + 1, 3)
+    def _course(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch step_plus_1 3"]:
+        """Return how far the anchors have gone [m]: nowhere, or as what slows down evenly to rest."""
+        if self.options.anchors == "still":
+            return x.new_zeros(1, 1, 3).expand(len(x), self.steps + 1, 3)
+        time = (self.fidelity.dt * torch.arange(self.steps + 1, dtype=x.dtype)).clamp(max=BRAKING)
+        gone = x.new_tensor(SWING) * (time - time**2 / (2 * BRAKING))[:, None]
+        return gone.expand(len(x), -1, -1)
 
     def _prepare(self) -> None:
         _ = self._target
@@ -195,7 +226,7 @@ class SwingVelocity(Swing):
     space = ParameterSpace.box([f"velocity {axis}" for axis in "xyz"], -2.0, 2.0, "m/s")
 
     def _drive(self, x: Float[Tensor, "batch dim"]) -> Drive:
-        return Drive(x, torch.full((len(x), len(self.sheet.x)), STIFFNESS, dtype=x.dtype), self._rest_poses(x))
+        return Drive(x, torch.full((len(x), len(self.sheet.x)), STIFFNESS, dtype=x.dtype), self._course(x))
 
 
 class SwingStiffness(Swing):
@@ -220,7 +251,7 @@ class SwingStiffness(Swing):
     def _drive(self, x: Float[Tensor, "batch dim"]) -> Drive:
         share = self._patch_shares().to(x)
         stiffness = torch.stack([(share @ row.view(PATCHES, PATCHES) @ share.T).flatten() for row in x])
-        return Drive(x.new_tensor(SWING).expand(len(x), 3), stiffness, self._rest_poses(x))
+        return Drive(x.new_tensor(SWING).expand(len(x), 3), stiffness, self._course(x))
 
     def _patch_shares(self) -> Float[Tensor, "vertex patch"]:
         """Return how much of what a vertex stands for along an edge lies in each patch: a cell's width, or half."""

@@ -71,6 +71,8 @@ def measure_floor(
 
     Raises ValueError where a replica has another space, and what `evaluate` does.
     """
+    if objective.device != "cpu":
+        objective.release()  # or else replicas would be made for what it leaves of a GPU's memory
     replicas = objective.replicas()
     if not replicas:
         return None
@@ -83,8 +85,9 @@ def measure_floor(
 def evaluate_replicas(
     objective: Objective, x: Float[Tensor, "points dim"], replicas: Mapping[str, Objective], *, grad: bool
 ) -> dict[str, Evaluation]:
-    """Evaluate each replica of an objective at points, and give back its memory. Raises what `measure_floor` does."""
+    """Evaluate each replica of an objective at points, one at a time in memory. Raises what `measure_floor` does."""
     found = {}
+    objective.release()
     for name, replica in replicas.items():
         refuse_other_space(objective, name, replica)
         found[name] = evaluate(replica, x, grad=grad)

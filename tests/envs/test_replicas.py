@@ -54,16 +54,8 @@ def test_every_scene_of_the_paper_has_replicas_that_can_be_made() -> None:
         assert model.origin[1] / model.dx == pytest.approx(round(model.origin[1] / model.dx))
 
 
-def test_mirrored_episodes_agree_to_rounding() -> None:
-    """So a mirrored scene is no replica that tells anything: grids, meshes and sums are their own mirror images."""
+def test_a_mirrored_throw_agrees_to_the_last_bit() -> None:
+    """So a mirrored scene is no replica that tells anything, as test_swing.py and test_cartpole.py say of theirs."""
     throw = gs.make("bounce", device="cpu")
     x = throw.space.sobol(16, seed=0)
-    there, back = throw.evaluate(x), throw.evaluate(x * torch.tensor([1.0, 1.0, -1.0]))
-    assert torch.equal(there.loss, back.loss)
-    chain = gs.make("cartpole", device="cpu", target_x=0.5)
-    x = chain.space.sobol(16, seed=0)
-    there, back = chain.evaluate(x), chain.remake(target_x=-0.5).evaluate(-x)
-    torch.testing.assert_close(there.loss, back.loss, rtol=1e-6, atol=1e-6)
-    assert there.grad is not None
-    assert back.grad is not None
-    torch.testing.assert_close(there.grad, -back.grad, rtol=1e-3, atol=1e-6)
+    assert torch.equal(throw.evaluate(x).loss, throw.evaluate(x * torch.tensor([1.0, 1.0, -1.0])).loss)

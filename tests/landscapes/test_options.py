@@ -6,9 +6,11 @@ from typing import Literal
 
 import pytest
 
+from gradscape.api.scene import spec_of
 from gradscape.envs.records import EpisodeOptions
-from gradscape.envs.registry import entries, environment_class
-from gradscape.landscapes.options import NoOptions, describe, in_full, read_options
+from gradscape.envs.registry import entries, environment_class, make
+from gradscape.gallery.paper import read_paper
+from gradscape.landscapes.options import NoOptions, added, describe, in_full, read_options, record_options
 from gradscape.optim.registry import methods, optimizer_class
 
 
@@ -104,3 +106,23 @@ def test_what_dataclasses_make_up_is_no_explanation() -> None:
 
     assert "Bare(" not in in_full(Bare)
     assert "wind=a number (default 0.0)" in in_full(Bare)
+
+
+def test_an_option_that_was_added_later_is_recorded_only_where_it_says_something():
+    @dataclass(frozen=True)
+    class Later(Options):
+        anchors: Literal["still", "swing"] = added("still")
+
+    assert record_options(Later()) == record_options(Options())
+    assert record_options(Later(anchors="swing"))["anchors"] == "swing"
+
+
+def test_presets_are_options_that_their_scenes_have_and_the_paper_s_scenes_have_its():
+    for name in read_paper().words:
+        scene = environment_class(name)
+        read_options(name, scene.Options, scene.preset_options("paper"))
+    env = make("fluid", preset="paper", viscosity=5.0, device="cpu")
+    assert (env.options.speed, env.options.viscosity, env.space.units[0]) == (0.4, 5.0, "· 0.4 m/s")
+    assert spec_of("fluid", {"preset": "paper", "options": ["viscosity=5"]}).make().identity() == env.identity()
+    with pytest.raises(ValueError, match="fluid has preset paper; got preset 'printed'"):
+        spec_of("fluid", {"preset": "printed"})

@@ -61,9 +61,8 @@ def test_a_ripple_of_the_grid_is_the_floor_and_what_is_measured_stays(tmp_path: 
         assert one.spearman.value is not None
         assert 0.98 < one.spearman.value < 1
         assert one.cosine_low <= one.cosine.value
-    assert found.sentences()[0].startswith(
-        "numerical floor 0.87 % of the range; gradients of replicas: cosine 1.000 (95 %"
-    )
+    first = "numerical floor 0.87 % of the range; gradients of replicas: cosine 1.000 (95 % intervals "
+    assert found.sentences()[0].startswith(first)
     assert found.sentences()[-1] == "7 of 64 points left out, where the scene or a replica fails"
     assert list(found.table().index) == [one.name for one in found.replicas]
     assert to_json(from_json(SymmetryRecord, read_json(tmp_path / "study/symmetry.json"))) == to_json(found)

@@ -17,6 +17,7 @@ from .stencil import lattice
 BOX_MARGIN = 1  # cells around the particles that a control step begins with
 SPREAD = 1.5  # times the nodes that bodies touch at rest, for which memory is estimated, too
 TRAVEL = 5  # cells that bodies move beyond where they were at rest, for estimates of memory
+ON_NODE = 1e-4  # cells between a wall and its nodes, at most
 EMPTY = 1e-8  # nodes lighter than this part of the lightest particle carry no velocity
 
 
@@ -165,7 +166,23 @@ def place_grid(model: Model, box: Box | None = None) -> Any:
     placed.inv_dx = 1.0 / model.dx
     placed.first = wp.vec3i(*first)
     placed.nx, placed.ny, placed.nz = nodes
+    below, above = walls_that_reflect(model)
+    placed.below, placed.above = wp.vec3i(*below), wp.vec3i(*above)
     return placed
+
+
+def walls_that_reflect(model: Model) -> tuple[list[int], list[int]]:
+    """Return which node is on a wall that reflects, the lower and the upper one along each axis; 0 where none is.
+
+    A wall reflects only where it has nodes of its own.
+    """
+    found: tuple[list[int], list[int]] = ([0, 0, 0], [0, 0, 0])
+    for side, places in enumerate(model.boundary.mirrors):
+        for axis, place in enumerate(places):
+            node = (place - model.origin[axis]) / model.dx if place is not None else 0.0
+            if 0.5 < node < model.nodes[axis] - 1.5 and abs(node - round(node)) < ON_NODE:
+                found[side][axis] = round(node)
+    return found
 
 
 def nodes_around(model: Model, low: np.ndarray, high: np.ndarray, margin: int, grain: int = 1) -> Box:

@@ -4,7 +4,7 @@ One substep, state (x, v, C, S) of frame s to frame s + 1, S being each material
 
     update  S'   = deform(S, C), A = -dt V 4/dx^2 tau(S', C) + m C
     p2g     m_i  = sum w m,   q_i = sum w (m v + A (x_i - x))
-    grid    v_i  = boundary(q_i / m_i + dt g)
+    grid    v_i  = boundary(q_i / m_i + dt g), between images in walls that reflect (`mirrors`)
     g2p     v'   = sum w v_i, C' = 4/dx^2 sum w v_i (x_i - x)^T, x' = x + dt v'
 
 Particles are kept at the ends of control steps; as many of the last control steps as fit are kept whole, with A and
@@ -34,7 +34,8 @@ from .boundaries import settle_kernel, substep_struct
 from .checkpoints import Allocator, Frame, Sizes, Tape
 from .columns import GPU_TEAM, cell_kernels, column_kernels, list_struct, segments
 from .grid import velocity_on
-from .model import BOX_MARGIN, EMPTY, Box, Model, nodes_around
+from .mirrors import mirror_kernels, mirrors_of_columns
+from .model import BOX_MARGIN, EMPTY, Box, Model, nodes_around, walls_that_reflect
 from .order import Order, Sorter, sorting_kernels
 from .scatter import ByColumns, InPlace, Scatter, nodes
 from .smoothing import ColumnSmoother, Smoother, smoothing_columns, smoothing_kernels
@@ -54,6 +55,8 @@ def kernels(model: Model, device: str) -> Iterator[Any]:
     name = model.precision
     yield from (_of_cpu if device == "cpu" else _of_gpu)(name, any(body.material.smoothing for body in model.groups))
     yield velocity_on(name, model.boundary, columns=device != "cpu")
+    if any(chain.from_iterable(walls_that_reflect(model))):
+        yield (mirror_kernels if device == "cpu" else mirrors_of_columns)(name).unfold
     for body in model.groups:
         yield from body.material.kernels(name, columns=device != "cpu")
     yield extent_kernels(name).look
@@ -151,7 +154,9 @@ class Adjoint:
         inputs = solver.velocity_inputs(step, substep)
         adjoints = [*self.structs, self.tools, None, self.grid.m, self.grid.v, *self.lists, None]
         how = {"adj_inputs": adjoints, "adj_outputs": [], "adjoint": True}
+        solver.fold(self.grid.v, step, batch)
         solver.launch_at_nodes(solver.velocity, step, batch, inputs, **how)
+        solver.unfold(self.grid.m, step, substep, batch)
 
     def _adjoint_p2g(self, step: int, substep: int, frame: Frame, batch: int) -> None:
         """Launch the adjoint of p2g, and those of the materials after it or as its continuation."""
@@ -355,9 +360,12 @@ class Solver:
         self.types = self.allocator.types
         self.kernels = (transfers_of_columns if columns else transfers)(model.precision)
         self.velocity = velocity_on(model.precision, model.boundary, columns=columns)
+        self.reflects = any(chain.from_iterable(walls_that_reflect(model)))
+        self.mirrors = (mirrors_of_columns if columns else mirror_kernels)(model.precision)
         self.boundary, self.substep = model.boundary.data(model.precision, device), substep_struct(model.precision)
         self.materials = [group.material.kernels(model.precision, columns=columns) for group in model.groups]
-        load([*vars(self.kernels).values(), self.velocity, *chain.from_iterable(self.materials)], device)
+        mirrors = vars(self.mirrors).values() if self.reflects else ()
+        load([*vars(self.kernels).values(), *mirrors, self.velocity, *chain.from_iterable(self.materials)], device)
         self.first = np.concatenate([[0], np.cumsum([len(group.x) for group in model.groups])]).tolist()
         self.empty = EMPTY * float(model.mass.min())
         self.scatter: Scatter = ByColumns(self) if columns else InPlace(self)
@@ -573,7 +581,23 @@ class Solver:
     def _fill_grid(self, frame: Frame, step: int, substep: int, batch: int) -> None:
         """Fill the substep's grid: momentum and mass from particles, then velocity."""
         self.scatter.p2g(step, substep, frame, batch)
+        grid = self.tape(step).grids[substep]
+        self.fold(grid.m, step, batch)
         self.launch_at_nodes(self.velocity, step, batch, self.velocity_inputs(step, substep))
+        self.unfold(grid.v, step, substep, batch)
+
+    def fold(self, grid: wp.array, step: int, batch: int) -> None:
+        """Add what nodes beyond walls that reflect hold to their images; by columns, nodes that add up do so."""
+        if self.reflects and not self.columns:
+            self.launch(self.mirrors.fold, 1, batch, [self.tape(step).lattice, grid])
+
+    def unfold(self, grid: wp.array, step: int, substep: int, batch: int) -> None:
+        """Give nodes beyond walls that reflect the image of what those before them hold."""
+        if self.reflects and self.columns:
+            inputs = [self.tape(step).lattice, self.tape(step).lists[substep].struct, grid]
+            self.launch_at_nodes(self.mirrors.unfold, step, batch, inputs)
+        elif self.reflects:
+            self.launch(self.mirrors.unfold, 1, batch, [self.tape(step).lattice, grid])
 
     def _move_particles(self, frame: Frame, new: Frame, step: int, substep: int, batch: int, *, followed: bool) -> None:
         grid_v, where = self.tape(step).grids[substep].v, self.scatter.where(step, substep)

@@ -78,7 +78,8 @@ def lattice(name: str) -> type:
         """Place the grid: node (0, 0, 0) at `origin` [m], spacing 1/`inv_dx` [m].
 
         Arrays hold `nx, ny, nz` nodes from node `first` on. As long as they cover what a particle reads and writes, it
-        does not depend on them, to the last bit.
+        does not depend on them, to the last bit. Nodes `below` and `above`, along each axis and counted from (0, 0, 0),
+        are on walls that reflect; 0 says that there is none.
         """
 
         origin: vec3
@@ -87,6 +88,8 @@ def lattice(name: str) -> type:
         nx: int
         ny: int
         nz: int
+        below: wp.vec3i
+        above: wp.vec3i
 
     return Lattice
 

@@ -6,6 +6,7 @@
 // the highest, and 65536 times the cell where it begins.
 #pragma once
 #include "layout.h"
+#include "mirrors.h"
 
 namespace gradscape {
 
@@ -204,12 +205,21 @@ inline CUDA_CALLABLE Vec4<Real> add_up_node(
     return Vec4<Real>(low.a + high.a, low.b + high.b, low.c + high.c, low.d + high.d);
 }
 
+// The same, after walls that reflect have folded it.
+template <int cells, int numbers, typename Real, typename Lattice>
+inline CUDA_CALLABLE Vec4<Real> add_up_folded(
+    const Lattice& lattice, const Rows<wp::int32>& planes, const Rows<Vec4<Real>>& parts, int e, int node) {
+    return folded<Real>(lattice, node, [&](int one) {
+        return add_up_node<cells, numbers>(lattice, planes, parts, e, one);
+    });
+}
+
 // Write what a node's parts come to, which has place i in the grid.
 template <int cells, int numbers, typename Real, typename Lattice>
 inline CUDA_CALLABLE void write_sum(
     const Lattice& lattice, const Rows<wp::int32>& planes, const Rows<Vec4<Real>>& parts, const Rows<Vec4<Real>>& grid,
     int e, int i, int node) {
-    write_node(grid, e, i, add_up_node<cells, numbers>(lattice, planes, parts, e, node));
+    write_node(grid, e, i, add_up_folded<cells, numbers>(lattice, planes, parts, e, node));
 }
 
 // Write a node's value; its adjoint is what the node's parts come to.
@@ -224,7 +234,7 @@ inline CUDA_CALLABLE void adj_write_with_parts(
     const Lattice& lattice, const Rows<wp::int32>& planes, const Rows<Vec4<Real>>& parts, const Rows<Vec4<Real>>&,
     int e, int, int node, const Vec4<Real>&, const Lattice&, const Rows<wp::int32>&, const Rows<Vec4<Real>>&,
     const Rows<Vec4<Real>>&, int, int, int, Vec4<Real>& adj_value) {
-    adj_value += add_up_node<cells, numbers>(lattice, planes, parts, e, node);
+    adj_value += add_up_folded<cells, numbers>(lattice, planes, parts, e, node);
 }
 
 }  // namespace gradscape

@@ -66,6 +66,13 @@ class Floor(Surface):
 
 
 @dataclass(frozen=True)
+class AnchoredFloor(Floor):
+    """A floor that does not move, under anchors that do: a pose is how far these have gone [m], along x, y and z."""
+
+    moves: ClassVar[bool] = True
+
+
+@dataclass(frozen=True)
 class Pan(Surface):
     """A round pan: a flat bottom whose edge bends up smoothly, along an arc.
 
@@ -275,8 +282,10 @@ def _stop_twice(name: str, rule: Rule) -> Any:
 def contact_kernel(name: str, stop: Any, Data: Any) -> Any:
     """Return the kernel that lets a surface stop vertices, and moves them.
 
-    Within a step the surface moves steadily from one pose to the next. `held` vertices stay where they are. Poses are
-    read by vertex. The adjoint sets those of poses, `x` and `pulled`, whatever they were, or leaves out what is None.
+    Within a step the surface moves steadily from one pose to the next. `held` vertices go where places do that are
+    given as poses: nowhere where poses stay. Poses are read by vertex.
+
+    The adjoint sets those of poses, `x` and `pulled`, whatever they were, or leaves out what is None.
     """
     types = precision(name)
     real, vec3, Vectors = types.real, types.vec3, types.rows[1]
@@ -299,9 +308,10 @@ def contact_kernel(name: str, stop: Any, Data: Any) -> Any:
     ):
         row, i = wp.tid()
         p = read(x, row, i)
-        v = stop(data, p, read(pulled, row, i), read(pose, row, i), read(following, row, i), dt)
+        now, then = read(pose, row, i), read(following, row, i)
+        v = stop(data, p, read(pulled, row, i), now, then, dt)
         if held[i]:
-            v = vec3(real(0.0), real(0.0), real(0.0))
+            v = (then - now) / dt
         v_next[row, i] = v
         x_next[row, i] = p + dt * v
 

@@ -35,7 +35,7 @@ class Sheet:
     of stiffness s_i and s_j [N/m] pulls with w (s_i + s_j) / 2 times its elongation, and with w `damping` [N s/m] times
     its rate. Where there is a `plate` [N/m], shape (spring,), a pair also attracts with so much times its distance, or
     repels where that is negative: such linear forces are how a sheet resists bending. `mass` [kg] is that of each
-    vertex, or of all alike; air takes `drag` [1/s] of its velocity; `held` vertices never move.
+    vertex, or of all alike; air takes `drag` [1/s] of its velocity; `held` vertices go where the anchors do.
     """
 
     x: np.ndarray

@@ -31,7 +31,7 @@ from ..mpm.boundaries import FAINTEST, STICKY, TINY, UPSTREAM_DT, Boundary, Kind
 from ..mpm.materials import Elastic, Fluid, Material, Plasticine
 from ..mpm.materials.fluid import TORN
 from ..mpm.materials.plasticine import ROUNDED, SMALLEST
-from ..mpm.model import EMPTY, Model
+from ..mpm.model import EMPTY, Model, walls_that_reflect
 from ..mpm.smoothing import smooth_volume_ratios
 from ..runtime import precision
 from .runtime import real as real_type
@@ -440,12 +440,13 @@ def _laws(name: str) -> SimpleNamespace:
         return t * ti.max(real(0.0), real(1.0) + friction * normal / speed)
 
     @ti.func
-    def touch(v, body, n, share, friction, slip: ti.template()):
+    def touch(v, body, n, share, held, friction, slip: ti.template()):
+        """Take a share of the velocity that goes into a body, and what of it is held of that which goes out."""
         u = v - body
         normal = u.dot(n)
         t = u - normal * n
-        felt = ti.select(normal < real(0.0), share, real(0.0))
-        return v + felt * (rub(t, normal, friction, slip) - u)
+        felt = ti.select(normal < real(0.0), share, held)
+        return v + felt * (rub(t, -ti.abs(normal), friction, slip) - u)
 
     return SimpleNamespace(motion=motion, rub=rub, touch=touch)
 
@@ -453,13 +454,13 @@ def _laws(name: str) -> SimpleNamespace:
 @no_type_check
 def _bowl(ladle: LadleInTank, name: str) -> Any:
     real, laws, bowl = real_type(name), _laws(name), _shapes(name).bowl
-    fade = _fade(ladle.band, name)
+    grip, held = _ladle_shares(ladle, name)
 
     @ti.func
     def contact(p, v, e, tools: ti.template(), step, fraction, rate):
         rim, body = laws.motion(tools, e, step, 0, fraction, rate)
         n, d = bowl(p - rim, real(ladle.radius), real(ladle.half_thickness))
-        return laws.touch(v, body, n, fade(d), real(ladle.friction), LADLE_SLIP)
+        return laws.touch(v, body, n, grip(d), held(d), real(ladle.friction), LADLE_SLIP)
 
     return contact
 
@@ -468,7 +469,7 @@ def _bowl(ladle: LadleInTank, name: str) -> Any:
 def _handle(ladle: LadleInTank, name: str) -> Any:
     """Return the contact with an upright capsule that stands on the bowl's rim."""
     real, laws, capsule = real_type(name), _laws(name), _shapes(name).capsule
-    fade = _fade(ladle.band, name)
+    grip, held = _ladle_shares(ladle, name)
 
     @ti.func
     def contact(p, v, e, tools: ti.template(), step, fraction, rate):
@@ -477,7 +478,7 @@ def _handle(ladle: LadleInTank, name: str) -> Any:
         middle = rim + ti.Vector([-real(ladle.radius), half, real(0.0)])
         up = ti.Vector([real(0.0), real(1.0), real(0.0)])
         n, d = capsule(p - middle, up, half, real(ladle.half_thickness))
-        return laws.touch(v, body, n, fade(d), real(ladle.friction), LADLE_SLIP)
+        return laws.touch(v, body, n, grip(d), held(d), real(ladle.friction), LADLE_SLIP)
 
     return contact
 
@@ -500,15 +501,24 @@ def _drag(tank: LadleInTank, name: str) -> Any:
 
 
 @no_type_check
-def _fade(band: float, name: str) -> Any:
+def _ladle_shares(ladle: LadleInTank, name: str) -> tuple[Any, Any]:
+    """Return which share of what goes into the ladle a node at a distance loses, and of what goes out."""
     real = real_type(name)
 
     @ti.func
-    def fade(d):
-        s = ti.max(real(0.0), ti.min(real(1.0) - d / real(band), real(1.0)))
+    def fade(s):
+        s = ti.max(real(0.0), ti.min(s, real(1.0)))
         return s * s * (real(3.0) - real(2.0) * s)
 
-    return fade
+    @ti.func
+    def grip(d):
+        return fade(real(1.0) - d / real(ladle.band))
+
+    @ti.func
+    def held(d):
+        return fade(-d / real(ladle.half_thickness))
+
+    return grip, held
 
 
 @no_type_check
@@ -526,7 +536,7 @@ def _tool(tool: Tool, slot: int, influence: Any, name: str) -> Any:
             axis = ti.Vector([ti.sin(angles[1]), real(0.0), ti.cos(angles[1])])
             body += (spin[0] * axis + spin[1] * up).cross(local)
         n, d = distance(local, axis)
-        return laws.touch(v, body, n, influence(d), real(tool.friction), TOOL_SLIP)
+        return laws.touch(v, body, n, influence(d), real(0.0), real(tool.friction), TOOL_SLIP)
 
     return contact
 
@@ -651,12 +661,14 @@ class Solver:
         self.volume = self._constant(np.concatenate([body.volume for body in model.bodies]))
         self.origin = ti.Vector(model.origin)
         self.empty = EMPTY * float(model.mass.min())
+        walls = zip(walls_that_reflect(model), (1, -1), strict=True)
+        self.images = [(axis, node, before) for nodes, before in walls for axis, node in enumerate(nodes) if node]
         self.smooth = [b for b, body in enumerate(model.bodies) if body.material.smoothing]
         self.checkpoints = self._states(model.steps + 1)
         self.tape = self._states(model.substeps + 1)
         self.A = self._zeros(model.substeps, capacity, model.particles, 3, 3)
-        nodes = capacity, *model.nodes
-        self.grid = Grid(self._zeros(*nodes, 3), self._zeros(*nodes), self._zeros(*nodes, 3))
+        shape = capacity, *model.nodes
+        self.grid = Grid(self._zeros(*shape, 3), self._zeros(*shape), self._zeros(*shape, 3))
         self.tools = self._zeros(capacity, model.steps + 1, model.boundary.slots, 3)
         self.differentiated = (*self.tape.arrays(), self.A, *self.grid.arrays(), self.tools)
         for array in self.differentiated:
@@ -725,7 +737,33 @@ class Solver:
         for array in self.grid.arrays():
             array.detach().zero_()
         self.transfers.p2g(*self._p2g_inputs(s, batch))
+        self._fold(self.grid.q.detach(), self.grid.m.detach())
         self.grid_op(*self._grid_inputs(step, s, batch))
+        self._unfold(self.grid.v.detach())
+
+    def _fold(self, vectors: torch.Tensor, masses: torch.Tensor | None = None) -> None:
+        """Add what nodes beyond walls that reflect hold to their images (`mirrors`); the adjoint of `_unfold`."""
+        for axis, on, before in self.images:
+            for values in (vectors,) if masses is None else (vectors, masses):
+                across = values.movedim(axis + 1, 0)
+                across[on + before] += self._image(across[on - before], axis)
+                across[on - before] = 0.0
+            vectors.movedim(axis + 1, 0)[on, ..., axis] = 0.0
+
+    def _unfold(self, vectors: torch.Tensor, masses: torch.Tensor | None = None) -> None:
+        """Give nodes beyond walls that reflect the image of what those before them hold."""
+        for axis, on, before in reversed(self.images):
+            for values in (vectors,) if masses is None else (vectors, masses):
+                across = values.movedim(axis + 1, 0)
+                across[on - before] = self._image(across[on + before], axis)
+            vectors.movedim(axis + 1, 0)[on, ..., axis] = 0.0
+
+    def _image(self, values: torch.Tensor, axis: int) -> torch.Tensor:
+        """Return what a plane of nodes [environment, j, k] of vectors or masses looks like in a wall."""
+        image = values.clone()
+        if image.ndim == 4:
+            image[..., axis] *= -1.0
+        return image
 
     def _retreat(self, step: int, batch: int) -> None:
         """Take gradients from the tape's last state to its first, then to the last of the step before."""
@@ -736,7 +774,9 @@ class Solver:
                 _grad(array).zero_()
             self.transfers.move.grad(*self._move_inputs(s, batch))
             self.transfers.g2p.grad(*self._g2p_inputs(s, batch))
+            self._fold(_grad(self.grid.v))
             self.grid_op.grad(*self._grid_inputs(step, s, batch))
+            self._unfold(_grad(self.grid.q), _grad(self.grid.m))
             self.transfers.p2g.grad(*self._p2g_inputs(s, batch))
             for (_, adjoint), inputs in zip(self.materials, self._material_inputs(s, batch), strict=True):
                 adjoint(*inputs)

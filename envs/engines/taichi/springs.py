@@ -4,7 +4,8 @@ A step takes vertices' x and v from time t to time t + 1:
 
     pull     f_t    = sum over a vertex's springs of weight (s (|d| - rest) + damping w.n) n + plate d
     advance  v'     = v_t + dt (f_t / m - drag v_t - g)
-             v_t+1  = v' - max(min((v' - u).n, 0), d / dt) n where x_t + dt v' is inside a surface, 0 where held
+             v_t+1  = v' - max(min((v' - u).n, 0), d / dt) n where x_t + dt v' is inside a surface,
+             or (pose_t+1 - pose_t) / dt where held
              x_t+1  = x_t + dt v_t+1
 
 A spring has d = x_j - x_i, w = v_j - v_i, n = d / |d|, s = (s_i + s_j) / 2, and adds its force to both its ends; a
@@ -60,7 +61,8 @@ class Solver:
         fields, tree = _fields(ti, R, sheet, frames=steps + 1, capacity=capacity)
         weakref.finalize(self, tree.destroy).atexit = False  # Taichi keeps fields that nothing refers to
         self.borders = _borders(ti, R, fields)
-        self.physics = _physics(ti, R, sheet, fields, _stops(ti, R, surface, rule, dt=dt), dt=dt, device=device)
+        stop_by = _stops(ti, R, surface, rule, dt=dt)
+        self.physics = _physics(ti, R, sheet, fields, stop_by, moves=surface.moves, dt=dt, device=device)
         self._lay_out(sheet)
         self._compile()
 
@@ -168,7 +170,9 @@ def _fields(ti: Any, R: Any, sheet: Sheet, *, frames: int, capacity: int) -> tup
 
 
 @no_type_check
-def _physics(ti: Any, R: Any, sheet: Sheet, fields: Any, stop: Any, *, dt: float, device: str) -> SimpleNamespace:
+def _physics(
+    ti: Any, R: Any, sheet: Sheet, fields: Any, stop: Any, *, moves: bool, dt: float, device: str
+) -> SimpleNamespace:
     """Return the kernels `pull` of springs' forces and `advance` of vertices against a surface."""
     plate = fields.plate
     pairs, rest, weight, free, mass = fields.pairs, fields.rest, fields.weight, fields.free, fields.mass
@@ -203,6 +207,8 @@ def _physics(ti: Any, R: Any, sheet: Sheet, fields: Any, stop: Any, *, dt: float
                 p = x[t, row, i]
                 a = f[t, row, i] / mass[i] - R(drag) * v[t, row, i] - vec3(0.0, g, 0.0)
                 v_next = free[i] * stop(p, v[t, row, i] + R(dt) * a, poses[t, row], poses[t + 1, row])
+                if ti.static(moves):
+                    v_next += (R(1.0) - free[i]) * (poses[t + 1, row] - poses[t, row]) / R(dt)
                 v[t + 1, row, i] = v_next
                 x[t + 1, row, i] = p + R(dt) * v_next
 

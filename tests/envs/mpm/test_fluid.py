@@ -16,6 +16,7 @@ from gradscape.envs.mpm import fluid
 from gradscape.envs.mpm.fluid import (
     BOWL,
     CUBE_CENTER,
+    CUBE_EDGE,
     EASING,
     FILL,
     GRAVITY,
@@ -68,9 +69,8 @@ def test_the_pressure_of_syrup_at_rest_is_hydrostatic(monkeypatch):
     for low in torch.arange(0, FILL - 0.01, 0.025):
         layer = (height >= low) & (height < low + 0.025)
         wanted = SYRUP_DENSITY * GRAVITY * (FILL - height[layer].mean())
-        allowed = 0.06 if low == 0 else 0.04  # nodes of the floor weigh on one side only
-        assert abs(float(pressure[layer].mean() - wanted)) < allowed * floor
-        assert pressure[layer].std() < 0.06 * floor  # of it a layer's own slope is 0.04
+        assert abs(float(pressure[layer].mean() - wanted)) < 0.04 * floor
+        assert pressure[layer].std() < 0.03 * floor  # of it a layer's own slope is 0.04
 
 
 @pytest.fixture(scope="module")
@@ -123,14 +123,33 @@ def test_a_heavy_cube_sinks_and_a_light_one_rises(speeds):
     for viscosity in (30.0, 60.0):
         assert speeds[viscosity, 1800.0][0] < -0.001
         assert speeds[viscosity, 860.0][0] > 0.001
-    assert abs(speeds[30.0, SYRUP_DENSITY][1]) < 0.002
+    # A neutral one stays: what drives it is less than a twentieth of the weight of syrup that it displaces.
+    assert abs(speeds[30.0, SYRUP_DENSITY][0]) < 0.05 * SYRUP_DENSITY / 470.0 * known_speed(30.0)
 
 
 @pytest.mark.parametrize("viscosity", [30.0, 60.0])
 def test_a_cube_sinks_and_rises_as_fast_as_is_known_of_cubes_between_walls(speeds, viscosity):
     # Half the difference of the two is free of what a neutral cube drifts.
     half = (speeds[viscosity, 860.0][0] - speeds[viscosity, 1800.0][0]) / 2
-    assert half == pytest.approx(known_speed(viscosity), rel=0.2)
+    assert half == pytest.approx(known_speed(viscosity), rel=0.1)
+
+
+def test_a_heavy_cube_that_is_half_in_goes_under(monkeypatch):
+    # It neither sticks where its top is at the surface, nor does the syrup lose volume on the way.
+    for name, value in {"RIM": (0.0, 10.0, 0.0), "TANK_WIDTH": 0.2, "CUBE_CENTER": (0.0, FILL, 0.0)}.items():
+        monkeypatch.setattr(fluid, name, value)
+    fidelity = Fidelity("narrow", dt=SPAN / 14, resolution=16, sampling=1.5)
+    steps = 150
+    scene = Fluid(fidelity=fidelity, device="cpu", cube_density=2000.0, horizon=steps / STEPS)
+    away = torch.tensor([0.0, 10.0, 0.0], dtype=torch.float64).expand(1, steps + 1, 1, 3)
+    with scene._solvers.lend() as stage:
+        stage.solver.run(away)
+        places = [stage.solver.read_positions(step, 1).double() for step in (0, steps - 20, steps)]
+    start, before, end = (float(scene._center(place)[0, 1]) for place in places)
+    assert end + CUBE_EDGE / 2 < FILL - 0.01
+    assert (before - end) / (20 * SPAN) > 0.008
+    syrup = [float(place[0, : len(scene.model.bodies[0].x), 1].mean()) for place in places]
+    assert syrup[2] == pytest.approx(syrup[0], rel=0.02)
 
 
 def test_walls_that_stick_slow_the_syrup_along_them():
@@ -176,6 +195,16 @@ def test_the_gradient_of_the_whole_scene_is_the_slope():
         ends = [float(scene.evaluate(x + s * step * way, grad=False).loss) for s in (1, -1)]
         errors.append(abs((ends[0] - ends[1]) / (2 * step) - slope) / abs(slope))
     assert min(errors) < 1e-6
+
+
+def test_the_gradient_is_the_slope_over_a_thousandth_of_the_box(draft):
+    """Losses jumped wherever the middle of the ladle's shell passed a node, which no gradient sees."""
+    scene = Fluid(fidelity=replace(draft.fidelity, precision="float64"), device="cpu")
+    x = 0.5 * scene.space.uniform(6, seed=5)
+    way = 4.0 * torch.nn.functional.normalize(scene.space.uniform(6, seed=6), dim=1)
+    slope = (scene.evaluate(x).grad * way).sum(dim=1)
+    ends = scene.evaluate(torch.cat([x + 5e-4 * way, x - 5e-4 * way]), grad=False).loss
+    assert ((ends[:6] - ends[6:]) / 1e-3 / slope - 1).abs().median() < 0.02
 
 
 def test_a_still_scene_stays_symmetric_in_depth(draft):

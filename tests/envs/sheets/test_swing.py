@@ -53,6 +53,21 @@ def test_an_episode_is_that_of_the_parameters_and_its_anchors_stand_still(cls):
     assert frames[:, :, 1].min() < 0.005  # it swings down onto the floor
 
 
+@pytest.mark.parametrize("cls", [SwingVelocity, SwingStiffness])
+def test_the_papers_anchors_swing_the_cloth_onto_the_floor_and_gradients_are_the_slopes(cls):
+    env = cls(fidelity=DRAFT64, device="cpu", **cls.preset_options("paper"))
+    x, throw = env.example("target"), torch.tensor([1.0, -0.5, 0.0], dtype=torch.float64)
+    episode, right = env.episode(x), torch.tensor([[0.0, 0.1, -0.1], [0.0, 0.1, 0.1]], dtype=torch.float64)
+    time = episode.time.clamp(max=0.4)
+    gone = throw * (time - time**2 / 0.8)[:, None]  # slows down evenly, to rest after 0.4 s
+    torch.testing.assert_close(episode.points["sheet"][:, list(env.sheet.held)], right + gone[:, None])
+    assert float(episode.points["sheet"][-1, :, 1].mean()) < 0.02  # onto the floor, folded
+    other, step = env.space.uniform(1, seed=1), 1e-8 * (env.space.upper - env.space.lower)
+    ends = env.evaluate(torch.cat([other - step, other + step]), grad=False).loss
+    slope = float(env.evaluate(other).grad @ step)
+    assert float(ends[1] - ends[0]) / 2 == pytest.approx(slope, rel=1e-3)
+
+
 @pytest.mark.parametrize("loss", LOSSES)
 def test_the_target_is_where_its_own_example_brings_the_cloth(cls, loss):
     env = made(cls, loss)

@@ -149,10 +149,9 @@ def resting():
 def test_a_resting_tank_stays_at_rest(resting, material):
     for dx in (0.05, 0.025):
         drift, fastest, last = resting[material, dx]
-        assert drift < 1e-3
-        assert fastest < 0.06
-        assert last < 0.01
-    assert resting[material, 0.025][0] < resting[material, 0.05][0]
+        assert drift < 3e-4  # 7e-4 where walls do not reflect
+        assert fastest < 0.015
+        assert last < 0.006
 
 
 @pytest.mark.parametrize("material", MATERIALS)
@@ -166,6 +165,5 @@ def test_a_column_that_starts_to_bear_its_weight_swings_at_the_speed_of_sound(ma
         step = int((v[1:] > 0).nonzero()[0])
         crossing = SPAN * (step - float(v[step] / (v[step + 1] - v[step])))
         late.append(abs(crossing / turn - 1))
-        assert float(height[0] - height.min()) == pytest.approx(depth, rel=0.08)
-    assert late[1] < 0.05
-    assert late[1] < 0.6 * late[0]
+        assert float(height[0] - height.min()) == pytest.approx(depth, rel=0.1)
+    assert max(late) < 0.05

@@ -297,7 +297,7 @@ def replay(sheet, hit, velocity, stiffness, poses=STILL, rule="end"):
             v[i] = v[i] + DT * (f / sheet.masses[i] - sheet.drag * v[i] - g)
             v[i], hit_now = stopped(hit, x[i], v[i], pose, following, rule)
             hits += hit_now
-            v[i] = 0 * v[i] if i in held else v[i]
+            v[i] = (following - pose) / DT if i in held else v[i]
         x = [p + DT * w for p, w in zip(x, v, strict=True)]
     return torch.stack(x), hits
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from gradscape.envs.engines.sheets import springs
-from gradscape.envs.engines.sheets.contact import Floor, PanOverFloor
+from gradscape.envs.engines.sheets.contact import AnchoredFloor, Floor, PanOverFloor
 from gradscape.envs.engines.taichi import springs as taichi_springs
 from gradscape.envs.engines.taichi.runtime import start
 from gradscape.envs.sheets.swing import SwingVelocity
@@ -38,6 +38,7 @@ def made(engine, surface, rule):
 ROUGH = PanOverFloor(replace(PAN, friction=0.3), Floor(height=-0.02, friction=0.2))
 SURFACES = {
     "floor": (Floor(height=0.001), "end"),
+    "floor under anchors": (AnchoredFloor(height=0.001), "start"),
     "pan": (PAN, "end"),
     "pan once inside": (PAN, "start"),
     "pan over floor, with friction": (ROUGH, "end"),
