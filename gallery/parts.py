@@ -463,8 +463,9 @@ class ReportPart(FigurePart):
     def seconds_each(self) -> float:
         """Estimate a report by the first episodes."""
         rank = len(self.figure.dims)
-        losses, gradients = effort(rank, REPORT_POINTS, (self.figure.resolution,) * rank)
-        return simulation_seconds(self.scene().make(), losses, gradients, losses + gradients)
+        env = self.scene().make()
+        losses, gradients = effort(rank, REPORT_POINTS, (self.figure.resolution,) * rank, len(env.replicas()))
+        return simulation_seconds(env, losses, gradients, losses + gradients)
 
     def make(self, watch: Watch) -> str:
         """Measure the slice, and replace a report of another one."""

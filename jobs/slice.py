@@ -294,7 +294,9 @@ class SliceJob(SummaryJob[SliceSummary]):
             return
         kept = f", {total - cost.episodes} are there already" if cost.episodes < total else ""
         most, losses = "up to " if self.refinement else "", probes(total, grad=whole)
-        between = f"; plus at most {losses} between samples" if losses else ""
+        again = floor_episodes(self.objective, total)
+        more = [f"{losses} between samples"] * (losses > 0) + [f"{again} of its replicas"] * (again > 0)
+        between = f"; plus at most {' and '.join(more)}" if more else ""
         watch.note(
             f"{most}{cost.episodes} {kind} to compute{kept}: about {duration(cost.seconds)}, "
             f"{size(cost.memory)} of memory{_gpu_memory(self.objective)}{between}"
