@@ -110,5 +110,5 @@ def read_paper(path: Path = PAPER) -> Paper:
     findings: dict[str, tuple[PaperFinding, ...]] = {}
     for table in tables["finding"]:
         for name in table["slices"]:
-            findings[name] = findings.get(name, ()) + (from_json(PaperFinding, table),)
+            findings[name] = (*findings.get(name, ()), from_json(PaperFinding, table))
     return Paper(words, claims, silences, captions, findings)

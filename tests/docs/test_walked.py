@@ -143,7 +143,7 @@ def test_a_slice_is_judged_by_which_of_the_paper_s_words_were_measured(
     assert f"| **verdict** | **{verdict}** |" in page
     assert (f"| **not measured of its words** | {', '.join(unseen)} |" in page) == bool(misses)
     options = report.options | environment_class(figure.env).preset_options("paper")
-    one.report = replace(report, options=options)
+    one.report, one.figure = replace(report, options=options), replace(one.figure, id="of-no-finding")
     assert reproduction.verdict_of(one) == ("refuted" if verdict == "not seen here" else verdict)
 
 
@@ -155,7 +155,7 @@ def test_claims_are_what_the_league_makes_of_them(nothing: Kept) -> None:
     assert by["bo-leap", "random"] == by["bo-leap", "cma-es"] == "confirmed"
     assert by["bo-leap", "descents"] == "not run"
     assert {one.verdict for one in reproduction.judge_claims(raced) if one.env != "fluid"} == {NOT_MEASURED}
-    assert len(set(ClaimVerdict)) + 2 == len(reproduction.MEANING)  # each that there is has a meaning
+    assert len(set(ClaimVerdict)) + 3 == len(reproduction.MEANING)  # each that there is has a meaning
 
 
 def test_pictures_lead_to_the_gallery_where_it_is_built_and_to_scenes_where_not(
