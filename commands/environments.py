@@ -36,6 +36,7 @@ def show_entries(found: list[Entry], console: Console) -> None:
 
 def show_environment(env: Environment, console: Console) -> None:
     """Print all there is to know about one environment."""
+    from ..envs.base import describe_settings
     from ..gallery.paper import read_paper
     from ..landscapes.options import in_full
     from ..landscapes.space import LOG10
@@ -59,18 +60,10 @@ def show_environment(env: Environment, console: Console) -> None:
         console.print(said)
     console.print(in_full(env.Options))
     console.print(f"examples: {', '.join(env.examples) or 'none'}")
-    console.print(f"presets: {_presets(env)}")
+    presets = (f"{name} ({describe_settings(options)})" for name, options in env.presets.items())
+    console.print(f"presets: {', '.join(presets) or 'none'}")
     if words := read_paper().words.get(env.name):
         console.print(f"the paper says: {words}")
-
-
-def _presets(env: Environment) -> str:
-    """Return every preset with the options it sets; one that sets none has the scene as it is."""
-    said = [
-        f"{name} ({', '.join(f'{option}={value}' for option, value in options.items()) or 'the defaults'})"
-        for name, options in env.presets.items()
-    ]
-    return ", ".join(said) or "none"
 
 
 def describe_environment(env: Environment) -> dict[str, Any]:

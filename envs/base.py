@@ -124,6 +124,12 @@ def describe_presets(presets: Mapping[str, Mapping[str, Any]]) -> str:
     return f"preset{'s' if len(presets) > 1 else ''} {', '.join(presets)}" if presets else "no presets"
 
 
+def describe_settings(options: Mapping[str, Any]) -> str:
+    """Return the options that a preset sets as the command line takes them; one that sets none leaves the defaults."""
+    said = (f"{name}={str(value).lower() if isinstance(value, bool) else value}" for name, value in options.items())
+    return ", ".join(said) or "the defaults"
+
+
 FLOAT32 = torch.finfo(torch.float32).max
 SHORTER = (0.01, 0.02)  # by which the time steps of replicas are shorter: longer ones might be unstable
 PROBES = 8  # points besides the centre that are tried where a whole batch raised

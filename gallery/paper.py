@@ -36,20 +36,46 @@ class PaperWords:
 
 @dataclass(frozen=True)
 class PaperCaption:
-    """Hold what the paper says, in our words, of what a slice shows, and the number of its figure, None in ours."""
+    """Hold what the paper says, in our words, of what a slice shows, and the number of its figure, None in ours.
+
+    `words` are those of this slice alone, of `classify.WORDS`, where it does not say of it what it says of the scene.
+    """
 
     says: str = "It does not show this slice."
     number: int | None = None
+    words: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class PaperFinding:
+    """Hold what was measured of the paper's words for some slices, beyond what their reports say.
+
+    `words` are of `classify.WORDS`, or the paper's own where it has more. `setting` is what turns our landscape into
+    the paper's, empty where none was found; `holds` says whether the words hold with it; `measured` how that is known.
+    """
+
+    words: tuple[str, ...]
+    measured: str
+    setting: str = ""
+    holds: bool = True
+
+    def __str__(self) -> str:
+        said = f"{', '.join(self.words)}: {self.measured}"
+        return f"{said} ({'so with' if self.holds else 'tried:'} {self.setting})" if self.setting else said
 
 
 @dataclass(frozen=True)
 class Paper:
-    """Hold all that the paper says: `words`, `claims` and `silences` by environment, `captions` by slice."""
+    """Hold all that the paper says: `words`, `claims` and `silences` by environment, `captions` by slice.
+
+    `findings` are ours, by slice.
+    """
 
     words: Mapping[str, PaperWords]
     claims: Mapping[str, tuple[Claim, ...]]
     silences: Mapping[str, str]
     captions: Mapping[str, PaperCaption]
+    findings: Mapping[str, tuple[PaperFinding, ...]]
 
     def claims_about(self, env: str) -> Claims:
         """Return which optimisers the paper has ahead of which others in an environment, or why it claims nothing."""
@@ -71,7 +97,8 @@ def read_paper(path: Path = PAPER) -> Paper:
 
     tables = tomllib.loads(path.read_text())
     words = from_json(dict[str, PaperWords], tables["environment"])
-    for name, said in words.items():
+    captions = {name: from_json(PaperCaption, table) for table in tables["caption"] for name in table["slices"]}
+    for name, said in (words | captions).items():
         if unknown := set(said.words) - set(WORDS):
             raise ValueError(f"{path}: {name} has words {sorted(unknown)}; the words are {', '.join(WORDS)}")
     claims: dict[str, tuple[Claim, ...]] = {}
@@ -80,5 +107,8 @@ def read_paper(path: Path = PAPER) -> Paper:
         for env in table["environments"]:
             claims[env] = claims.get(env, ()) + tuple(from_json(Claim, table | pair) for pair in pairs)
     silences = {env: str(table["why"]) for table in tables["silence"] for env in table["environments"]}
-    captions = {name: from_json(PaperCaption, table) for table in tables["caption"] for name in table["slices"]}
-    return Paper(words, claims, silences, captions)
+    findings: dict[str, tuple[PaperFinding, ...]] = {}
+    for table in tables["finding"]:
+        for name in table["slices"]:
+            findings[name] = (*findings.get(name, ()), from_json(PaperFinding, table))
+    return Paper(words, claims, silences, captions, findings)

@@ -11,7 +11,7 @@ from gradscape.envs.registry import environment_class
 from gradscape.gallery.figures import Figure, read_figures
 from gradscape.gallery.files import DATA, STORE
 from gradscape.gallery.league import read_league
-from gradscape.gallery.paper import Paper, read_paper
+from gradscape.gallery.paper import Paper, PaperFinding, read_paper
 from gradscape.jobs.folder import REPORT
 from gradscape.jobs.report import Report
 from gradscape.landscapes.slice import Slice
@@ -49,6 +49,24 @@ class KeptFigure:
     def axes(self) -> str:
         """What its slice varies."""
         return " and ".join(self.slice.plane.labels) if self.slice else ""
+
+    @property
+    def paper_words(self) -> tuple[str, ...]:
+        """The paper's words for it, its own or those of the scene."""
+        said = read_paper().words.get(self.figure.env)
+        return self.figure.caption.words or (said.words if said else ())
+
+    @property
+    def findings(self) -> tuple[PaperFinding, ...]:
+        """What else is known of the paper's words for it."""
+        return read_paper().findings.get(self.figure.id, ())
+
+    @property
+    def as_the_paper(self) -> bool:
+        """Whether its scene was set as the paper has it, by its preset."""
+        wanted = environment_class(self.figure.env).presets.get("paper")
+        known = self.report.options if self.report else {}
+        return wanted is not None and all(known.get(name) == value for name, value in wanted.items())
 
     @property
     def words(self) -> str:

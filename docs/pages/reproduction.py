@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+from gradscape.envs.base import describe_settings
+from gradscape.envs.registry import environment_class
 from gradscape.gallery.site.league import VERDICTS
 from gradscape.optim.claims import Claim
 
@@ -15,12 +17,15 @@ from .kept import NOT_MEASURED, Kept, KeptFigure
 from .pictures import draw_slice
 from .text import cell, render
 
-CONFIRMED, REFUTED, DIFFERENT = "confirmed", "refuted", "different"
+CONFIRMED, REFUTED, DIFFERENT, UNSEEN = "confirmed", "refuted", "different", "not seen here"
 SAYS_NOTHING = "the paper says nothing of it"
 MEANING = {
     CONFIRMED: "all that the paper says of it was measured here too; of a claim about two methods: the rank test of "
     "Mann and Whitney, corrected by Holm's rule for all pairs of the race, has p below 0.05",
-    REFUTED: "none of the paper's words was measured; of a claim: that test says the opposite",
+    REFUTED: "none of the paper's words was measured, with its settings, preset paper, nor with another that is known; "
+    "of a claim: that test says the opposite",
+    UNSEEN: "none of the paper's words was measured, and another setting has some of them, or the paper's is another; "
+    "what is known of the reason is said",
     DIFFERENT: "some of the paper's words were measured and some were not",
     "not decided": "the races that are kept do not say which of two methods is ahead",
     "not run": "one of the two methods was not raced in this scene",
@@ -46,7 +51,8 @@ def pages(kept: Kept, pictures: Path) -> dict[str, str]:
         numbers.setdefault(one.figure.caption.number, []).append(one)
     text = render(
         "reproduction.md", kept=kept, meaning=MEANING, numbers=numbers, claims=claims, verdict_of=verdict_of, cell=cell,
-        draw=partial(draw_slice, folder=pictures),
+        draw=partial(draw_slice, folder=pictures), missing=missing_words,
+        preset_of=lambda env: describe_settings(environment_class(env).preset_options("paper")),
         of_slices=_count(map(verdict_of, kept.figures)), of_claims=_count(one.verdict for one in claims),
         earlier=sum(one.slice is not None and not one.current for one in kept.figures),
     )  # fmt: skip
@@ -57,10 +63,18 @@ def verdict_of(one: KeptFigure) -> str:
     """Return what the measured words of a slice make of the paper's."""
     if one.report is None:
         return NOT_MEASURED
-    hits = [word.measured for word in one.report.paper.words] if one.report.paper else []
-    if not hits:
+    words, missing = one.paper_words, missing_words(one)
+    if not words:
         return SAYS_NOTHING
-    return CONFIRMED if all(hits) else DIFFERENT if any(hits) else REFUTED
+    if len(missing) < len(words):
+        return DIFFERENT if missing else CONFIRMED
+    elsewhere = any(found.setting and found.holds and set(found.words) & set(missing) for found in one.findings)
+    return REFUTED if one.as_the_paper and not elsewhere else UNSEEN
+
+
+def missing_words(one: KeptFigure) -> tuple[str, ...]:
+    """Return the paper's words for a slice that were not measured of it."""
+    return tuple(word for word in one.paper_words if one.report is not None and word not in one.report.words)
 
 
 def judge_claims(kept: Kept) -> Iterator[FoundClaim]:

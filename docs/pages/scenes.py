@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
-from gradscape.envs.base import Environment
+from gradscape.envs.base import Environment, describe_settings
 from gradscape.envs.registry import BUILTIN, EXTRAS, Entry, installs, make
 from gradscape.landscapes.options import in_full
 from gradscape.studies.kept import describe_margins
@@ -45,7 +45,7 @@ def _page(entry: Entry, kept: Kept, pictures: Path) -> str:
         parameters=list(zip(space.names, space.lower.tolist(), space.upper.tolist(), space.units, strict=True)),
         options=[line.strip() for line in named.splitlines() if "=" in line], explained=explained,
         margins=describe_margins(env) if any(one.dt for one in env.fidelities.values()) else (),
-        paper=kept.paper.words.get(entry.name),
+        paper=kept.paper.words.get(entry.name), settings_of=describe_settings,
     )  # fmt: skip
 
 

@@ -25,7 +25,8 @@ from gradscape.envs.user_functions import Function, FunctionKeywords
 from gradscape.gallery.figures import read_figures
 from gradscape.gallery.files import DATA
 from gradscape.gallery.paper import read_paper
-from gradscape.landscapes.storage.records import read_json, write_record
+from gradscape.jobs.report import Report
+from gradscape.landscapes.measures.classify import WORDS
 from gradscape.optim.claims import ClaimVerdict
 from gradscape.optim.league import League
 
@@ -34,7 +35,6 @@ from ..gallery.site.conftest import scene_standings
 pytestmark = pytest.mark.docs
 
 ROOT = Path(__file__).parents[2]
-REPORTED = "bounce-y"  # a figure whose report is kept
 
 
 VERBS = verbs()
@@ -126,28 +126,25 @@ def test_pages_hold_every_figure_and_claim_and_say_what_is_not_measured(
 
 
 @pytest.mark.parametrize(
-    ("hits", "verdict"),
-    [
-        ((True, True), "confirmed"),
-        ((False, False), "refuted"),
-        ((True, False), "different"),
-        ((), "the paper says nothing of it"),
-    ],
+    ("hits", "misses", "verdict"),
+    [(1, 0, "confirmed"), (0, 2, "not seen here"), (1, 1, "different"), (0, 0, "the paper says nothing of it")],
 )
 def test_a_slice_is_judged_by_which_of_the_paper_s_words_were_measured(
-    tmp_path: Path, hits: tuple[bool, ...], verdict: str
+    tmp_path: Path, hits: int, misses: int, verdict: str
 ) -> None:
-    figure = next(one for one in read_figures() if one.id == REPORTED)
-    folder = tmp_path / figure.id
-    folder.mkdir()
-    record = read_json(DATA / figure.id / "report.json")
-    words = [{"word": f"word {number}", "measured": hit} for number, hit in enumerate(hits)]
-    write_record(folder / "report.json", record | {"paper": {"words": words, "where": "nowhere"}})
-    one = KeptFigure(figure, tmp_path)
+    """What was not measured with other settings than the paper's is not seen here, and refuted only with its own."""
+    figure = next(one for one in read_figures() if one.id == "swing-stiffness-single")
+    report = Report.read(DATA / figure.id)
+    unseen = [word for word in WORDS if word not in report.words][:misses]
+    own = replace(figure.caption, words=(*report.words[:hits], *unseen))
+    one = KeptFigure(replace(figure, caption=own, env=figure.env if own.words else "branin"))
     assert reproduction.verdict_of(one) == verdict
     page = reproduction.pages(replace(Kept.read(tmp_path / "none"), figures=[one]), tmp_path)["reproduction.md"]
     assert f"| **verdict** | **{verdict}** |" in page
-    assert all((f"word {number}" in page) == (not hit) for number, hit in enumerate(hits))
+    assert (f"| **not measured of its words** | {', '.join(unseen)} |" in page) == bool(misses)
+    options = report.options | environment_class(figure.env).preset_options("paper")
+    one.report, one.figure = replace(report, options=options), replace(one.figure, id="of-no-finding")
+    assert reproduction.verdict_of(one) == ("refuted" if verdict == "not seen here" else verdict)
 
 
 def test_claims_are_what_the_league_makes_of_them(nothing: Kept) -> None:
@@ -158,7 +155,7 @@ def test_claims_are_what_the_league_makes_of_them(nothing: Kept) -> None:
     assert by["bo-leap", "random"] == by["bo-leap", "cma-es"] == "confirmed"
     assert by["bo-leap", "descents"] == "not run"
     assert {one.verdict for one in reproduction.judge_claims(raced) if one.env != "fluid"} == {NOT_MEASURED}
-    assert len(set(ClaimVerdict)) + 2 == len(reproduction.MEANING)  # each that there is has a meaning
+    assert len(set(ClaimVerdict)) + 3 == len(reproduction.MEANING)  # each that there is has a meaning
 
 
 def test_pictures_lead_to_the_gallery_where_it_is_built_and_to_scenes_where_not(
