@@ -9,6 +9,7 @@ import pytest
 import torch
 
 import gradscape as gs
+from gradscape.envs.engines.mpm.model import walls_that_reflect
 from gradscape.envs.mpm.plasticine import Plasticine
 from gradscape.landscapes.measures.floor import evaluate_replicas, floor_between
 
@@ -35,15 +36,15 @@ def test_replicas_differ_by_little_and_not_by_nothing(name: str, wide: float, mo
 
 
 def test_every_scene_of_the_paper_has_replicas_that_can_be_made() -> None:
-    """A tank's walls stay on nodes, and the grids of plasticine cover the room though they are moved."""
+    """A tank's walls reflect on every grid, and the grids of plasticine cover the room though they are moved."""
     for name in ("fluid", "rope", "triple-move", "writer", "swing-stiffness", "pinball-16"):
         for env in (gs.make(name, device="cpu"), gs.make(name, fidelity="standard", device="cpu")):
             assert len(env.replicas()) > 1, name
     for replica in gs.make("fluid", device="cpu").replicas().values():
-        model: Any = replica.model  # type: ignore[attr-defined]
-        nodes = model.origin[0] + model.dx * np.arange(model.nodes[0])
-        assert np.abs(np.abs(nodes) - model.boundary.half_width).min() < 1e-9
-        assert nodes.sum() == pytest.approx(0, abs=1e-9)
+        below, above = walls_that_reflect(replica.model)  # type: ignore[attr-defined]
+        assert all(below)
+        assert [a - b for a, b in zip(above[::2], below[::2], strict=True)] == [24, 24]  # halves of a cell
+    assert gs.make("fluid", device="cpu", walls="stick").replicas().keys() == {"other particles"}
     for replica in gs.make("torus", device="cpu").replicas().values():
         assert isinstance(replica, Plasticine)
         lower, upper = replica.scene.room()
