@@ -165,6 +165,15 @@ def test_bounces_are_counted_as_the_closed_form_has_them():
     assert fine.bounces(upright(speeds)[:0]).shape == (0,)
 
 
+def test_the_number_of_bounces_changes_as_a_throw_does_and_not_with_what_a_step_hits():
+    """In whole steps it changed 401 times along this line."""
+    env = Bounce(fidelity="standard", device="cpu", **Bounce.preset_options("paper"))
+    x = env.example("aim").repeat(2000, 1)
+    x[:, 1] = torch.linspace(float(env.space.lower[1]), float(env.space.upper[1]), len(x), dtype=torch.float64)
+    assert x[-1, 1] == 0.0  # no velocity upwards
+    assert 1 < int((env.events(x)["bounces"].diff() != 0).sum()) < 8
+
+
 @pytest.mark.parametrize("fidelity", ["draft", "standard"])
 def test_the_aimed_throw_meets_the_target_after_one_bounce(fidelity):
     bounce = Bounce(fidelity=fidelity, device="cpu")
