@@ -143,8 +143,10 @@ class CensusJob(CheckpointedJob["Census"]):
 
     def compute(self, watch: Watch) -> Census:
         """Survey what is missing, and return the census."""
+        from ..landscapes.measures.slice_floor import counted_from
+
         deviation, replicas = self._noise(watch), self._replicas(watch)
-        numerics = float(np.nan_to_num(self._floor(replicas, None).deviation)) if replicas else 0.0
+        numerics = counted_from(self._floor(replicas, None)) if replicas else 0.0
         self._announce(watch)
         return self._conclude(self._survey(deviation, numerics, watch), replicas)
 

@@ -542,7 +542,7 @@ def conclude_slice(
     With an `executor` its workers evaluate.
     """
     floor = look_at_replicas(objective, dataset, executor)
-    least = counted_from(floor, dataset["loss"].size)
+    least = counted_from(floor)
     hidden = look_between(evaluator(objective, executor, remake), dataset, floor=least)
     return {**(floor_attribute(floor) if floor else {}), **hidden}
 

@@ -175,17 +175,16 @@ def survey(
 ) -> list[SurveyedSlice]:
     """Sample and measure slices, their points in one batch.
 
-    `deviation` and `numerics` [loss unit] are the standard deviations of the losses' noise and between replicas. The
-    larger one is what measures of losses count nothing below, as `noise_floor` has it.
+    `deviation` [loss unit] is the standard deviation of the losses' noise, and measures of losses count nothing below
+    what it should put so many samples apart, or below `numerics` (`counted_from`), whichever is more.
     Measures are those of a report, without their intervals within the slice: what counts here is how they differ from
     slice to slice. Those of gradients are of every so many samples along each axis, `gradients`, and hold them against
     the losses of all. Jumps are looked for in at most `STEEP` pairs of samples of a slice.
     """
     wholes = sample_cuts(objective, planes, gradients=gradients)
-    apart = max(deviation, numerics)
-    rugged = [_ruggedness(whole, apart, deviation) for whole in wholes]
+    rugged = [_ruggedness(whole, numerics, deviation) for whole in wholes]
     least = [
-        max(noise_floor(apart, whole["loss"].size), half_step(found.range, plane.resolution))
+        max(found.floor, half_step(found.range, plane.resolution))
         for plane, whole, found in zip(planes, wholes, rugged, strict=True)
     ]
     jumps = find_jumps(objective, wholes, least=least, most=STEEP, seed=seed)
@@ -193,7 +192,7 @@ def survey(
     for plane, whole, found, steep in zip(planes, wholes, rugged, jumps, strict=True):
         measures, verdict = _measure(whole, found, steep, deviation)
         thin = thin_out(whole)
-        halved, _ = _measure(thin, _ruggedness(thin, apart, deviation), None, deviation)
+        halved, _ = _measure(thin, _ruggedness(thin, numerics, deviation), None, deviation)
         samples = plane.grid().reshape(-1, plane.dim)
         asked = len(samples) if objective.beyond_box else int(in_box(objective.space, samples).sum())
         loss, episodes = whole["loss"].to_numpy(), asked + EVALUATIONS_PER_PAIR * steep.checked
@@ -244,9 +243,9 @@ def _dataset(plane: Plane, loss: Array, grad: Array, status: Array) -> xr.Datase
     return xr.Dataset(columns, attrs=about)
 
 
-def _ruggedness(dataset: xr.Dataset, apart: float, deviation: float) -> Ruggedness:
-    floor, noise = (noise_floor(one, dataset["loss"].size) for one in (apart, deviation))
-    return ruggedness(dataset, floor=floor, noise=noise, estimate=_alone)
+def _ruggedness(dataset: xr.Dataset, numerics: float, deviation: float) -> Ruggedness:
+    noise = noise_floor(deviation, dataset["loss"].size)
+    return ruggedness(dataset, floor=max(noise, numerics), noise=noise, estimate=_alone)
 
 
 def _measure(dataset: xr.Dataset, found: Ruggedness, steep: Jumps | None, deviation: float) -> tuple[Array, Verdict]:

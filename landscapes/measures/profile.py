@@ -117,8 +117,7 @@ class Profile:
 
     def _describe_source(self) -> str:
         """Say that the floor is not that of repeats."""
-        numerical = self.floor is not None and self.floor.deviation > np.nan_to_num(self.noise.deviation)
-        return ", that of numerics" if numerical else ""
+        return ", that of numerics" if self.floor and self.losses.floor == counted_from(self.floor) else ""
 
 
 def effort(rank: int, points: int, shape: Sequence[int] = (), replicas: int = 0) -> tuple[int, int]:
@@ -172,7 +171,7 @@ def measure_profile(
     numerics = floor_of(dataset) or find_floor(objective, dataset, seed=seed)
     samples = dataset["loss"].size
     noisy = float(np.nan_to_num(fuzz.floor(samples)))
-    floor = max(noisy, counted_from(numerics, samples))
+    floor = max(noisy, counted_from(numerics))
     found = ruggedness(dataset, floor=floor, noise=noisy)
     least = [max(floor, half_step(found.range, plane.resolution))]
     most = PAIRS_PER_POINT * points

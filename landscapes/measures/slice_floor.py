@@ -19,9 +19,9 @@ from ..objective import Evaluation, Objective, Status
 from ..space import sobol
 from ..statistics import Values
 from .floor import MIN_POINTS, Floor, evaluate_replicas, floor_between, point_deviations, replica_cosines
-from .noise import noise_floor
 from .ruggedness import span
 
+APART = 4.0  # standard deviations from trough to peak: numerics' differences are waves (2.8), no independent draws
 ATTRIBUTE = "floor"  # the attribute of a slice, and of its map, that holds the record
 OF = "slice"  # the attribute of a map that says of which slice it is
 SAMPLES_EACH, MOST_POINTS = 10, 16  # samples of a slice for each evaluation of a replica; points of a slice
@@ -40,12 +40,9 @@ def floor_attribute(floor: Floor) -> dict[str, str]:
     return {ATTRIBUTE: json.dumps(to_json(floor))}
 
 
-def counted_from(floor: Floor | None, samples: int) -> float:
-    """Return how far apart numerics alone should put the extremes of so many samples [loss unit]; 0 where unknown.
-
-    It is the multiple of a standard deviation that noise has: `noise_floor`.
-    """
-    return 0.0 if floor is None else float(np.nan_to_num(noise_floor(floor.deviation, samples)))
+def counted_from(floor: Floor | None) -> float:
+    """Return how far numerics alone should put losses apart [loss unit]; 0 where unknown."""
+    return 0.0 if floor is None else float(np.nan_to_num(APART * floor.deviation))
 
 
 def refuse_without_replicas(objective: Objective, *, refined: bool) -> None:
