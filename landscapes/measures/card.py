@@ -215,12 +215,6 @@ def _row(one: Grade) -> Sequence[Any]:
     return (one.scene, one.engine, one.verdict, *counts, one.cause, one.finding, off, round(one.seconds, 1), one.check)
 
 
-def describe_error(one: ClosedFormError) -> str:
-    """Say how far gradients are from the closed form's."""
-    most = f" (95 % of points: below {describe_share(one.upper)})" if one.upper >= ROUNDED else ""
-    return f"{describe_share(one.median)}{most}"
-
-
 def describe_share(value: float) -> str:
     """Write a share in percent, with a digit where it is small, and one of more than ten times the whole as a factor.
 
