@@ -72,7 +72,7 @@ MAX_DRAWING_SHARE = 0.1  # of the time, for pictures of an unfinished slice
 FIRST_PICTURE_SECONDS = 3.0  # no intermediate picture of slices that are faster than this
 MAX_NAME_LETTERS = 40  # letters of a folder's name that say along what a slice was cut
 JOINED = "joined"  # in the identity of a slice that was cut between points: their names
-# draw(dataset, width=None, floor=None): a slice with its map of the numerical floor, for a screen or a page so wide [mm]
+# draw(dataset, width=None, floor=None): a slice with its map of the numerical floor, for a screen or a page [mm]
 Draw = Callable[..., "Figure"]
 
 
