@@ -12,8 +12,8 @@ Christiansen, Chemical Engineering Progress 44, 157, 1948), and what slippery wa
 below the surface a cube is slower, since syrup has to flow over it: what is above it is thin (a film of h lets it sink
 at about h^3 p / (600 mm^2 x 3 viscosity)).
 
-    python benchmarks/drag.py --resolution 16 --width 0.2
-    python benchmarks/drag.py --resolution 32 --width 0.4 --device cuda
+    python -m benchmarks.drag --resolution 16 --width 0.2
+    python -m benchmarks.drag --resolution 32 --width 0.4 --device cuda
 """
 
 from __future__ import annotations
