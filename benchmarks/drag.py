@@ -101,9 +101,9 @@ def heights(
         return np.array([float(scene._center(place)[0, 1]) for place in places])
 
 
-def known_speed(viscosity: float, width: float, depth: float) -> float:
-    """Return how fast a cube heavier by EXCESS sinks in the middle of a square tank [m/s]."""
-    return float(SHAPE * wall_factor(width, depth) * 2 / 9 * EXCESS * fluid.GRAVITY * RADIUS**2 / viscosity)
+def known_speed(viscosity: float, width: float, depth: float, excess: float = EXCESS) -> float:
+    """Return how fast a cube so much heavier than syrup [kg/m^3] sinks in the middle of a square tank [m/s]."""
+    return float(SHAPE * wall_factor(width, depth) * 2 / 9 * excess * fluid.GRAVITY * RADIUS**2 / viscosity)
 
 
 def wall_factor(width: float, depth: float) -> float:

@@ -131,7 +131,7 @@ def describe_settings(options: Mapping[str, Any]) -> str:
 
 
 FLOAT32 = torch.finfo(torch.float32).max
-SHORTER = (0.01, 0.02)  # by which the time steps of replicas are shorter: longer ones might be unstable
+SHORTER = (0.01, 0.02)  # shares by which replicas shorten the time step; a longer step might be unstable
 PROBES = 8  # points besides the centre that are tried where a whole batch raised
 
 

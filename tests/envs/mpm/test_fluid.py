@@ -2,9 +2,9 @@
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
+from benchmarks.drag import known_speed
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -111,42 +111,19 @@ def test_a_cube_half_as_heavy_as_syrup_floats_half_in_and_leaves_the_surface_sti
     assert float((end - start)[:syrup][top, 1].abs().max()) < 1e-3
 
 
-def known_speed(viscosity, width=0.2, depth=0.2):
-    """Return how fast a cube sinks that is 470 kg/m^3 heavier than the syrup, in the middle of a square tank [m/s].
-
-    A cube sinks 0.92 times as fast as the sphere of its volume (Pettyjohn & Christiansen 1948), of which Stokes' law
-    is known. Slippery walls reflect (Happel & Brenner 1965, chapter 7): the body has images of the same force beside
-    it, and of the opposite force below the floor and above the surface, whose velocity is a sum over waves.
-    """
-    radius = fluid.CUBE_EDGE * (3 / (4 * np.pi)) ** (1 / 3)
-    terms, blur = 40, 0.02  # of the sum; how wide the force is spread [m], to the first order of no influence
-    counts = (terms, int(terms * 2 * depth / width) + 1)
-    across, up = (
-        2 * np.pi / length * np.arange(-count, count + 1)
-        for length, count in zip((width, 2 * depth), counts, strict=True)
-    )
-    kx, ky, kz = np.meshgrid(across, up, across, indexing="ij")
-    square = kx**2 + ky**2 + kz**2
-    square[square == 0] = np.inf
-    waves = (1 - np.cos(ky * depth)) * (1 - ky**2 / square) / square * np.exp(-square * blur**2)
-    alone = 1 / (6 * np.pi**1.5 * blur)
-    walls = 1 + 6 * np.pi * radius * (waves.sum() / (2 * depth * width**2) - alone)
-    return 0.92 * walls * 2 / 9 * 470.0 * GRAVITY * radius**2 / viscosity
-
-
 def test_a_heavy_cube_sinks_and_a_light_one_rises(speeds):
     for viscosity in (30.0, 60.0):
         assert speeds[viscosity, 1800.0][0] < -0.001
         assert speeds[viscosity, 860.0][0] > 0.001
     # A neutral one stays: what drives it is less than a twentieth of the weight of syrup that it displaces.
-    assert abs(speeds[30.0, SYRUP_DENSITY][0]) < 0.05 * SYRUP_DENSITY / 470.0 * known_speed(30.0)
+    assert abs(speeds[30.0, SYRUP_DENSITY][0]) < 0.05 * SYRUP_DENSITY / 470.0 * known_speed(30.0, 0.2, 0.2, 470.0)
 
 
 @pytest.mark.parametrize("viscosity", [30.0, 60.0])
 def test_a_cube_sinks_and_rises_as_fast_as_is_known_of_cubes_between_walls(speeds, viscosity):
     # Half the difference of the two is free of what a neutral cube drifts.
     half = (speeds[viscosity, 860.0][0] - speeds[viscosity, 1800.0][0]) / 2
-    assert half == pytest.approx(known_speed(viscosity), rel=0.1)
+    assert half == pytest.approx(known_speed(viscosity, 0.2, 0.2, 470.0), rel=0.1)
 
 
 def test_a_heavy_cube_that_is_half_in_goes_under(monkeypatch):
