@@ -69,9 +69,12 @@ def _load_file(known: str, path: str) -> ModuleType:
     if (folder := str(Path(path).parent)) not in sys.path:
         sys.path.append(folder)
     sys.modules[known] = module  # dataclasses look there for their own module
+    kept = sys.dont_write_bytecode
+    sys.dont_write_bytecode = True  # bytecode hides an edit of the same length within the same second
     try:
         spec.loader.exec_module(module)
     finally:
+        sys.dont_write_bytecode = kept
         del sys.modules[known]
     return module
 
