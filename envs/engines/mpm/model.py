@@ -157,6 +157,15 @@ class Box:
         """Number of columns of nodes, along z."""
         return self.nodes[0] * self.nodes[1]
 
+    def around(self, other: "Box") -> "Box":
+        """Return the smallest box that holds this one and another."""
+        spans = [
+            (min(a, b), max(a + n, b + m))
+            for a, n, b, m in zip(self.first, self.nodes, other.first, other.nodes, strict=True)
+        ]
+        (x, y, z), (nx, ny, nz) = zip(*((low, high - low) for low, high in spans), strict=True)
+        return Box((x, y, z), (nx, ny, nz))
+
 
 def place_grid(model: Model, box: Box | None = None) -> Any:
     """Return where a model's grid lies, for the transfer kernels: the nodes in `box`, or all."""

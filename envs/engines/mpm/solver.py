@@ -304,7 +304,7 @@ WHOLE_EPISODE = 300e6  # bytes up to which a CPU stores an episode whole
 LAUNCHES = 200_000  # particles up to which launches cost a GPU more than what they launch
 LEFT = 0.15, 6e9  # part of a GPU's free memory, and bytes of it, that control steps leave, whichever is less
 STEPWISE = ("forward", "backward")  # launches that work on what a control step stores, whose keys name it second
-GRAIN = 4  # nodes to which the boxes of so few are rounded, so that the same ones come again
+GRAIN = 4  # nodes to which boxes of columns are rounded, so that the same ones come again
 
 
 def capacity(model: Model, device: str) -> int:
@@ -372,6 +372,7 @@ class Solver:
         smooth = [b for b, group in enumerate(model.groups) if group.material.smoothing]
         self.smoothers = [(ColumnSmoother if columns else Smoother)(self, b) for b in smooth]
         self.boxes = [Box((0, 0, 0), model.nodes)] * model.steps
+        self.widest: list[Box | None] = [None] * model.steps  # by columns, which holds those of all batches so far
         self.margins = [BOX_MARGIN] * model.steps  # cells around the particles, as each step has needed so far
         self.touched = [model.touched] * model.steps  # nodes of which grids hold no others, by columns, likewise
         self.most = Sizes(0, 0, 0)  # columns and segments of any step: boxes differ more than what is in them
@@ -465,9 +466,8 @@ class Solver:
         Take the corners between which they are at its beginning [m], shape (3,), and return those of its end.
         """
         whole = Box((0, 0, 0), self.model.nodes)
-        grain = GRAIN if self.device != "cpu" and self.small(batch) else 1
         while True:
-            box = nodes_around(self.model, low, high, self.margins[step], grain)
+            box = self._place_box(step, low, high)
             self.set_box(step, box)
             self.advance(step, batch)
             self.extent.find(self.end.x, self.left_box, self.needed, batch, small=self.small(batch))
@@ -482,6 +482,19 @@ class Solver:
         if left:
             to_torch(self.escaped)[:batch] += to_torch(self.left_box)[:batch]
         return corners[0], corners[1]
+
+    def _place_box(self, step: int, low: np.ndarray, high: np.ndarray) -> Box:
+        """Return the nodes for a control step whose particles begin between two corners [m], shape (3,).
+
+        By columns it holds those of earlier batches too: launches are prepared for a box, which costs Python more than
+        empty columns cost a GPU. A batch that needs the whole grid, of an exploded body perhaps, widens no later box.
+        """
+        if not self.columns:
+            return nodes_around(self.model, low, high, self.margins[step])
+        box, before = nodes_around(self.model, low, high, self.margins[step], GRAIN), self.widest[step]
+        if box.nodes != self.model.nodes:
+            box = self.widest[step] = box if before is None else box.around(before)
+        return box
 
     def _sort(self, step: int, batch: int) -> None:
         """Bring the particles at a control step's end into the order of the next one."""

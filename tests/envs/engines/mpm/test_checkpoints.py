@@ -80,6 +80,22 @@ def test_an_episode_is_the_same_after_one_elsewhere(materials, columns):
     assert torch.equal(gradient, fresh[2])
 
 
+def test_by_columns_boxes_of_nodes_hold_those_of_all_batches_but_exploded_ones():
+    """So that launches that were prepared for one batch serve the next, which has other parameters."""
+    model, paths = kneading()
+    solver = Solver(model, capacity=3, device="cpu", columns=True)
+    x, boxes = to_torch(solver.checkpoints[0].x), list[list[Box]]()
+    start = x.clone()
+    for moved in (0.0, 0.25, 0.0, 0.1, torch.nan, 0.25):
+        x[:] = start + torch.tensor([moved, 0.0, 0.0])
+        solver.run(paths)
+        boxes.append(solver.boxes[1:])
+    first, second, again, between, exploded, last = boxes
+    assert first != second == again == between == last
+    assert Box((0, 0, 0), model.nodes) not in last
+    assert set(exploded) == {Box((0, 0, 0), model.nodes)}
+
+
 @pytest.mark.parametrize("columns", [False, True])
 @pytest.mark.parametrize("pieces", [2, 3, 100])
 def test_a_control_step_in_pieces_gives_the_same_bits(pieces, columns):
