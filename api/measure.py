@@ -281,12 +281,13 @@ def bench(
     second_engine: str | None = None,
     batch: Annotated[Sequence[int], at_least(1)] = (),
     seconds: Annotated[float, at_least(0)] = 10.0,
+    same_points: bool = False,
     **keywords: Unpack[SceneKeywords],
 ) -> Bench:
     """Measure episodes per second, with and without gradients, and where the time goes.
 
-    Rates are the best of alternating repetitions. With --second-engine the engines alternate too, so that ratios come
-    from one run. It writes no file.
+    Rates are the median of alternating repetitions, each at other points of the box. With --second-engine the engines
+    alternate too, so that ratios come from one run. It writes no file.
 
     Raises ValueError for an engine that the scene does not have, TooLargeError for a batch that does not fit.
 
@@ -300,6 +301,8 @@ def bench(
         Batch size in episodes. It may be repeated; the default is 1 and the preferred batch of the environment.
     seconds
         Approximate time to spend on each batch size [s].
+    same_points
+        Evaluate the same points in every repetition, to compare kernels alone.
     """
     spec = spec_of(scene, keywords)
     if second_engine is not None:
@@ -307,5 +310,8 @@ def bench(
     from ..jobs.bench import BenchJob
 
     call = current()
-    job = BenchJob.of(spec.resolve(call.watch), against=second_engine, batches=sorted(set(batch)), seconds=seconds)
+    job = BenchJob.of(
+        spec.resolve(call.watch), against=second_engine, batches=sorted(set(batch)), seconds=seconds,
+        same_points=same_points,
+    )  # fmt: skip
     return job.run(call.watch)

@@ -42,6 +42,7 @@ def _subject(found: Bench) -> str:
     unit = work.unit + "s" * (work.count != 1)
     lines = [
         f"{found.env} · {found.fidelity} · {found.device} ({found.hardware}) · {found.engine}",
+        f"points: {'the same' if found.same_points else 'others'} in each repetition",
         f"an episode: {work.count:,} {unit}, about {size(memory.estimated)}"
         + (f"; {size(memory.measured)} of the GPU" if memory.measured is not None else ""),
     ]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import statistics
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -51,7 +52,7 @@ class Start:
 
 @dataclass(frozen=True)
 class Rate:
-    """Hold the best of some repetitions: `seconds` for a whole batch, and what that is per second."""
+    """Hold the median of some repetitions: `seconds` for a whole batch, and what that is per second."""
 
     seconds: float
     episodes_per_second: float
@@ -140,7 +141,8 @@ class Bench:
     """Hold what was measured of an environment; fields are called as `landscape bench --json` has them.
 
     `start` is by engine, `kernels` by way (forward, with_gradient), None of other engines than Warp. Ratios are of the
-    largest batch, None without another engine. `adapter` is None of engines whose programs are our own.
+    largest batch, None without another engine. `adapter` is None of engines whose programs are our own. Each repetition
+    evaluated points of its own, unless they were the `same_points`.
     """
 
     env: str
@@ -152,6 +154,7 @@ class Bench:
     deterministic: bool
     work: Work
     against: str | None
+    same_points: bool
     start: dict[str, Start]
     memory: MemoryUse
     ratio_forward: float | None
@@ -171,7 +174,8 @@ class BenchJob:
     """An environment to measure on an engine, in turn with another one if `against` names it.
 
     `make` returns the environment for an engine. Each of `batches` (1 and the preferred one by default) is timed for
-    about so many `seconds`.
+    about so many `seconds`, at other points in each repetition: nobody evaluates the same ones twice, and some engines
+    prepare for where bodies are. With the `same_points` kernels alone are compared.
     """
 
     make: Callable[[str], Environment]
@@ -179,6 +183,7 @@ class BenchJob:
     against: str | None = None
     batches: Sequence[int] = ()
     seconds: float = 10.0
+    same_points: bool = False
 
     @classmethod
     def of(cls, scene: SceneSpec, **how: Any) -> BenchJob:
@@ -205,7 +210,7 @@ class BenchJob:
             rates = list[BatchRate]()
             for batch in self.batches or sorted({1, env.preferred_batch}):
                 say(f"timing batches of {batch}")
-                rates += _time_batch(envs, _points(env, batch), self.seconds)
+                rates += _time_batch(envs, batch, self.seconds, same=self.same_points)
             say("timing kernels")
             part, profiled = _points(env, env._rows_per_part(env.preferred_batch)), find_engine(self.engine).profiled
             kernels = tabulate_kernels(env, part) if profiled else None
@@ -224,6 +229,7 @@ class BenchJob:
             deterministic=env.deterministic,
             work=env.work(),
             against=self.against,
+            same_points=self.same_points,
             start=starts,
             memory=MemoryUse(env.memory(), starts[self.engine].bytes_per_episode),
             ratio_forward=largest.ratio_forward if largest else None,
@@ -278,21 +284,25 @@ def _free(env: Environment) -> int:
     return free_memory()
 
 
-def _points(env: Environment, count: int) -> Float[Tensor, "count dim"]:
-    """Return well-spread points of the box, the same for every engine."""
-    return env.space.sobol(count, seed=0)
+def _points(env: Environment, count: int, seed: int = 0) -> Float[Tensor, "count dim"]:
+    """Return well-spread points of the box, others for each seed, the same for every engine."""
+    return env.space.sobol(count, seed=seed)
 
 
-def _time_batch(envs: Mapping[str, Environment], points: Tensor, seconds: float) -> list[BatchRate]:
-    """Time one batch on every engine in turn, forward and with gradient; the first engine's rate holds the ratios."""
+def _time_batch(envs: Mapping[str, Environment], batch: int, seconds: float, *, same: bool) -> list[BatchRate]:
+    """Time a batch on every engine in turn, forward and with gradient, of other points in each round or of the same.
+
+    The first engine's rate holds the ratios.
+    """
+    draw = partial(_points, next(iter(envs.values())), batch)
+    points = draw(0)
     lost = {name: int(env.evaluate(points).failed.sum()) for name, env in envs.items()}  # warms up too
-    calls = {
-        (name, grad): partial(env.evaluate, points, grad=grad) for grad in WAYS.values() for name, env in envs.items()
-    }
-    times = alternate(calls, seconds)
+    calls = {(name, grad): partial(env.evaluate, grad=grad) for grad in WAYS.values() for name, env in envs.items()}
+    times = alternate(calls, seconds, lambda number: points if same else draw(1 + number))
     found = []
     for name, env in envs.items():
-        forward, sloped = (Rate.of(env, len(points), min(times[name, grad])) for grad in WAYS.values())
+        seconds_of = [statistics.median(times[name, grad]) for grad in WAYS.values()]
+        forward, sloped = (Rate.of(env, len(points), one) for one in seconds_of)
         costs = sloped.seconds / forward.seconds
         found.append(BatchRate(name, len(points), lost[name], len(times[name, True]), forward, sloped, costs))
     for other in found[1:]:
@@ -304,14 +314,20 @@ def _time_batch(envs: Mapping[str, Environment], points: Tensor, seconds: float)
     return found
 
 
-def alternate(calls: Mapping[K, Callable[[], object]], seconds: float) -> dict[K, list[float]]:
-    """Return the seconds that calls took, made in turn (a, b, a, b, ...) until the next round would end too late."""
+def alternate(
+    calls: Mapping[K, Callable[[Tensor], object]], seconds: float, draw: Callable[[int], Tensor]
+) -> dict[K, list[float]]:
+    """Return the seconds that calls took, made in turn (a, b, a, b, ...) until the next round would end too late.
+
+    All calls of a round take what `draw` gives for its number, which is drawn before their time begins.
+    """
     times: dict[K, list[float]] = {key: [] for key in calls}
     start, rounds = time.perf_counter(), 0
     while rounds < LEAST or (time.perf_counter() - start) * (rounds + 1) / rounds < seconds:
+        points = draw(rounds)
         for key, call in calls.items():
             began = time.perf_counter()
-            call()
+            call(points)
             times[key].append(time.perf_counter() - began)
         rounds += 1
     return times
@@ -343,10 +359,13 @@ def _time_adapter(env: Environment, seconds: float) -> AdapterShare | None:
         engine = env.engine_call(points, grad=grad)
         if engine is None:
             return None
-        calls: dict[str, Callable[[], object]] = {"ours": partial(env.evaluate, points, grad=grad), "engine": engine}
+        calls: dict[str, Callable[[Tensor], object]] = {
+            "ours": partial(env.evaluate, grad=grad),
+            "engine": lambda _, program=engine: program(),  # type: ignore[misc] # of these points alone
+        }
         for call in calls.values():
-            call()
-        times = alternate(calls, seconds)
+            call(points)
+        times = alternate(calls, seconds, lambda _: points)
         shares[way] = max(0.0, 1 - min(times["engine"]) / min(times["ours"]))
     return AdapterShare(len(points), **shares)
 

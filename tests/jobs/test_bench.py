@@ -1,5 +1,6 @@
 """What a benchmark says is what was measured: rates, ratios, kernels, the sampler's share."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -88,12 +89,32 @@ def test_batches_are_repeated_for_the_seconds_given_and_twice_at_least(report):
     assert [row["repetitions"] for row in report["rates"]] == [6, 6, 2, 2]  # rounds of 0.03 s and of 0.24 s
 
 
-def test_the_best_repetition_counts(monkeypatch):
+def test_the_median_of_repetitions_counts(monkeypatch):
     monkeypatch.setattr(
-        "gradscape.jobs.bench.alternate", lambda calls, seconds: {key: [3.0, 1.0, 2.0] for key in calls}
+        "gradscape.jobs.bench.alternate", lambda calls, seconds, draw: {key: [4.0, 1.0, 2.0] for key in calls}
     )
     (row,) = BenchJob(sleeper, "warp", batches=[1]).run().record()["rates"]
-    assert (row["forward"]["seconds"], row["with_gradient"]["seconds"], row["repetitions"]) == (1.0, 1.0, 3)
+    assert (row["forward"]["seconds"], row["with_gradient"]["seconds"], row["repetitions"]) == (2.0, 2.0, 3)
+
+
+@pytest.mark.parametrize("same", [False, True])
+def test_every_repetition_has_points_of_its_own_and_both_engines_the_same(monkeypatch, same):
+    seen = {"warp": [], "taichi": []}
+
+    class Seen(Sleeper):
+        def _evaluate(self, x, *, grad):
+            if len(x) == 8:
+                seen[self.engine].append((grad, x.clone()))
+            return super()._evaluate(x, grad=grad)
+
+    monkeypatch.setattr("gradscape.jobs.bench.time", CLOCK)
+    job = BenchJob(lambda engine: Seen(engine=engine), "warp", against="taichi", batches=[8], seconds=1.0)
+    assert replace(job, same_points=same).run().same_points == same
+    for (_, ours), (_, theirs) in zip(*seen.values(), strict=False):
+        assert torch.equal(ours, theirs)
+    sloped = [x for grad, x in seen["warp"] if grad]
+    assert len(sloped) > 3
+    assert len({float(x.sum()) for x in sloped}) == (1 if same else len(sloped))
 
 
 def test_failures_are_counted(report):
@@ -130,15 +151,16 @@ def test_what_is_not_the_engines_own_program_is_the_adapters(report, monkeypatch
 
 def test_calls_take_turns_and_are_repeated_whatever_they_take():
     made = []
-    times = alternate({"a": lambda: made.append("a"), "b": lambda: made.append("b")}, seconds=0.0)
-    assert made == ["a", "b", "a", "b"]
+    calls = {name: lambda number, name=name: made.append((name, number)) for name in "ab"}
+    times = alternate(calls, 0.0, lambda number: number)
+    assert made == [("a", 0), ("b", 0), ("a", 1), ("b", 1)]
     assert {key: len(found) for key, found in times.items()} == {"a": 2, "b": 2}
 
 
 def test_calls_end_before_a_round_would_end_too_late(monkeypatch):
     clock = Clock()
     monkeypatch.setattr("gradscape.jobs.bench.time", clock)
-    times = alternate({"a": lambda: clock.sleep(1.0), "b": lambda: clock.sleep(2.0)}, seconds=10.0)
+    times = alternate({"a": lambda _: clock.sleep(1.0), "b": lambda _: clock.sleep(2.0)}, 10.0, lambda number: number)
     assert times == {"a": [1.0] * 3, "b": [2.0] * 3}
 
 
