@@ -159,6 +159,10 @@ class Evaluation:
         error = self.error if bool((status == Status.ERROR).any()) else ""
         return Evaluation(self.loss[rows], None if self.grad is None else self.grad[rows], status, error)
 
+    def without_gradients(self) -> Evaluation:
+        """Return what would be there had gradients not been asked for: none is missing."""
+        return Evaluation.from_results(self.loss, None, self.status, self.error)
+
     @classmethod
     def raised(cls, error: Exception, *, dim: int, grad: bool) -> Evaluation:
         """Return the evaluation of one point at which the simulation raised."""

@@ -7,7 +7,7 @@ searches want evaluated make one batch; computations run in worker processes, si
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, TypeVar
 
@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..landscapes.objective import Objective
+from ..landscapes.objective import Evaluation, Objective
 from ..landscapes.sampling.memory import MemoryBound
 from .processes import WorkerProcesses
 
@@ -38,6 +38,10 @@ class Evaluate:
     def answer(self, objective: Objective, x: Float[Tensor, "batch dim"]) -> Callable[[slice], Any]:
         """Return a function that returns the results of some rows of `x`, of which this request is a part."""
         return objective.evaluate(x, grad=self.grad).rows
+
+    def own(self, found: Evaluation) -> Evaluation:
+        """Return the part of an evaluation, which may have gradients, that was asked for."""
+        return found if self.grad else found.without_gradients()
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,18 +153,36 @@ class Lockstep:
                 self._answer(number, value, seconds)
 
     def _evaluate(self) -> None:
-        """Answer what is asked of the objective, a batch for each kind."""
+        """Answer what is asked of the objective, a batch for each kind, or losses with the gradients of others."""
         asked = {n: one for n, one in sorted(self._asked.items()) if not isinstance(one, Compute)}
         answers = dict[int, tuple[Any, float]]()
-        for kind in sorted({one.kind for one in asked.values()}):
-            group = {number: one for number, one in asked.items() if one.kind == kind}
+        for group in self._batches(asked):
             x, began = torch.cat([one.x for one in group.values()]), time.perf_counter()
-            take, start = next(iter(group.values())).answer(self._bound, x), 0
+            first = max(group.values(), key=lambda one: one.kind)  # which asks for gradients, if one does
+            take, start = first.answer(self._bound, x), 0
             seconds = (time.perf_counter() - began) / len(x)
             for number, one in group.items():
-                answers[number] = take(slice(start, start := start + len(one.x))), seconds * len(one.x)
+                found = take(slice(start, start := start + len(one.x)))
+                answers[number] = one.own(found) if isinstance(one, Evaluate) else found, seconds * len(one.x)
         for number in sorted(answers):
             self._answer(number, *answers[number])
+
+    def _batches(self, asked: Mapping[int, Evaluate | Observe]) -> list[dict[int, Evaluate | Observe]]:
+        """Return what makes a batch each: requests of a kind, and on a GPU that is not full all losses together.
+
+        There it takes one sequence of launches less, and gradients that nobody asked for take no time of their own.
+        """
+        evaluated = [one for one in asked.values() if isinstance(one, Evaluate)]
+        rows = sum(len(one.x) for one in evaluated)
+        together = self.objective.device == "cuda" and rows <= self.objective.preferred_batch
+        kinds = {
+            number: one.kind[:1] if together and isinstance(one, Evaluate) else one.kind
+            for number, one in asked.items()
+        }
+        return [
+            {number: asked[number] for number, kind in kinds.items() if kind == one}
+            for one in sorted(set(kinds.values()))
+        ]
 
 
 def answer_alone(asking: Asking[Result], objective: Objective | None) -> Result:

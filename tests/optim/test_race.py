@@ -82,6 +82,29 @@ def test_runs_in_lockstep_are_those_of_each_alone():
     assert len(objective.batches) < BUDGET * 2  # a run that has ended is not waited for
 
 
+def test_on_a_gpu_that_is_not_full_losses_are_evaluated_with_the_gradients_of_others():
+    """A row whose loss alone was wanted does not fail for a gradient that it lacks."""
+
+    class Edged(Bowl):
+        device, preferred_batch = "cuda", 1000
+
+        def evaluate(self, x, *, grad=True):
+            found = super().evaluate(x, grad=grad)
+            return Evaluation.from_results(
+                found.loss, found.grad.masked_fill(x[:, :1] < 0, torch.nan) if grad else None, found.status
+            )
+
+    apart, objective, entries = field(), Edged(), field()
+    for entry in apart:
+        search(Edged(), entry.make(), entry.run, budget=BUDGET, gradient_cost=2.0)
+    race(objective, entries, budget=BUDGET, gradient_cost=2.0)
+    assert bits(entries) == bits(apart)
+    assert objective.batches[0] == 2 * (16 + 6 + 4)
+    status = {entry.method: set(entry.run.dataset()["status"].to_numpy().tolist()) for entry in entries}
+    assert Status.NO_GRADIENT in status["descents"]
+    assert Status.NO_GRADIENT not in status["random"] | status["cma-es"]
+
+
 @pytest.mark.parametrize("abreast", [1, 4])
 def test_more_runs_than_go_on_abreast_take_turns(monkeypatch, abreast):
     monkeypatch.setattr("gradscape.optim.race.MAX_ABREAST", abreast)
