@@ -5,6 +5,7 @@ from __future__ import annotations
 import abc
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -63,6 +64,9 @@ class MjxScene(Environment):
     numbers are varied; `duration` [s]; `segments`, how many times controls are held; and `loss_of(state)`, the loss of
     the last state, a JAX number, from its `qpos`, `qvel`, `xpos` and others. A row that ends in numbers that are not
     finite has failed. Loss and gradient come from two programs, so that losses are the same with gradients and without.
+
+    What JAX traces of scenes of this package is kept for other processes. What somebody's `loss_of` reads nobody knows,
+    so theirs are traced in each process, and only what XLA compiles is kept.
     """
 
     model_version = 1
@@ -101,39 +105,60 @@ class MjxScene(Environment):
 
     def work(self) -> Work:
         """Count steps of bodies."""
-        return Work(self.steps * max(1, self._rollout.host.nbody - 1), "body-step")
+        return Work(self.steps * max(1, self._model.host.nbody - 1), "body-step")
 
     def episode(self, x: Float[Tensor, " dim"]) -> Episode:
         """Return where geoms are during the episode at one point."""
-        at, turn = self._rollout.frames(self._row(x)[0].numpy(), self._course)
+        at, turn = self._model.frames(lambda row: self._rollout.frames(row), self._row(x)[0].numpy(), self._key)
         rows = np.unique(np.linspace(0, len(at) - 1, FRAMES).round().astype(int))
         time = torch.from_numpy(rows * self.fidelity.dt)
-        return draw(time, torch.from_numpy(at[rows]), torch.from_numpy(turn[rows]), self._rollout.geoms())
+        return draw(time, torch.from_numpy(at[rows]), torch.from_numpy(turn[rows]), self._model.geoms())
 
     def act(self, model: Any, state: Any, control: Any) -> Any:
         """Return the state at the start of a segment with its controls, shape (actuator,)."""
         return state.replace(ctrl=control)
 
     def _setup(self) -> None:
-        o, solver = self.options, self._engine("rollout")
+        o, solver = self.options, self._engine("model")
         settings = solver.Settings(self.fidelity.dt, o.solver, o.iterations, o.ls_iterations)
-        self._rollout = solver.Rollout(self.mjcf, settings, self.fidelity.precision, name=self.name)
+        self._model = solver.Model(self.mjcf, settings, self.fidelity.precision, name=self.name)
         first = [one for one in self.parameters if one.field != "ctrl"]
         held = [one for one in self.parameters if one.field == "ctrl"]
         turns = [f"t{k} " for k in range(self.segments)] if self.segments > 1 else [""]
         names = [one.name for one in first] + [f"{turn}{one.name}" for turn in turns for one in held]
         bounds = [(one.lower, one.upper, one.unit) for one in (*first, *(held * self.segments))]
         self.space = ParameterSpace(names, *zip(*bounds, strict=True))
-        places = tuple(self._rollout.find(one.field, one.index) for one in (*first, *held))
+        places = tuple(self._model.find(one.field, one.index) for one in (*first, *held))
         each = round(self.duration / self.segments / self.fidelity.dt)
         count, steps = (1, o.count_steps(each)) if self.segments == 1 else (o.count_steps(self.segments), each)
         self._course = solver.Course(places, self.segments, count, steps, OwnMethod(self.act))
+        self._key = self._model.identify(self._course, type(self), o, self.fidelity) if self._is_ours() else ""
+        vars(self).pop("_rollout", None)
+        if not self._key:
+            self._rollout  # noqa: B018 # refuses here and now what MJX cannot simulate
         self._function = solver.JaxFunction(
-            OwnMethod(self._loss), self.space.dim, self.name, self.fidelity.precision, self.preferred_batch, o.mode
+            OwnMethod(self._loss),
+            self.space.dim,
+            self.name,
+            self.fidelity.precision,
+            self.preferred_batch,
+            o.mode,
+            key=self._key,
         )
 
+    @cached_property
+    def _rollout(self) -> Any:
+        """What MJX simulates, which only tracing needs."""
+        return self._engine("rollout").Rollout(self._model, self._course)
+
+    def _is_ours(self) -> bool:
+        """Say whether all of this scene's code is that of this package."""
+        package = __package__.rpartition(".")[0] + "."
+        kinds = [kind for kind in type(self).__mro__ if issubclass(kind, MjxScene)]
+        return all(one.__module__.startswith(package) for one in (*kinds, self.loss_of, self.act))
+
     def _loss(self, x: Any) -> Any:
-        return self.loss_of(self._rollout.end(x, self._course))
+        return self.loss_of(self._rollout.end(x))
 
     def _prepare(self) -> None:
         for grad in (False, True):
