@@ -27,9 +27,11 @@ from platformdirs import user_cache_path
 from ...landscapes.storage.files import replacing
 from . import IMPORTED_AT, installed_version
 
-MAX_COMPILED = 1 << 29  # bytes of compiled programs, of which JAX deletes those that were not used for longest
+LIMITS = (  # JAX's setting, its default, and ours
+    ("jax_compilation_cache_max_size", -1, 1 << 29),  # bytes; JAX deletes what was not used for longest
+    ("jax_persistent_cache_min_compile_time_secs", 1.0, 0.1),  # [s]; a function of a user's often takes less than 1 s
+)
 MAX_TRACED = 256  # files of traced programs, of about 0.2 MB
-QUICK = 0.1  # what compiles within this time [s] is not worth a file
 UNREADABLE = "Error reading persistent compilation cache entry"
 
 Program = Callable[[Any], Any]  # of one array: an array, or a tuple of several
@@ -47,8 +49,9 @@ def keep_compiled() -> None:
     """
     if jax.config.values["jax_compilation_cache_dir"] is None:
         jax.config.update("jax_compilation_cache_dir", str(user_folder()))
-        jax.config.update("jax_compilation_cache_max_size", MAX_COMPILED)
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", QUICK)
+        for name, usual, ours in LIMITS:
+            if jax.config.values[name] == usual:
+                jax.config.update(name, ours)
 
 
 def compile_lowered(lowered: Any) -> Program:
@@ -95,7 +98,7 @@ def traced(fn: Program, shape: tuple[int, ...], precision: str, key: str) -> Pro
     if program is None:
         try:
             program = replace(export.export(jax.jit(fn))(argument), fun_name="traced")
-        except ValueError:
+        except (ValueError, NotImplementedError):
             return fn  # it holds what JAX does not export; tracing says what else may be wrong
         if program.module_kept_var_idx == (0,) and not (program.ordered_effects or program.unordered_effects):
             _write(path, program)
