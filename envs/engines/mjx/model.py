@@ -137,6 +137,7 @@ def no_numbers(name: str, field: str) -> ValueError:
 
 def load(mjcf: str, name: str) -> Any:
     """Return MuJoCo's model of a file, or of the text of one. Raises ValueError where it cannot be read."""
+    mujoco.mj_clearCache(mujoco.mj_getCache())  # of meshes, which takes one edited within a second for the same
     try:
         if "<" in mjcf:
             return mujoco.MjModel.from_xml_string(mjcf)
