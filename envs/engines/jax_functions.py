@@ -132,12 +132,15 @@ class JaxFunction:
     def _function(self, grad: bool, size: int) -> Callable[[Any], Any]:
         """Return the compiled function of so many points: losses, or losses and gradients."""
         if (grad, size) not in self._compiled:
-            both = jax.value_and_grad if self.mode == "reverse" else _value_and_tangents
-            at: Callable[[Any], Any] = both(self._one) if grad else self._one
-            whole = jax.vmap(at) if self.batch == "vmap" else lambda x: jax.lax.map(at, x)
-            key = f"{self.key} {self.mode} {self.batch} {grad}" if self.key else ""
-            self._compiled[grad, size] = compiled(whole, (size, self.dim), self.precision, key)
+            self._compiled[grad, size] = self._compile(grad, (size, self.dim))
         return self._compiled[grad, size]
+
+    def _compile(self, grad: bool, shape: tuple[int, int]) -> Callable[[Any], Any]:
+        both = jax.value_and_grad if self.mode == "reverse" else _value_and_tangents
+        at: Callable[[Any], Any] = both(self._one) if grad else self._one
+        whole = jax.vmap(at) if self.batch == "vmap" else lambda x: jax.lax.map(at, x)
+        key = f"{self.key} {self.mode} {self.batch} {grad}" if self.key else ""
+        return compiled(whole, shape, self.precision, key)
 
     def _one(self, x: Any) -> Any:
         """Return the loss of one point, held against what it must be."""

@@ -65,8 +65,8 @@ class MjxScene(Environment):
     the last state, a JAX number, from its `qpos`, `qvel`, `xpos` and others. A row that ends in numbers that are not
     finite has failed. Loss and gradient come from two programs, so that losses are the same with gradients and without.
 
-    What JAX traces of scenes of this package is kept for other processes. What somebody's `loss_of` reads nobody knows,
-    so theirs are traced in each process, and only what XLA compiles is kept.
+    What JAX traces of an episode is kept for other processes, unless a class has its own `act`. What somebody's
+    `loss_of` reads nobody knows, so it is traced in each process.
     """
 
     model_version = 1
@@ -132,19 +132,22 @@ class MjxScene(Environment):
         each = round(self.duration / self.segments / self.fidelity.dt)
         count, steps = (1, o.count_steps(each)) if self.segments == 1 else (o.count_steps(self.segments), each)
         self._course = solver.Course(places, self.segments, count, steps, OwnMethod(self.act))
-        self._key = self._model.identify(self._course, type(self), o, self.fidelity) if self._is_ours() else ""
+        known = self._is_ours() or type(self).act is MjxScene.act
+        self._key = self._model.identify(self._course, self.act.__qualname__) if known else ""
         vars(self).pop("_rollout", None)
-        if not self._key:
-            self._rollout  # noqa: B018 # refuses here and now what MJX cannot simulate
-        self._function = solver.JaxFunction(
-            OwnMethod(self._loss),
-            self.space.dim,
-            self.name,
-            self.fidelity.precision,
-            self.preferred_batch,
-            o.mode,
-            key=self._key,
-        )
+        self._function = self._bind(solver)
+
+    def _bind(self, solver: Any) -> Any:
+        """Return the loss as a function of JAX, of which what is known is kept: all, or of somebody's the episode."""
+        how = (self.space.dim, self.name, self.fidelity.precision, self.preferred_batch, self.options.mode)
+        if self._is_ours():
+            key = self._key and repr((self._key, type(self), self.options, self.fidelity))
+            return solver.JaxFunction(OwnMethod(self._loss), *how, key=key)
+        rollout = self._rollout  # refuses here and now what MJX cannot simulate
+        if self._key and self.options.mode == "forward":
+            at_end = self._engine("rollout").LossAtEnd
+            return at_end(OwnMethod(self.loss_of), *how, key=self._key, rollout=rollout)
+        return solver.JaxFunction(OwnMethod(self._loss), *how)
 
     @cached_property
     def _rollout(self) -> Any:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import jax
@@ -10,7 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from mujoco import mjx
 
-from ..jax_functions import computing_in
+from ..jax_functions import JaxFunction, compiled, computing_in
+from ..jax_programs import traced
 from .model import AT_FIRST, CONTROL, Course, Model, Place, no_numbers
 
 STAGES = np.array([[0.0, 1 / 6], [0.5, 1 / 3], [0.5, 1 / 3], [1.0, 1 / 6]])  # of Runge and Kutta: part, share
@@ -31,9 +33,9 @@ class Rollout:
                 self.start = mjx.make_data(model.host)
         except NotImplementedError as error:
             raise ValueError(f"{model.name} holds what MJX cannot simulate: {error}") from error
-        for field, _ in course.places:
-            if field not in (*AT_FIRST, CONTROL) and not hasattr(self.model, field):
-                raise no_numbers(model.name, field)
+        for place, _ in course.places:
+            if place not in (*AT_FIRST, CONTROL) and not hasattr(self.model, place):
+                raise no_numbers(model.name, place)
 
     def end(self, x: Any) -> Any:
         """Return the last state of one parameter vector's episode, with bodies and geoms where they are then."""
@@ -73,21 +75,80 @@ class Rollout:
         """Return the model and the state that parameters ask for, before the first step."""
         own = [place for place in places if place[0] != CONTROL]
         of_state, of_model = dict[str, Any](), dict[str, Any]()
-        for number, (field, at) in enumerate(own):
-            home, source = (of_state, self.start) if field in AT_FIRST else (of_model, self.model)
-            home[field] = home.get(field, getattr(source, field)).at[at].set(x[number])
+        for number, (name, at) in enumerate(own):
+            home, source = (of_state, self.start) if name in AT_FIRST else (of_model, self.model)
+            home[name] = home.get(name, getattr(source, name)).at[at].set(x[number])
         model = self.model.replace(**of_model) if of_model else self.model
         return model, _on_parameters(self.start.replace(**of_state), x)
 
     def _controls(self, x: Any) -> Any:
         """Return the controls of every segment, shape (segment, actuator); those that no parameter sets are zero."""
         course = self.course
-        own = [at[0] for field, at in course.places if field == CONTROL]
+        own = [at[0] for name, at in course.places if name == CONTROL]
         whole = jnp.zeros((course.held, self.controls), dtype=x.dtype)
         if not own:
             return whole
         given = x[len(course.places) - len(own) :].reshape(course.segments, len(own))[: course.held]
         return whole.at[: len(given), jnp.array(own)].set(given)
+
+
+@dataclass(eq=False)
+class LossAtEnd(JaxFunction):
+    """A loss of an episode's last state, `fn`, differentiated forward: the episode is kept, and the loss is not.
+
+    The `key` says all that the episode comes from. What the loss reads nobody knows, and it is traced in each process.
+    """
+
+    rollout: Rollout = field(kw_only=True)
+
+    def _compile(self, grad: bool, shape: tuple[int, int]) -> Callable[[Any], Any]:
+        episode, loss = (self._push_end, self._push_loss) if grad else (self._end, self._loss)
+
+        def whole(x: Any) -> Any:
+            return jax.vmap(loss)(*traced(jax.vmap(episode), shape, self.precision, f"{self.key} {grad}")(x))
+
+        return compiled(whole, shape, self.precision)
+
+    def _end(self, x: Any) -> tuple[Any, ...]:
+        """Return the last state: its real numbers, then its other ones."""
+        real, other = self._split(self.rollout.end(x))
+        return (*real, *other)
+
+    def _push_end(self, x: Any) -> tuple[Any, ...]:
+        """Return the real numbers of the last state, their tangents along each parameter, then its other numbers."""
+
+        def along(direction: Any) -> Any:
+            return jax.jvp(lambda x: self._split(self.rollout.end(x)), (x,), (direction,), has_aux=True)
+
+        real, tangents, other = jax.vmap(along, out_axes=(None, 0, None))(jnp.eye(len(x), dtype=x.dtype))
+        return (*real, *tangents, *other)
+
+    def _loss(self, *numbers: Any) -> Any:
+        count = sum(self._is_real)
+        return self._one(self._join(numbers[:count], numbers[count:]))
+
+    def _push_loss(self, *numbers: Any) -> Any:
+        count = sum(self._is_real)
+        real, tangents, other = numbers[:count], numbers[count : 2 * count], numbers[2 * count :]
+
+        def along(direction: Any) -> Any:
+            return jax.jvp(lambda real: self._one(self._join(real, other)), (real,), (direction,))
+
+        return jax.vmap(along, out_axes=(None, 0))(tangents)
+
+    def _split(self, state: Any) -> tuple[list[Any], list[Any]]:
+        numbers = list(zip(jax.tree.leaves(state), self._is_real, strict=True))
+        return [one for one, real in numbers if real], [one for one, real in numbers if not real]
+
+    def _join(self, real: Iterable[Any], other: Iterable[Any]) -> Any:
+        """Return the state with these numbers."""
+        these, those = iter(real), iter(other)
+        numbers = [next(these if real else those) for real in self._is_real]
+        return jax.tree.unflatten(jax.tree.structure(self.rollout.start), numbers)
+
+    @property
+    def _is_real(self) -> list[bool]:
+        return [bool(jnp.issubdtype(one.dtype, jnp.floating)) for one in jax.tree.leaves(self.rollout.start)]
 
 
 def step(model: Any, state: Any) -> Any:
