@@ -132,7 +132,7 @@ class MjxScene(Environment):
         each = round(self.duration / self.segments / self.fidelity.dt)
         count, steps = (1, o.count_steps(each)) if self.segments == 1 else (o.count_steps(self.segments), each)
         self._course = solver.Course(places, self.segments, count, steps, OwnMethod(self.act))
-        known = self._is_ours() or type(self).act is MjxScene.act
+        known = _of_package(self.act, self._setup)
         self._key = self._model.identify(self._course, self.act.__qualname__) if known else ""
         vars(self).pop("_rollout", None)
         self._function = self._bind(solver)
@@ -140,7 +140,8 @@ class MjxScene(Environment):
     def _bind(self, solver: Any) -> Any:
         """Return the loss as a function of JAX, of which what is known is kept: all, or of somebody's the episode."""
         how = (self.space.dim, self.name, self.fidelity.precision, self.preferred_batch, self.options.mode)
-        if self._is_ours():
+        kinds = [kind for kind in type(self).__mro__ if issubclass(kind, MjxScene)]
+        if _of_package(*kinds, self.loss_of, self.act, self._setup):
             key = self._key and repr((self._key, type(self), self.options, self.fidelity))
             return solver.JaxFunction(OwnMethod(self._loss), *how, key=key)
         rollout = self._rollout  # refuses here and now what MJX cannot simulate
@@ -153,12 +154,6 @@ class MjxScene(Environment):
     def _rollout(self) -> Any:
         """What MJX simulates, which only tracing needs."""
         return self._engine("rollout").Rollout(self._model, self._course)
-
-    def _is_ours(self) -> bool:
-        """Say whether all of this scene's code is that of this package."""
-        package = __package__.rpartition(".")[0] + "."
-        kinds = [kind for kind in type(self).__mro__ if issubclass(kind, MjxScene)]
-        return all(one.__module__.startswith(package) for one in (*kinds, self.loss_of, self.act))
 
     def _loss(self, x: Any) -> Any:
         return self.loss_of(self._rollout.end(x))
@@ -178,6 +173,11 @@ class MjxScene(Environment):
         loss, _, _ = self._function(whole, False)
         slope = self._function(whole, True)[1][: len(x)] if grad else None
         return Evaluation.from_results(loss[: len(x)], slope)
+
+
+def _of_package(*code: Any) -> bool:
+    """Say whether classes and functions are all of this package, whose files are part of what programs are found by."""
+    return all(one.__module__.startswith(__package__.rpartition(".")[0] + ".") for one in code)
 
 
 def draw(

@@ -50,16 +50,23 @@ def test_a_scene_of_ours_is_found_by_what_its_loss_depends_on():
     made = [gs.make(name, device="cpu") for name in ("mjx-drop", "mjx-bounce", "mjx-cartpole")]
     options = ({"fidelity": "standard"}, {"iterations": 1}, {"mode": "reverse"}, {"horizon": 0.5})
     made += [gs.make("mjx-drop", device="cpu", **one) for one in options]
-    keys = [scene._key for scene in made]
+    keys = [scene._function.key for scene in made]
     assert "" not in keys
     assert len(set(keys)) == len(keys)
-    assert gs.make("mjx-drop", device="cpu")._key == keys[0]
+    assert gs.make("mjx-drop", device="cpu")._function.key == keys[0]
 
 
-def test_a_scene_with_code_of_somebodys_is_traced_in_each_process(monkeypatch):
+def test_of_a_scene_with_code_of_somebodys_only_an_episode_of_ours_is_found(monkeypatch):
     """What such code reads nobody knows: constants of a module, files, the time."""
     pytest.importorskip("mujoco.mjx")
-    assert not type("Mine", (Drop,), {"loss_of": lambda self, state: state.qpos[2]})()._key
-    assert not type("Mine", (Drop,), {"act": lambda self, model, state, control: state})()._key
+    mine = type("Mine", (Drop,), {"loss_of": lambda self, state: state.qpos[2]})()
+    assert mine._key == mine._function.key == Drop()._key
+    moved = type("Mine", (Drop,), {"act": lambda self, model, state, control: state})()
+    assert moved._key == moved._function.key == ""
+    reverse = type("Mine", (Drop,), {})(mode="reverse")
+    assert reverse._function.key == ""
+    whole = Drop()._function.key
     monkeypatch.setattr(Drop, "loss_of", lambda self, state: state.qpos[2])
-    assert not Drop()._key
+    assert Drop()._function.key not in (whole, "")
+    monkeypatch.setattr(Drop, "act", lambda self, model, state, control: state)
+    assert Drop()._function.key == ""
