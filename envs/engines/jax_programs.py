@@ -1,4 +1,4 @@
-"""Programs of JAX that the next process finds again: what XLA compiled, and of our own scenes what JAX traced.
+"""Programs of JAX that the next process finds again: what XLA compiled, and of MuJoCo scenes what JAX traced.
 
 JAX keeps what XLA compiled, found by the program itself, the device and the versions of both. Until it can ask for
 that it has to trace the function, which takes seconds where a simulator is long. So a traced program is kept too, as
