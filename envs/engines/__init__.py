@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 
+IMPORTED_AT = time.time()  # a file of ours that is changed later is not what this process runs
 EXTRAS = {"mjx": ("mujoco", "mujoco-mjx", "jax"), "newton": ("newton",)}  # of this package, and what each brings
 
 
@@ -70,7 +72,7 @@ ENGINES = {
             newest_python=(3, 12),
         ),
         Engine("torch", {"collisions": "balls.collisions"}, concurrent=False),  # by autograd
-        Engine("mjx", {"rollout": "mjx.rollout"}, concurrent=False, extra="mjx"),  # MuJoCo in JAX
+        Engine("mjx", {"model": "mjx.model", "rollout": "mjx.rollout"}, concurrent=False, extra="mjx"),  # MuJoCo in JAX
         Engine("newton", {"rollout": "newton.rollout"}, concurrent=False, extra="newton"),  # by Warp's tape
     )
 }

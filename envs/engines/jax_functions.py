@@ -17,6 +17,9 @@ from torch import Tensor
 from ...landscapes.objective import SimulatorError
 from ..user_functions import Backend, Compute, Function
 from .jax_origins import jax_origin
+from .jax_programs import compile_lowered, keep_compiled, traced
+
+keep_compiled()
 
 GROWTH = 4
 _TRACED: dict[str, str] = {}  # the precision that JAX has last traced a function in
@@ -75,7 +78,8 @@ class JaxFunction:
     """A JAX function of one point, compiled for batches of several sizes, losses alone and with gradients.
 
     At most `rows` points are in one call, and smaller batches are padded to the next power of four. `mode` is reverse
-    or forward differentiation, `batch` is vmap or map.
+    or forward differentiation, `batch` is vmap or map. A `key` says all that `fn` computes from: what is traced is kept
+    under it, and other processes do not call `fn`.
     """
 
     fn: Callable[[Any], Any]
@@ -85,6 +89,7 @@ class JaxFunction:
     rows: int
     mode: str = "reverse"
     batch: str = "vmap"
+    key: str = ""
 
     def __post_init__(self) -> None:
         self._compiled: dict[tuple[bool, int], Callable[[Any], Any]] = {}
@@ -106,6 +111,7 @@ class JaxFunction:
         with computing_in(self.precision), self._explained():
             found = self._function(grad, size)(jnp.asarray(padded, dtype=self.precision))
         loss, slope = found if grad else (found, None)
+        self._type = str(loss.dtype)
         return _tensor(loss)[: len(x)], None if slope is None else _tensor(slope)[: len(x)]
 
     def engine_call(self, x: Float[Tensor, "batch dim"], *, grad: bool) -> Callable[[], object]:
@@ -126,11 +132,15 @@ class JaxFunction:
     def _function(self, grad: bool, size: int) -> Callable[[Any], Any]:
         """Return the compiled function of so many points: losses, or losses and gradients."""
         if (grad, size) not in self._compiled:
-            both = jax.value_and_grad if self.mode == "reverse" else _value_and_tangents
-            at: Callable[[Any], Any] = both(self._one) if grad else self._one
-            whole = jax.vmap(at) if self.batch == "vmap" else lambda x: jax.lax.map(at, x)
-            self._compiled[grad, size] = compiled(whole, (size, self.dim), self.precision)
+            self._compiled[grad, size] = self._compile(grad, (size, self.dim))
         return self._compiled[grad, size]
+
+    def _compile(self, grad: bool, shape: tuple[int, int]) -> Callable[[Any], Any]:
+        both = jax.value_and_grad if self.mode == "reverse" else _value_and_tangents
+        at: Callable[[Any], Any] = both(self._one) if grad else self._one
+        whole = jax.vmap(at) if self.batch == "vmap" else lambda x: jax.lax.map(at, x)
+        key = f"{self.key} {self.mode} {self.batch} {grad}" if self.key else ""
+        return compiled(whole, shape, self.precision, key)
 
     def _one(self, x: Any) -> Any:
         """Return the loss of one point, held against what it must be."""
@@ -149,7 +159,6 @@ class JaxFunction:
             )
         if not jnp.issubdtype(loss.dtype, jnp.floating):
             raise SimulatorError(f"{self.name} must return a floating-point loss; got {loss.dtype}")
-        self._type = str(loss.dtype)
         return loss
 
     @contextmanager
@@ -205,20 +214,14 @@ def computing_in(name: str) -> Iterator[None]:
         yield
 
 
-def compiled(fn: Callable[[Any], Any], shape: tuple[int, ...], precision: str) -> Callable[[Any], Any]:
+def compiled(fn: Callable[[Any], Any], shape: tuple[int, ...], precision: str, key: str = "") -> Callable[[Any], Any]:
     """Return the compiled function of an array of one shape, in the precision that JAX computes in now.
 
-    XLA's newer emitters of code for CPUs take twice as long to compile a simulator's many small operations, which are
-    no faster then.
+    What was traced under a `key`, by this process or another one, is not traced again.
     """
     _forget_other_precision(precision)
-    lowered = jax.jit(fn).lower(jax.ShapeDtypeStruct(shape, precision))
-    try:
-        return lowered.compile({"xla_cpu_use_fusion_emitters": False})
-    except jax.errors.JaxRuntimeError as error:
-        if "No such compile option" not in str(error):
-            raise
-        return lowered.compile()  # another version of XLA
+    program = traced(fn, shape, precision, key) if key else fn
+    return compile_lowered(jax.jit(program).lower(jax.ShapeDtypeStruct(shape, precision)))
 
 
 def _forget_other_precision(name: str) -> None:

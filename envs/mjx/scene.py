@@ -5,6 +5,7 @@ from __future__ import annotations
 import abc
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -63,6 +64,9 @@ class MjxScene(Environment):
     numbers are varied; `duration` [s]; `segments`, how many times controls are held; and `loss_of(state)`, the loss of
     the last state, a JAX number, from its `qpos`, `qvel`, `xpos` and others. A row that ends in numbers that are not
     finite has failed. Loss and gradient come from two programs, so that losses are the same with gradients and without.
+
+    What JAX traces of an episode is kept for other processes, unless a class has its own `act`. What somebody's
+    `loss_of` reads nobody knows, so it is traced in each process.
     """
 
     model_version = 1
@@ -101,39 +105,58 @@ class MjxScene(Environment):
 
     def work(self) -> Work:
         """Count steps of bodies."""
-        return Work(self.steps * max(1, self._rollout.host.nbody - 1), "body-step")
+        return Work(self.steps * max(1, self._model.host.nbody - 1), "body-step")
 
     def episode(self, x: Float[Tensor, " dim"]) -> Episode:
         """Return where geoms are during the episode at one point."""
-        at, turn = self._rollout.frames(self._row(x)[0].numpy(), self._course)
+        at, turn = self._model.frames(lambda row: self._rollout.frames(row), self._row(x)[0].numpy(), self._key)
         rows = np.unique(np.linspace(0, len(at) - 1, FRAMES).round().astype(int))
         time = torch.from_numpy(rows * self.fidelity.dt)
-        return draw(time, torch.from_numpy(at[rows]), torch.from_numpy(turn[rows]), self._rollout.geoms())
+        return draw(time, torch.from_numpy(at[rows]), torch.from_numpy(turn[rows]), self._model.geoms())
 
     def act(self, model: Any, state: Any, control: Any) -> Any:
         """Return the state at the start of a segment with its controls, shape (actuator,)."""
         return state.replace(ctrl=control)
 
     def _setup(self) -> None:
-        o, solver = self.options, self._engine("rollout")
+        o, solver = self.options, self._engine("model")
         settings = solver.Settings(self.fidelity.dt, o.solver, o.iterations, o.ls_iterations)
-        self._rollout = solver.Rollout(self.mjcf, settings, self.fidelity.precision, name=self.name)
+        self._model = solver.Model(self.mjcf, settings, self.fidelity.precision, name=self.name)
         first = [one for one in self.parameters if one.field != "ctrl"]
         held = [one for one in self.parameters if one.field == "ctrl"]
         turns = [f"t{k} " for k in range(self.segments)] if self.segments > 1 else [""]
         names = [one.name for one in first] + [f"{turn}{one.name}" for turn in turns for one in held]
         bounds = [(one.lower, one.upper, one.unit) for one in (*first, *(held * self.segments))]
         self.space = ParameterSpace(names, *zip(*bounds, strict=True))
-        places = tuple(self._rollout.find(one.field, one.index) for one in (*first, *held))
+        places = tuple(self._model.find(one.field, one.index) for one in (*first, *held))
         each = round(self.duration / self.segments / self.fidelity.dt)
         count, steps = (1, o.count_steps(each)) if self.segments == 1 else (o.count_steps(self.segments), each)
         self._course = solver.Course(places, self.segments, count, steps, OwnMethod(self.act))
-        self._function = solver.JaxFunction(
-            OwnMethod(self._loss), self.space.dim, self.name, self.fidelity.precision, self.preferred_batch, o.mode
-        )
+        known = _of_package(self.act, self._setup)
+        self._key = self._model.identify(self._course, self.act.__qualname__) if known else ""
+        vars(self).pop("_rollout", None)
+        self._function = self._bind(solver)
+
+    def _bind(self, solver: Any) -> Any:
+        """Return the loss as a function of JAX, of which what is known is kept: all, or of somebody's the episode."""
+        how = (self.space.dim, self.name, self.fidelity.precision, self.preferred_batch, self.options.mode)
+        kinds = [kind for kind in type(self).__mro__ if issubclass(kind, MjxScene)]
+        if _of_package(*kinds, self.loss_of, self.act, self._setup):
+            key = self._key and repr((self._key, type(self), self.options, self.fidelity))
+            return solver.JaxFunction(OwnMethod(self._loss), *how, key=key)
+        rollout = self._rollout  # refuses here and now what MJX cannot simulate
+        if self._key and self.options.mode == "forward":
+            at_end = self._engine("rollout").LossAtEnd
+            return at_end(OwnMethod(self.loss_of), *how, key=self._key, rollout=rollout)
+        return solver.JaxFunction(OwnMethod(self._loss), *how)
+
+    @cached_property
+    def _rollout(self) -> Any:
+        """What MJX simulates, which only tracing needs."""
+        return self._engine("rollout").Rollout(self._model, self._course)
 
     def _loss(self, x: Any) -> Any:
-        return self.loss_of(self._rollout.end(x, self._course))
+        return self.loss_of(self._rollout.end(x))
 
     def _prepare(self) -> None:
         for grad in (False, True):
@@ -150,6 +173,11 @@ class MjxScene(Environment):
         loss, _, _ = self._function(whole, False)
         slope = self._function(whole, True)[1][: len(x)] if grad else None
         return Evaluation.from_results(loss[: len(x)], slope)
+
+
+def _of_package(*code: Any) -> bool:
+    """Say whether classes and functions are all of this package, whose files are part of what programs are found by."""
+    return all(one.__module__.startswith(__package__.rpartition(".")[0] + ".") for one in code)
 
 
 def draw(

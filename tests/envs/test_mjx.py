@@ -16,7 +16,7 @@ from gradscape.landscapes.checks.places import measure_places
 from gradscape.landscapes.checks.probe import Probe
 from gradscape.landscapes.checks.slopes import Kind
 
-from .scenes import made_once
+from .scenes import made, made_once
 
 pytestmark = pytest.mark.slow
 
@@ -95,6 +95,30 @@ def test_precisions_take_turns_in_one_process():
     assert not torch.equal(double, double.float().double())
     assert torch.equal(again, double)
     torch.testing.assert_close(single, double, rtol=1e-5, atol=0)
+
+
+def test_a_scene_of_ours_is_traced_once_for_all_processes():
+    first, again = made_once("mjx-drop"), made("mjx-drop")
+    x = first.space.uniform(2, seed=3)
+    wanted = first.evaluate(x)
+    vars(again)["_rollout"] = None  # what tracing needs
+    found = again.evaluate(x)
+    assert torch.equal(found.loss, wanted.loss)
+    assert torch.equal(found.grad, wanted.grad)
+
+
+def test_an_episode_is_traced_once_for_all_processes_and_somebodys_loss_in_each(dart, monkeypatch):
+    from gradscape.envs.engines.mjx import rollout
+
+    x = dart.space.uniform(3, seed=1)
+    wanted = dart.evaluate(x)
+    monkeypatch.setattr(rollout.Rollout, "end", None)
+    found = Dart(fidelity=STEP).evaluate(x)
+    assert torch.equal(found.loss, wanted.loss)
+    assert torch.equal(found.grad, wanted.grad)
+    other = type("Dart", (Dart,), {"loss_of": lambda self, state: state.qpos[0] ** 2})(fidelity=STEP).evaluate(x)
+    torch.testing.assert_close(other.loss, wanted.loss**2)
+    torch.testing.assert_close(other.grad, 2 * wanted.loss[:, None] * wanted.grad)
 
 
 def test_reverse_is_forward_where_nothing_touches(dart):

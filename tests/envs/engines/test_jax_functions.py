@@ -87,7 +87,7 @@ def test_no_points_are_no_call():
     assert len(gs.from_jax(wave, SPACE).evaluate(X[:0]).loss) == 0
 
 
-def test_it_is_compiled_anew_in_another_process():
+def test_it_goes_to_another_process():
     objective = gs.from_jax(wave, SPACE)
     wanted = objective.evaluate(X)
     got = pickle.loads(pickle.dumps(objective)).evaluate(X)
