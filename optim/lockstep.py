@@ -108,8 +108,8 @@ def _draw(
 class Lockstep:
     """Run searches of an objective, whose rows must not depend on their batch.
 
-    Computations are spread over `workers` processes, and done here if that is one; results are the same to the last
-    bit. `computed` counts the seconds that they took.
+    Computations are spread over `workers` processes, which begin as soon as a search asks, and done here if that is
+    one; results are the same to the last bit. `computed` counts the seconds that they took.
     """
 
     def __init__(self, objective: Objective, *, workers: int = 1) -> None:
@@ -121,11 +121,12 @@ class Lockstep:
         self._searches, self._clocks = searches, [0.0] * len(searches)
         self._asked: dict[int, Request] = {}
         self._results: dict[int, Any] = {}
-        with WorkerProcesses(self.workers) as processes:
+        self._computing: dict[int, Callable[[], tuple[Any, float]]] = {}
+        with WorkerProcesses(self.workers) as self._processes:
             for number in range(len(searches)):
                 self._advance(number, None)
             while self._asked:
-                self._compute(processes)
+                self._compute()
                 self._evaluate()
         return [self._results[number] for number in range(len(searches))]
 
@@ -133,9 +134,13 @@ class Lockstep:
         """Let a search continue to its next request, or to its end."""
         began = time.perf_counter()
         try:
-            self._asked[number] = self._searches[number].send(answer)  # type: ignore[arg-type] # None starts it
+            request = self._searches[number].send(answer)  # type: ignore[arg-type] # None starts it
         except StopIteration as end:
             self._results[number] = end.value
+        else:
+            self._asked[number] = request
+            if isinstance(request, Compute):
+                self._computing[number] = self._processes.submit(number, request.result)
         self._clocks[number] += time.perf_counter() - began
 
     def _answer(self, number: int, value: Any, seconds: float) -> None:
@@ -143,12 +148,11 @@ class Lockstep:
         self._clocks[number] += seconds
         self._advance(number, Answer(value, self._clocks[number]))
 
-    def _compute(self, processes: WorkerProcesses) -> None:
+    def _compute(self) -> None:
         """Answer computations until none is asked for."""
-        while computing := {n: one for n, one in sorted(self._asked.items()) if isinstance(one, Compute)}:
-            results = {number: processes.submit(number, one.result) for number, one in computing.items()}
-            for number, result in results.items():
-                value, seconds = result()
+        while computing := sorted(self._computing):
+            for number in computing:
+                value, seconds = self._computing.pop(number)()
                 self.computed += seconds
                 self._answer(number, value, seconds)
 

@@ -13,6 +13,7 @@ import torch
 
 from gradscape.optim.lockstep import Asking, Compute, Lockstep
 from gradscape.optim.methods.surrogate import Surrogate, SurrogateOptions
+from gradscape.optim.processes import WorkerProcesses
 
 from .test_race import Bowl
 
@@ -62,6 +63,22 @@ def test_a_process_computes_the_same_bits_and_what_it_has_learnt_comes_back(core
         assert drawn == redrawn
     assert torch.get_num_threads() == cores
     torch.set_num_threads(before)
+
+
+def test_a_computation_begins_as_soon_as_a_search_asks(monkeypatch: pytest.MonkeyPatch) -> None:
+    begun, seen, submit = list[int](), list[list[int]](), WorkerProcesses.submit
+
+    def begin(processes: WorkerProcesses, search: int, function: Callable[[], Any]) -> Callable[[], Any]:
+        begun.append(search)
+        return submit(processes, search, function)
+
+    def asking() -> Asking[None]:
+        seen.append(list(begun))
+        yield Compute(os.getpid, ())
+
+    monkeypatch.setattr(WorkerProcesses, "submit", begin)
+    Lockstep(Bowl()).run([asking() for _ in range(3)])
+    assert seen == [[], [0], [0, 1]]
 
 
 def test_searches_keep_their_processes() -> None:
