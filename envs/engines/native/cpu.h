@@ -3,4 +3,5 @@
 #include "gpu.h"
 #include "grid.h"
 #include "materials.h"
+#include "sheets.h"
 #include "smoothing.h"
