@@ -284,38 +284,14 @@ def _stop_twice(name: str, rule: Rule) -> Any:
 
 @cache
 @no_type_check
-def _toucher(name: str, stop: Any, Data: Any) -> Any:
-    """Return the function that lets a surface stop a vertex, and moves it."""
-    types = precision(name)
-    real, vec3, Vectors = types.real, types.vec3, types.rows[1]
+def _reader(name: str) -> Any:
+    """Return the function of an element that is read once: its adjoint is set, where Warp would add to it atomically."""
+    vec3, Vectors = precision(name).vec3, precision(name).rows[1]
 
-    # An element is read once, so that its adjoint can be set, where Warp would add to it atomically.
     @cpp.func_native(called="read_strided", adjoint="set_adj_read_strided")
     def read(values: Vectors, row: int, i: int) -> vec3: ...
 
-    @wp.func(module=f"gradscape.contact.{name}", name=f"touch_{stop.key}")
-    def touch_vertex(
-        row: int,
-        i: int,
-        dt: real,
-        data: Data,
-        held: wp.array[bool],
-        pose: Vectors,
-        following: Vectors,
-        x: Vectors,
-        pulled: Vectors,
-        x_next: Vectors,
-        v_next: Vectors,
-    ):
-        p = read(x, row, i)
-        now, then = read(pose, row, i), read(following, row, i)
-        v = stop(data, p, read(pulled, row, i), now, then, dt)
-        if held[i]:
-            v = (then - now) / dt
-        v_next[row, i] = v
-        x_next[row, i] = p + dt * v
-
-    return touch_vertex
+    return read
 
 
 @cache
@@ -328,7 +304,7 @@ def contact_kernel(name: str, stop: Any, Data: Any) -> Any:
 
     The adjoint sets those of poses, `x` and `pulled`, whatever they were, or leaves out what is None.
     """
-    types, touch_vertex = precision(name), _toucher(name, stop, Data)
+    types, read = precision(name), _reader(name)
     real, Vectors = types.real, types.rows[1]
 
     @wp.kernel(module=cpp.module(f"gradscape.contact.{stop.key}"), grid_stride=False)
@@ -344,7 +320,13 @@ def contact_kernel(name: str, stop: Any, Data: Any) -> Any:
         v_next: Vectors,
     ):
         row, i = wp.tid()
-        touch_vertex(row, i, dt, data, held, pose, following, x, pulled, x_next, v_next)
+        p = read(x, row, i)
+        now, then = read(pose, row, i), read(following, row, i)
+        v = stop(data, p, read(pulled, row, i), now, then, dt)
+        if held[i]:
+            v = (then - now) / dt
+        v_next[row, i] = v
+        x_next[row, i] = p + dt * v
 
     return touch
 
@@ -357,7 +339,7 @@ def contact_kernel_in_rows(name: str, stop: Any, Data: Any, inside: str, rule: R
     The vertices that are held or may be `inside` the surface are listed there, eight at a time (`native/sheets.h`), and
     left to the Warp function; the others fly on.
     """
-    types, touch_vertex = precision(name), _toucher(name, stop, Data)
+    types, read = precision(name), _reader(name)
     real, Vectors = types.real, types.rows[1]
 
     @cpp.func_native(template=[f"gradscape::{inside}", int(rule == "end")], adjoint="")
@@ -403,7 +385,14 @@ def contact_kernel_in_rows(name: str, stop: Any, Data: Any, inside: str, rule: R
         list_touched(row, dt, data, held, pose, following, x, pulled, touched)
         move_others(row, dt, touched, pose, following, x, pulled, x_next, v_next)
         for n in range(touched[row, 0]):
-            touch_vertex(row, touched[row, n + 1], dt, data, held, pose, following, x, pulled, x_next, v_next)
+            i = touched[row, n + 1]
+            p = read(x, row, i)
+            now, then = read(pose, row, i), read(following, row, i)
+            v = stop(data, p, read(pulled, row, i), now, then, dt)
+            if held[i]:
+                v = (then - now) / dt
+            v_next[row, i] = v
+            x_next[row, i] = p + dt * v
 
     return cpp.take_rows(touch)
 
