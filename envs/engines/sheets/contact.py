@@ -31,7 +31,7 @@ class Surface(abc.ABC):
 
     moves: ClassVar[bool]
 
-    inside: ClassVar[str]  # its name in `native/sheets.h`
+    inside: ClassVar[str]  # which tells, in `native/contact.h`, what may be inside it
 
     @abc.abstractmethod
     def function(self, name: str) -> tuple[Any, Any]:
@@ -285,7 +285,7 @@ def _stop_twice(name: str, rule: Rule) -> Any:
 @cache
 @no_type_check
 def _reader(name: str) -> Any:
-    """Return the function of an element that is read once: its adjoint is set, where Warp would add to it atomically."""
+    """Return the function of an element that is read once, so that its adjoint is set, not added to atomically."""
     vec3, Vectors = precision(name).vec3, precision(name).rows[1]
 
     @cpp.func_native(called="read_strided", adjoint="set_adj_read_strided")
@@ -334,10 +334,10 @@ def contact_kernel(name: str, stop: Any, Data: Any) -> Any:
 @cache
 @no_type_check
 def contact_kernel_in_rows(name: str, stop: Any, Data: Any, inside: str, rule: Rule) -> Any:
-    """Return the same kernel for a CPU, with an array more, of a row's vertices' numbers and one.
+    """Return the same kernel for a CPU, with room for the list of a row's vertices that are touched, and their count.
 
-    The vertices that are held or may be `inside` the surface are listed there, eight at a time (`native/sheets.h`), and
-    left to the Warp function; the others fly on.
+    What is held or may be `inside` the surface is found eight at a time (`native/contact.h`), and left to the Warp
+    function; the others fly on.
     """
     types, read = precision(name), _reader(name)
     real, Vectors = types.real, types.rows[1]

@@ -1,8 +1,9 @@
 """Mass-spring sheets: vertices joined by damped springs, against a moving surface that takes their normal velocity.
 
 Arrays are [row, vertex], one of each per step. A vertex gathers the forces of its own springs: every spring is computed
-twice, but no sum is atomic. The adjoint is written by hand in the same way: with d = x_j - x_i, w = v_j - v_i and mu_i
-the adjoint of the force on i, a pair that pulls i by f and j by -f adds -(mu_j - mu_i) . df to the loss's change.
+twice, but no sum is atomic. A CPU takes eight vertices at a time, with the same bits. The adjoint is written by hand in
+the same way: with d = x_j - x_i, w = v_j - v_i and mu_i the adjoint of the force on i, a pair that pulls i by f and j
+by -f adds -(mu_j - mu_i) . df to the loss's change.
 """
 
 import math
@@ -67,7 +68,7 @@ def bytes_per_row(sheet: Sheet, steps: int, name: str) -> int:
 
 
 def _in_rows(device: str) -> bool:
-    """Say whether kernels on this device take eight vertices at a time."""
+    """Say whether kernels take whole rows, eight vertices at a time, where others take a vertex in each thread."""
     return device == "cpu"
 
 
@@ -114,7 +115,7 @@ class Solver:
         self.moves = surface.moves
         self.surface = surface.data(name)
         self.no_adjoint = type(self.surface)()  # Warp wants a place for it
-        self.launches = Launches(device)
+        self.launches = Launches(device, programs=True)
         self.network = _network(sheet, self.springs.Network, self.types, device, in_rows=self.in_rows)
         self.held: Any = wp.array(np.isin(np.arange(len(sheet.x)), sheet.held), dtype=wp.bool, device=device)
         self._allocate(capacity)
@@ -165,8 +166,11 @@ class Solver:
         self.adj_pose = [wp.zeros((capacity, count), **vec3) if self.moves else None for _ in range(2)]
         self.adj_parts = wp.zeros((capacity, math.isqrt(count)), **vec3)
         self.adj_x, self.adj_v, self.adj_here, self.adj_pulled = (wp.zeros((capacity, count), **vec3) for _ in range(4))
-        self.work = [wp.zeros(10 * (count + 3 * LANES), dtype=self.types.real)] if self.in_rows else []
-        self.touched = [wp.zeros((capacity, count + 1), dtype=int)] if self.in_rows else []
+        self.work: list[Any] = []  # of kernels in rows: numbers of one row's vertices, and which of them are touched
+        self.touched: list[Any] = []
+        if self.in_rows:
+            self.work = [wp.zeros(10 * (count + 3 * LANES), dtype=self.types.real, device=self.device)]
+            self.touched = [wp.zeros((capacity, count + 1), dtype=int, device=self.device)]
         self.stiffness, self.adj_stiffness = (
             wp.zeros((capacity, count), dtype=self.types.real, device=self.device) for _ in range(2)
         )
@@ -206,7 +210,9 @@ class Solver:
             if by_vertex is not None:
                 self._add_to_pose(by_vertex, self.adj_poses[frame])
         changed = [self.adj_x, self.adj_v, self.adj_stiffness]
-        self._launch(self.springs.adjoint, [*self._pull_inputs(step), self.adj_here, self.adj_pulled, *changed, *self.work])
+        self._launch(
+            self.springs.adjoint, [*self._pull_inputs(step), self.adj_here, self.adj_pulled, *changed, *self.work]
+        )
 
     def _add_to_pose(self, by_vertex: Any, by_row: Any) -> None:
         if self.in_rows:
@@ -265,12 +271,14 @@ def _lists(sheet: Sheet) -> tuple[np.ndarray, dict[str, np.ndarray]]:
 def _slots(sheet: Sheet) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Return how many slots each eight vertices have, and lists [slot, vertex of the eight].
 
-    In a slot are their springs to the vertices that are as much further in number, which is its `neighbor`; a vertex
-    that has none there has one of negative length. A vertex's other ends rise from slot to slot.
+    In a slot are their springs to the vertices that are as much further in number, which is its `neighbor`, and where
+    there is none a rest length of minus infinity. A vertex's other ends rise from slot to slot.
     """
     here, there, values = _ends(sheet)
-    found, slot = np.unique(np.stack([here // LANES, there - here], axis=1), axis=0, return_inverse=True)
-    lists = {name: np.full((len(found), LANES), -1.0 if name == "rest" else 0.0) for name in values}
+    pair = here * len(sheet.x) + there
+    nth = np.arange(len(pair)) - np.searchsorted(pair, pair)  # of those that join the same two
+    found, slot = np.unique(np.stack([here // LANES, there - here, nth], axis=1), axis=0, return_inverse=True)
+    lists = {name: np.full((len(found), LANES), -np.inf if name == "rest" else 0.0) for name in values}
     for name, value in values.items():
         lists[name][slot.ravel(), here % LANES] = value
     count = np.bincount(found[:, 0], minlength=-(-len(sheet.x) // LANES))
@@ -287,10 +295,7 @@ def spring_kernels(name: str) -> SimpleNamespace:
 
     @partial(wp.struct, module=module)
     class Network:
-        """Springs by vertex, and the scalars of Sheet.
-
-        What `_lists` returns, or on a CPU `_slots`.
-        """
+        """Springs by vertex, as `_lists` returns them or for kernels in rows `_slots`, and the scalars of Sheet."""
 
         count: wp.array[int]
         neighbor: wp.array[int]
@@ -392,12 +397,11 @@ def spring_kernels(name: str) -> SimpleNamespace:
 @cache
 @no_type_check
 def spring_kernels_in_rows(name: str) -> SimpleNamespace:
-    """Return the same kernels for a CPU, in C++, which take eight vertices at a time (`native/sheets.h`)."""
-    (Reals, Vectors, _, _), Network = precision(name).rows, spring_kernels(name).Network
-    declare = partial(cpp.kernel_in_rows, f"gradscape.springs.{name}.rows")
-    given = {"network": Network, "dt": precision(name).real, "stiffness": Reals, "x": Vectors, "v": Vectors}
+    """Return the same kernels for a CPU, in C++, which take eight vertices at a time (`native/springs.h`)."""
+    real, (Reals, Vectors, _, _), Network = precision(name).real, precision(name).rows, spring_kernels(name).Network
+    declare, work = partial(cpp.kernel_in_rows, f"gradscape.springs.{name}.rows"), wp.array[real]
+    given = {"network": Network, "dt": real, "stiffness": Reals, "x": Vectors, "v": Vectors}
     adjoints = {"adj_here": Vectors, "adj_pulled": Vectors, "adj_x": Vectors, "adj_v": Vectors, "adj_stiffness": Reals}
-    work = wp.array[precision(name).real]
     pull = declare("pull", **given, pulled=Vectors, work=work)
     adjoint = declare("adjoint_pull", **given, **adjoints, work=work)
     return SimpleNamespace(pull=pull, adjoint=adjoint, Network=Network)
