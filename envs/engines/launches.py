@@ -1,21 +1,28 @@
-"""Kernel launches that come again: what Warp makes of their arguments is stored, and on a GPU whole graphs of them.
+"""Kernel launches that come again: what Warp makes of their arguments is stored, and whole programs or graphs of them.
 
-A new launch costs Python more than most kernels take; one that is stored costs a tenth of that, and one
-in a CUDA graph next to nothing.
+A new launch costs Python more than most kernels take; one that is stored costs a tenth of that, and one in a program of
+a CPU or a graph of a GPU next to nothing.
 """
 
 from __future__ import annotations
 
+import ctypes
 import re
 import time
 from collections import defaultdict
 from collections.abc import Callable, Hashable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import cache
+from itertools import groupby
 from pathlib import Path
 from typing import Any, ClassVar
 
+import numpy as np
 import warp as wp
+
+from . import cpp
+from .runtime import load
 
 MAX_GRAPHS, MAX_SEQUENCES = 512, 1024  # that are stored; more are not worth their memory
 
@@ -63,6 +70,53 @@ class _Streams(dict[int, wp.Stream]):
         return wp.get_stream(self.device)
 
 
+@cache
+def _packet(kinds: tuple[type, ...]) -> type[ctypes.Structure]:
+    """Return the struct in which a kernel of a CPU is given arguments of these kinds."""
+    fields = [(f"argument_{number}", kind) for number, kind in enumerate(kinds)]
+    return type("Packet", (ctypes.Structure,), {"_fields_": fields})
+
+
+@cache
+def _runner() -> Any:
+    """Return the kernel that runs calls of kernels (`native/calls.h`)."""
+    kernel = cpp.kernel_in_rows("gradscape.launches", "run_calls", calls=wp.array[wp.uint64])
+    load([kernel], "cpu")
+    return kernel
+
+
+class _Program:
+    """Launches of a CPU that run one after another without Python, for which threads would wait.
+
+    Their arguments stay as they are; their dimensions may be others when `move` has been called.
+    """
+
+    def __init__(self, launches: list[wp.Launch]) -> None:
+        self.launches = launches  # which hold their arrays
+        self.packets = [self._pack(launch) for launch in launches]
+        self.calls = np.zeros((len(launches), 4), dtype=np.uint64)
+        for call, launch, packets in zip(self.calls, launches, self.packets, strict=True):
+            function = launch.hooks.backward if launch.adjoint else launch.hooks.forward
+            call[0] = ctypes.cast(function, ctypes.c_void_p).value or 0
+            call[2 : 2 + len(packets)] = [ctypes.addressof(packet) for packet in packets]
+        self.move()
+        calls: Any = wp.array(self.calls.ravel(), dtype=wp.uint64, device="cpu", copy=False)
+        self.runner = wp.launch(_runner(), (1, 1), [calls], device="cpu", record_cmd=True, record_tape=False)
+
+    def move(self) -> None:
+        self.calls[:, 1] = [ctypes.addressof(launch.bounds) for launch in self.launches]
+
+    def launch(self) -> None:
+        self.runner.launch()
+
+    @staticmethod
+    def _pack(launch: wp.Launch) -> list[ctypes.Structure]:
+        """Return the arguments of a launch, and their adjoints if it is of an adjoint kernel."""
+        _, *given = launch.params
+        count = len(launch.kernel.adj.args)
+        return [_packet(tuple(map(type, part)))(*part) for part in (given[:count], given[count:]) if part]
+
+
 @dataclass
 class _Sequence:
     """Launches in their order, as they were made for one `extent`.
@@ -75,6 +129,16 @@ class _Sequence:
     launches: list[Any] = field(default_factory=list)
     located: list[tuple[Any, int]] = field(default_factory=list)
     sized: list[tuple[Any, Callable[[Any], tuple[int, int]]]] = field(default_factory=list)
+    programs: list[Any] = field(default_factory=list)
+
+    def run_programs(self) -> None:
+        """Launch on a CPU, as few programs as can be, or one by one where arguments change."""
+        if not self.programs and not self.located:
+            for launches, group in groupby(self.launches, lambda command: isinstance(command, wp.Launch)):
+                commands = list(group)
+                self.programs += [_Program(commands)] if launches else commands
+        for command in self.programs or self.launches:
+            command.launch()
 
     def run(self) -> None:
         for command in self.launches:
@@ -119,6 +183,9 @@ class _Sequence:
                 command.set_param_at_index(argument, place)
             for command, dim in self.sized:
                 command.set_dim(dim(extent))
+            for program in self.programs:
+                if isinstance(program, _Program):
+                    program.move()
             self.extent = extent
 
 
@@ -126,13 +193,16 @@ class Launches:
     """Run the launches of a piece of work: made when it first comes, stored from then on.
 
     What is launched under one key must be the same every time, arrays and numbers: only the extent may be another, a
-    box of nodes or a number of rows. Where an array is replaced by another, `clear` must be called.
+    box of nodes or a number of rows. Where an array is replaced by another, `clear` must be called. A CPU runs stored
+    work as `programs` if it is to, which pays where it comes more than twice.
     """
 
     one_by_one: ClassVar[bool] = False  # even on a GPU
 
-    def __init__(self, device: str) -> None:
-        self.device = device
+    def __init__(self, device: str, *, programs: bool = False) -> None:
+        self.device, self.programs = device, programs and device == "cpu"
+        if self.programs:
+            _runner()
         self.sequences: dict[Hashable, _Sequence] = {}
         self.seen: set[tuple[Hashable, Hashable]] = set()
         self.graphs: dict[tuple[Hashable, Hashable], Any] = {}
@@ -153,7 +223,10 @@ class Launches:
             self.seen.add((key, extent))
         elif self.one_by_one or self.device == "cpu":
             known.move(extent, place)
-            known.run()
+            if self.programs and not self.one_by_one:
+                known.run_programs()
+            else:
+                known.run()
         elif small:
             self._run_graph((key, extent), known, place)
         else:
@@ -246,8 +319,8 @@ def count_compiled_modules() -> int:
 def time_kernels(device: str) -> Iterator[dict[str, KernelTime]]:
     """Time every Warp kernel launched within a with block, by name; complete where the block ends.
 
-    On a CPU, where launches return when their kernel has run, the time includes that of launching. On CUDA kernels are
-    launched one by one, not as graphs.
+    Kernels are launched one by one, neither as graphs nor as programs. On a CPU, where launches return when their
+    kernel has run, the time includes that of launching.
     """
     times: dict[str, KernelTime] = defaultdict(KernelTime)
     with _time_on_cuda(times) if device == "cuda" else _time_on_cpu(times):
@@ -277,7 +350,8 @@ def _time_on_cpu(times: dict[str, KernelTime]) -> Iterator[None]:
 
     wp.launch, wp.Launch.launch = time_launch, time_relaunch  # type: ignore[assignment, method-assign]
     try:
-        yield
+        with one_by_one():  # a program hides its kernels
+            yield
     finally:
         wp.launch, wp.Launch.launch = launch, relaunch  # type: ignore[method-assign]
 

@@ -21,7 +21,7 @@ from typing import Any, ClassVar, Literal, no_type_check
 import warp as wp
 
 from .. import cpp
-from ..runtime import fill_struct, precision
+from ..runtime import Ints, fill_struct, precision
 
 Rule = Literal["end", "start"]
 
@@ -30,6 +30,8 @@ class Surface(abc.ABC):
     """What a solver asks of a surface."""
 
     moves: ClassVar[bool]
+
+    inside: ClassVar[str]  # which tells, in `native/contact.h`, what may be inside it
 
     @abc.abstractmethod
     def function(self, name: str) -> tuple[Any, Any]:
@@ -54,6 +56,7 @@ class Floor(Surface):
     height: float = 0.0
     friction: float = 0.0
     moves: ClassVar[bool] = False
+    inside: ClassVar[str] = "InFloor"
 
     def function(self, name: str) -> tuple[Any, Any]:
         """Return the surface's Warp function and its struct."""
@@ -87,6 +90,7 @@ class Pan(Surface):
     thickness: float
     friction: float = 0.0
     moves: ClassVar[bool] = True
+    inside: ClassVar[str] = "InPan"
 
     @property
     def radius(self) -> float:
@@ -110,6 +114,7 @@ class PanOverFloor(Surface):
     pan: Pan
     floor: Floor
     moves: ClassVar[bool] = True
+    inside: ClassVar[str] = "InEither"
 
     def function(self, name: str) -> tuple[Any, Any]:
         """Return the function of the nearer surface, and the struct of both."""
@@ -279,6 +284,18 @@ def _stop_twice(name: str, rule: Rule) -> Any:
 
 @cache
 @no_type_check
+def _reader(name: str) -> Any:
+    """Return the function of an element that is read once, so that its adjoint is set, not added to atomically."""
+    vec3, Vectors = precision(name).vec3, precision(name).rows[1]
+
+    @cpp.func_native(called="read_strided", adjoint="set_adj_read_strided")
+    def read(values: Vectors, row: int, i: int) -> vec3: ...
+
+    return read
+
+
+@cache
+@no_type_check
 def contact_kernel(name: str, stop: Any, Data: Any) -> Any:
     """Return the kernel that lets a surface stop vertices, and moves them.
 
@@ -287,12 +304,8 @@ def contact_kernel(name: str, stop: Any, Data: Any) -> Any:
 
     The adjoint sets those of poses, `x` and `pulled`, whatever they were, or leaves out what is None.
     """
-    types = precision(name)
-    real, vec3, Vectors = types.real, types.vec3, types.rows[1]
-
-    # An element is read once, so that its adjoint can be set, where Warp would add to it atomically.
-    @cpp.func_native(called="read_strided", adjoint="set_adj_read_strided")
-    def read(values: Vectors, row: int, i: int) -> vec3: ...
+    types, read = precision(name), _reader(name)
+    real, Vectors = types.real, types.rows[1]
 
     @wp.kernel(module=cpp.module(f"gradscape.contact.{stop.key}"), grid_stride=False)
     def touch(
@@ -316,6 +329,80 @@ def contact_kernel(name: str, stop: Any, Data: Any) -> Any:
         x_next[row, i] = p + dt * v
 
     return touch
+
+
+@cache
+@no_type_check
+def contact_kernel_in_rows(name: str, stop: Any, Data: Any, inside: str, rule: Rule) -> Any:
+    """Return the same kernel for a CPU, with room for the list of a row's vertices that are touched, and their count.
+
+    What is held or may be `inside` the surface is found eight at a time (`native/contact.h`), and left to the Warp
+    function; the others fly on.
+    """
+    types, read = precision(name), _reader(name)
+    real, Vectors = types.real, types.rows[1]
+
+    @cpp.func_native(template=[f"gradscape::{inside}", int(rule == "end")], adjoint="")
+    def list_touched(
+        e: int,
+        dt: real,
+        data: Data,
+        held: wp.array[bool],
+        pose: Vectors,
+        following: Vectors,
+        x: Vectors,
+        pulled: Vectors,
+        touched: Ints,
+    ): ...
+
+    @cpp.func_native(adjoint="adj_move_others", replay=False)
+    def move_others(
+        e: int,
+        dt: real,
+        touched: Ints,
+        pose: Vectors,
+        following: Vectors,
+        x: Vectors,
+        pulled: Vectors,
+        x_next: Vectors,
+        v_next: Vectors,
+    ): ...
+
+    @wp.kernel(module=cpp.module(f"gradscape.contact.{stop.key}.rows"))
+    def touch(
+        dt: real,
+        data: Data,
+        held: wp.array[bool],
+        pose: Vectors,
+        following: Vectors,
+        x: Vectors,
+        pulled: Vectors,
+        x_next: Vectors,
+        v_next: Vectors,
+        touched: Ints,
+    ):
+        row, _ = wp.tid()
+        list_touched(row, dt, data, held, pose, following, x, pulled, touched)
+        move_others(row, dt, touched, pose, following, x, pulled, x_next, v_next)
+        for n in range(touched[row, 0]):
+            i = touched[row, n + 1]
+            p = read(x, row, i)
+            now, then = read(pose, row, i), read(following, row, i)
+            v = stop(data, p, read(pulled, row, i), now, then, dt)
+            if held[i]:
+                v = (then - now) / dt
+            v_next[row, i] = v
+            x_next[row, i] = p + dt * v
+
+    return cpp.take_rows(touch)
+
+
+@cache
+@no_type_check
+def sum_kernel_in_rows(name: str) -> Any:
+    """Return a kernel that does for a CPU what both of `sum_kernels` do."""
+    vec3, Vectors, module = precision(name).vec3, precision(name).rows[1], f"gradscape.contact.sums.{name}.rows"
+    return cpp.kernel_in_rows(module, "add_vertices", by_vertex=Vectors, by_row=wp.array[vec3])
 
 
 @cache

@@ -1,8 +1,9 @@
 """Mass-spring sheets: vertices joined by damped springs, against a moving surface that takes their normal velocity.
 
 Arrays are [row, vertex], one of each per step. A vertex gathers the forces of its own springs: every spring is computed
-twice, but no sum is atomic. The adjoint is written by hand in the same way: with d = x_j - x_i, w = v_j - v_i and mu_i
-the adjoint of the force on i, a pair that pulls i by f and j by -f adds -(mu_j - mu_i) . df to the loss's change.
+twice, but no sum is atomic. A CPU takes eight vertices at a time, with the same bits. The adjoint is written by hand in
+the same way: with d = x_j - x_i, w = v_j - v_i and mu_i the adjoint of the force on i, a pair that pulls i by f and j
+by -f adds -(mu_j - mu_i) . df to the loss's change.
 """
 
 import math
@@ -20,9 +21,10 @@ import warp as wp
 from .. import cpp
 from ..launches import Launches
 from ..runtime import free_memory, load, precision, to_torch
-from .contact import Rule, Surface, contact_kernel, sum_kernels
+from .contact import Rule, Surface, contact_kernel, contact_kernel_in_rows, sum_kernel_in_rows, sum_kernels
 
 STRETCH = 50  # steps that are launched at once
+LANES = 8  # vertices that a CPU takes at once
 SMALL = 200_000  # vertices up to which launches cost a GPU more than what they launch
 
 
@@ -65,6 +67,11 @@ def bytes_per_row(sheet: Sheet, steps: int, name: str) -> int:
     return 9 * (steps + 1) * len(sheet.x) * (8 if name == "float64" else 4)
 
 
+def _in_rows(device: str) -> bool:
+    """Say whether kernels take whole rows, eight vertices at a time, where others take a vertex in each thread."""
+    return device == "cpu"
+
+
 def capacity(size: int, device: str) -> int:
     """Return how many episodes of a `size` in bytes a solver should take at once."""
     if device == "cpu":
@@ -96,15 +103,20 @@ class Solver:
         self.sheet, self.dt, self.steps, self.device = sheet, dt, steps, device
         self.stop = stop or threading.Event()
         self.types = precision(name)
-        self.springs = spring_kernels(name)
-        self.touch = contact_kernel(name, surface.stop(name, rule), surface.function(name)[1])
-        self.gather, self.add = sum_kernels(name)
-        load([self.springs.pull, self.springs.adjoint, self.touch, *([self.gather] if surface.moves else [])], device)
+        self.in_rows = _in_rows(device)
+        self.springs = (spring_kernels_in_rows if self.in_rows else spring_kernels)(name)
+        stop, Data = surface.stop(name, rule), surface.function(name)[1]
+        if self.in_rows:
+            self.touch = contact_kernel_in_rows(name, stop, Data, surface.inside, rule)
+            self.sums = [sum_kernel_in_rows(name)]
+        else:
+            self.touch, self.sums = contact_kernel(name, stop, Data), sum_kernels(name)
+        load([self.springs.pull, self.springs.adjoint, self.touch, *(self.sums if surface.moves else [])], device)
         self.moves = surface.moves
         self.surface = surface.data(name)
         self.no_adjoint = type(self.surface)()  # Warp wants a place for it
-        self.launches = Launches(device)
-        self.network = _network(sheet, self.springs.Network, self.types, device)
+        self.launches = Launches(device, programs=True)
+        self.network = _network(sheet, self.springs.Network, self.types, device, in_rows=self.in_rows)
         self.held: Any = wp.array(np.isin(np.arange(len(sheet.x)), sheet.held), dtype=wp.bool, device=device)
         self._allocate(capacity)
 
@@ -154,6 +166,11 @@ class Solver:
         self.adj_pose = [wp.zeros((capacity, count), **vec3) if self.moves else None for _ in range(2)]
         self.adj_parts = wp.zeros((capacity, math.isqrt(count)), **vec3)
         self.adj_x, self.adj_v, self.adj_here, self.adj_pulled = (wp.zeros((capacity, count), **vec3) for _ in range(4))
+        self.work: list[Any] = []  # of kernels in rows: numbers of one row's vertices, and which of them are touched
+        self.touched: list[Any] = []
+        if self.in_rows:
+            self.work = [wp.zeros(10 * (count + 3 * LANES), dtype=self.types.real, device=self.device)]
+            self.touched = [wp.zeros((capacity, count + 1), dtype=int, device=self.device)]
         self.stiffness, self.adj_stiffness = (
             wp.zeros((capacity, count), dtype=self.types.real, device=self.device) for _ in range(2)
         )
@@ -181,19 +198,28 @@ class Solver:
         self.launches.run((way, first), batch, work, small=batch * len(self.sheet.x) <= SMALL)
 
     def _step(self, step: int) -> None:
-        self._launch(self.springs.pull, [*self._pull_inputs(step), self.pulled[step]])
-        self._launch(self.touch, [*self._touch_inputs(step), self.x[step + 1], self.v[step + 1]])
+        self._launch(self.springs.pull, [*self._pull_inputs(step), self.pulled[step], *self.work])
+        self._launch(self.touch, [*self._touch_inputs(step), self.x[step + 1], self.v[step + 1], *self.touched])
 
     def _step_back(self, step: int) -> None:
-        moved = [self.x[step + 1], self.v[step + 1]]
+        moved = [self.x[step + 1], self.v[step + 1], *self.touched]
         adjoints = [None, self.no_adjoint, None, *self.adj_pose, self.adj_here, self.adj_pulled, self.adj_x, self.adj_v]
+        adjoints += [None for _ in self.touched]
         self._launch(self.touch, [*self._touch_inputs(step), *moved], adj_inputs=adjoints, adjoint=True)
         for frame, by_vertex in zip((step, step + 1), self.adj_pose, strict=True):
             if by_vertex is not None:
-                self._launch(self.gather, [by_vertex, self.adj_parts], elements=self.adj_parts.shape[1])
-                self._launch(self.add, [self.adj_parts, self.adj_poses[frame]], elements=1)
+                self._add_to_pose(by_vertex, self.adj_poses[frame])
         changed = [self.adj_x, self.adj_v, self.adj_stiffness]
-        self._launch(self.springs.adjoint, [*self._pull_inputs(step), self.adj_here, self.adj_pulled, *changed])
+        self._launch(
+            self.springs.adjoint, [*self._pull_inputs(step), self.adj_here, self.adj_pulled, *changed, *self.work]
+        )
+
+    def _add_to_pose(self, by_vertex: Any, by_row: Any) -> None:
+        if self.in_rows:
+            self._launch(self.sums[0], [by_vertex, by_row])
+        else:
+            self._launch(self.sums[0], [by_vertex, self.adj_parts], elements=self.adj_parts.shape[1])
+            self._launch(self.sums[1], [self.adj_parts, by_row], elements=1)
 
     def _pull_inputs(self, step: int) -> list[Any]:
         return [self.network, self.dt, self.stiffness, self.x[step], self.v[step]]
@@ -204,37 +230,59 @@ class Solver:
 
     def _launch(self, kernel: Any, inputs: list[Any], *, elements: int | None = None, **how: Any) -> None:
         """Launch a kernel over rows and vertices, or so many other elements."""
-        count = len(self.sheet.x) if elements is None else elements
+        count = cpp.threads(kernel, len(self.sheet.x) if elements is None else elements)
         self.launches.launch(kernel, lambda batch: (batch, count), inputs, **how)
 
 
-def _network(sheet: Sheet, Network: Any, types: Any, device: str) -> Any:
-    """List every vertex's springs in the order of their other ends; behind the last of them are zeros."""
-    ends = np.concatenate([sheet.pairs, sheet.pairs[:, ::-1]])
-    order = np.lexsort((ends[:, 1], ends[:, 0]))
-    here, there = ends[order].T
-    count = np.bincount(here, minlength=len(sheet.x))
-    number = np.arange(len(here)) - np.repeat(np.cumsum(count) - count, count)
-    shape, place = (len(count), int(count.max(initial=1))), (here, number)
-    if device != "cpu":  # a thread has a vertex: what they read at once lies side by side
-        shape, place = shape[::-1], place[::-1]
-
-    def table(values: np.ndarray, dtype: torch.dtype) -> Any:
-        filled = torch.zeros(shape, dtype=dtype)
-        filled[place] = torch.from_numpy(values).to(dtype)
-        return wp.from_torch(filled.flatten().to(device))
-
+def _network(sheet: Sheet, Network: Any, types: Any, device: str, *, in_rows: bool) -> Any:
+    """List every vertex's springs in the order of their other ends."""
+    count, lists = (_slots if in_rows else _lists)(sheet)
     network = Network()
     network.count = wp.array(count, dtype=int, device=device)
-    network.by_vertex, network.by_spring = (shape[1], 1) if device == "cpu" else (1, shape[1])
-    network.neighbor = table(there, torch.int32)
-    for name in ("rest", "weight", "plates"):
-        setattr(network, name, table(np.tile(getattr(sheet, name), 2)[order], types.torch))
+    for name, values in lists.items():
+        dtype = torch.int32 if name == "neighbor" else types.torch
+        setattr(network, name, wp.from_torch(torch.from_numpy(values).to(dtype).flatten().to(device)))
     masses = torch.from_numpy(sheet.masses.copy()).to(types.torch)
     network.mass, network.inverse_mass = (wp.from_torch(value.to(device)) for value in (masses, 1.0 / masses))
     for name in ("damping", "drag", "gravity"):
         setattr(network, name, getattr(sheet, name))
     return network
+
+
+def _ends(sheet: Sheet) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
+    """Return both ends of every spring, seen from each, and what it is, in their order."""
+    ends = np.concatenate([sheet.pairs, sheet.pairs[:, ::-1]])
+    order = np.lexsort((ends[:, 1], ends[:, 0]))
+    values = {"rest": sheet.rest, "weight": sheet.weight, "plates": sheet.plates}
+    return *ends[order].T, {name: np.tile(value, 2)[order] for name, value in values.items()}
+
+
+def _lists(sheet: Sheet) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Return how many springs a vertex has, and lists [number, vertex]: what threads read at once lies side by side."""
+    here, there, values = _ends(sheet)
+    count = np.bincount(here, minlength=len(sheet.x))
+    number = np.arange(len(here)) - np.repeat(np.cumsum(count) - count, count)
+    lists = {name: np.zeros((int(count.max(initial=1)), len(count))) for name in ("neighbor", *values)}
+    for name, value in {"neighbor": there, **values}.items():
+        lists[name][number, here] = value
+    return count, lists
+
+
+def _slots(sheet: Sheet) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Return how many slots each eight vertices have, and lists [slot, vertex of the eight].
+
+    In a slot are their springs to the vertices that are as much further in number, which is its `neighbor`, and where
+    there is none a rest length of minus infinity. A vertex's other ends rise from slot to slot.
+    """
+    here, there, values = _ends(sheet)
+    pair = here * len(sheet.x) + there
+    nth = np.arange(len(pair)) - np.searchsorted(pair, pair)  # of those that join the same two
+    found, slot = np.unique(np.stack([here // LANES, there - here, nth], axis=1), axis=0, return_inverse=True)
+    lists = {name: np.full((len(found), LANES), -np.inf if name == "rest" else 0.0) for name in values}
+    for name, value in values.items():
+        lists[name][slot.ravel(), here % LANES] = value
+    count = np.bincount(found[:, 0], minlength=-(-len(sheet.x) // LANES))
+    return count, {"neighbor": found[:, 1], **lists}
 
 
 @cache
@@ -247,14 +295,9 @@ def spring_kernels(name: str) -> SimpleNamespace:
 
     @partial(wp.struct, module=module)
     class Network:
-        """Springs by vertex, and the scalars of Sheet.
-
-        Vertex i has `count` of them, the k-th at number i * `by_vertex` + k * `by_spring` of what follows.
-        """
+        """Springs by vertex, as `_lists` returns them or for kernels in rows `_slots`, and the scalars of Sheet."""
 
         count: wp.array[int]
-        by_vertex: int
-        by_spring: int
         neighbor: wp.array[int]
         rest: wp.array[real]
         weight: wp.array[real]
@@ -287,7 +330,7 @@ def spring_kernels(name: str) -> SimpleNamespace:
         s_i = stiffness_at(stiffness, first + i)
         f = vec3()
         for k in range(network.count[i]):
-            at = i * network.by_vertex + k * network.by_spring
+            at = k * x.shape[1] + i
             j = first + number_at(network.neighbor, at)
             d = vector_at(x, j) - x_i
             w = vector_at(v, j) - v_i
@@ -323,7 +366,7 @@ def spring_kernels(name: str) -> SimpleNamespace:
         gv = vec3()
         gs = real(0.0)
         for k in range(network.count[i]):
-            at = i * network.by_vertex + k * network.by_spring
+            at = k * x.shape[1] + i
             neighbor = number_at(network.neighbor, at)
             j = first + neighbor
             d = vector_at(x, j) - x_i
@@ -348,4 +391,17 @@ def spring_kernels(name: str) -> SimpleNamespace:
         adj_v[row, i] = (real(1.0) - dt * network.drag) * adj_i + dt * gv
         adj_stiffness[row, i] += dt * gs
 
+    return SimpleNamespace(pull=pull, adjoint=adjoint, Network=Network)
+
+
+@cache
+@no_type_check
+def spring_kernels_in_rows(name: str) -> SimpleNamespace:
+    """Return the same kernels for a CPU, in C++, which take eight vertices at a time (`native/springs.h`)."""
+    real, (Reals, Vectors, _, _), Network = precision(name).real, precision(name).rows, spring_kernels(name).Network
+    declare, work = partial(cpp.kernel_in_rows, f"gradscape.springs.{name}.rows"), wp.array[real]
+    given = {"network": Network, "dt": real, "stiffness": Reals, "x": Vectors, "v": Vectors}
+    adjoints = {"adj_here": Vectors, "adj_pulled": Vectors, "adj_x": Vectors, "adj_v": Vectors, "adj_stiffness": Reals}
+    pull = declare("pull", **given, pulled=Vectors, work=work)
+    adjoint = declare("adjoint_pull", **given, **adjoints, work=work)
     return SimpleNamespace(pull=pull, adjoint=adjoint, Network=Network)

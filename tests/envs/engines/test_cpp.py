@@ -13,6 +13,8 @@ from gradscape.envs.engines.mpm.grid import velocity_on
 from gradscape.envs.engines.mpm.materials import Fluid, Plasticine
 from gradscape.envs.engines.mpm.smoothing import smoothing_kernels
 from gradscape.envs.engines.mpm.transfers import transfers
+from gradscape.envs.engines.sheets.contact import Pan, contact_kernel_in_rows
+from gradscape.envs.engines.sheets.springs import spring_kernels_in_rows
 
 CLANGS = "EightInts"  # a header with these vectors only clang compiles, and so Warp
 HEADERS = sorted(path.name for path in cpp.HEADERS.glob("*.h") if CLANGS not in cpp.whole_text(path.name))
@@ -23,8 +25,17 @@ IN_ROWS = {
     "fluid": lambda: Fluid(1.0, 1.0, 1.0).kernels("float32")[0],
     "plasticine": lambda: Plasticine(1.0, 1.0, 0.3, 1.0).kernels("float32")[0],
     "tank": lambda: velocity_on("float32", LadleInTank(*[0.1] * 7), columns=False),
+    "springs": lambda: spring_kernels_in_rows("float32").pull,
+    "contact": lambda: contact_in_rows("float32"),
     "room": lambda: velocity_on("float32", ROOM, columns=False),
 }
+
+
+def contact_in_rows(name):
+    pan = Pan(0.1, 0.1, 1.0, 0.1)
+    return contact_kernel_in_rows(name, pan.stop(name, "end"), pan.function(name)[1], pan.inside, "end")
+
+
 ROOM = ToolsInRoom((Tool(Kind.SPHERE, (0.1,), 0.1),), (0.0,) * 3, (1.0,) * 3, 0.0, 0.1, 1.0)
 
 

@@ -99,6 +99,29 @@ def test_launches_are_told_where_their_work_lies_by_whichever_argument_asks_for_
     assert found.numpy().tolist() == [4005]
 
 
+def test_a_program_of_a_cpu_launches_what_it_is_made_of_over_any_extent(monkeypatch):
+    @wp.kernel
+    def add(total: wp.array[float], some: float):
+        i, _ = wp.tid()
+        total[i] = total[i] + some
+
+    launches, python, relaunch = Launches("cpu", programs=True), [], wp.Launch.launch
+    monkeypatch.setattr(wp.Launch, "launch", lambda *given: (python.append(given), relaunch(*given)))
+    total = wp.zeros(3, dtype=float, device="cpu")
+
+    def work():
+        for some in (1.0, 2.0):
+            launches.launch(add, lambda extent: (extent, 1), [total, some])
+        launches.call(lambda: python.append("between"))
+        launches.launch(add, lambda extent: (extent, 1), [total, 4.0])
+
+    for extent, count in ((3, 4), (3, 3), (1, 3), (2, 3)):
+        python.clear()
+        launches.run("key", extent, work, small=True)
+        assert len(python) == count  # two programs, and what is between
+    assert total.numpy().tolist() == [28.0, 21.0, 14.0]
+
+
 @pytest.mark.parametrize("small", [True, False])
 def test_a_gpu_runs_beside_each_other_what_does_not_wait_for_each_other(monkeypatch, small):
     class Stream:
