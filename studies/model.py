@@ -211,7 +211,8 @@ class ModelStudy(VariantStudy):
     def measure(self, variant: Variant, follow: Follow) -> Mapping[str, Any]:
         """Return the arrays of a model's sample, and of one with a part changed the times in turn with the full one."""
         if variant.changed != PART:
-            return evaluate_points(self.env, self._moved() if variant.name == AGAIN else self.x, follow).arrays()
+            x = self._moved() if variant.name == AGAIN else self.x
+            return evaluate_points(self.env, x, follow, by=self.evaluates(variant)).arrays()
         env = self._make(variant)
         sample = evaluate_points(env, self.x, follow)
         for one in (self.env, env):

@@ -17,7 +17,8 @@ from ..landscapes.identity import MODEL_VERSION
 from ..landscapes.options import record_options
 from ..landscapes.sampling.memory import free_memory
 from ..landscapes.storage.checkpoint import Checkpoint
-from .samples import Sample, evaluate_points
+from .references import evaluate_reference
+from .samples import Sample, evaluate_parts, evaluate_points
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
     from ..envs.base import Environment
     from ..jobs.watch import Watch
     from ..landscapes.draw.figures.page import Picture
-    from .samples import Follow
+    from .samples import Evaluate, Follow
 
 FLOAT64_COST = 1.5  # what float64 is expected to take, in times what float32 takes
 MAX_TIMED_WORK, MIN_HORIZON_SHARE = 1e6, 0.05  # of an episode that is timed: it is shortened to that, if it can be
@@ -346,7 +347,11 @@ class VariantStudy(Study):
 
     def measure(self, variant: Variant, follow: Follow) -> Mapping[str, Any]:
         """Return the arrays that are measured of a variant."""
-        return evaluate_points(self._make(variant), self.x, follow).arrays()
+        return evaluate_points(self._make(variant), self.x, follow, by=self.evaluates(variant)).arrays()
+
+    def evaluates(self, variant: Variant) -> Evaluate:
+        """Return what evaluates a variant: the reference is kept for every study of the same points."""
+        return evaluate_reference if variant.name == self.variants[0].name else evaluate_parts
 
     def measure_all(self, watch: Watch) -> dict[str, dict[str, Any]]:
         """Return the arrays of each variant that can be measured, by its name; what is kept is not measured again.

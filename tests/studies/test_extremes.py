@@ -266,11 +266,11 @@ def test_a_stopped_study_goes_on_where_it_was(tmp_path: Path, monkeypatch: pytes
     whole = turn(Spring, tmp_path / "whole", "dt", "k")
     ask, asked = stability.ask, list[int]()
 
-    def stopped(env: Any, x: Tensor) -> Sample:
+    def stopped(env: Any, x: Tensor, **how: Any) -> Sample:
         if len(asked) == 9:
             raise KeyboardInterrupt
         asked.append(1)
-        return ask(env, x)
+        return ask(env, x, **how)
 
     monkeypatch.setattr("gradscape.studies.extremes.ask", stopped)
     with pytest.raises(KeyboardInterrupt, match="9 settings are kept"):
