@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..landscapes.cost import duration, seconds_per_episode
+from ..landscapes.cost import PICTURE_SECONDS, duration, seconds_per_episode, start_seconds
 from ..studies import study_class
 from ..studies.variants import Study, StudyOptions, StudyRecord, expected_work
 from .folder import ROOT, STUDIES, Results, folder_named
@@ -76,15 +76,17 @@ class StudyJob(CheckpointedJob[StudyRecord]):
         return self.study.describe_kept()
 
     def seconds(self) -> dict[str, float]:
-        """Estimate the seconds of each variant that is left, by the work of an episode."""
+        """Estimate the seconds of each variant that is left, by the work of an episode and what is to be compiled."""
         env = self.study.env
         left = [(one, expected_work(one.env)) for one in self.study.expected()]
         if not left:
             return {}
         base = env.remake(fidelity=next(iter(env.fidelities)))
         base.prepare()
-        rate = seconds_per_episode(base, base.space.sobol(len(self.study.x), seed=0), grad=True) / expected_work(base)
-        return {one.name: one.seconds + rate * work * one.episodes for one, work in left}
+        x = base.space.sobol(min(len(self.study.x), base.preferred_batch), seed=0)
+        start = start_seconds(base, x)
+        rate = seconds_per_episode(base, x, grad=True) / expected_work(base)
+        return {one.name: start + one.episodes * rate * work + one.repeats(rate * work) for one, work in left}
 
     def _announce(self, watch: Watch) -> None:
         """Say what is left to measure and about how long that takes."""
@@ -96,4 +98,5 @@ class StudyJob(CheckpointedJob[StudyRecord]):
         if seconds:
             dearest = max(seconds, key=lambda name: seconds[name])
             most = f"{duration(seconds[dearest])} of it {dearest}, " if len(seconds) > 1 else ""
-            watch.note(f"about {duration(sum(seconds.values()))}, {most}by the work of an episode; {study.advice}")
+            whole = sum(seconds.values()) + PICTURE_SECONDS
+            watch.announce(f"about {duration(whole)}, {most}by the work of an episode; {study.advice}", whole)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -181,8 +182,7 @@ class FidelityStudy(VariantStudy):
         return found
 
     def _expect(self, variant: Variant, env: Environment) -> Expected:
-        repeated = 2 / 3 * min(len(self.x), env.preferred_batch)
-        return Expected(variant.name, env, len(self.x) + repeated, seconds=2 * samples.REPETITION * samples.TURNS)
+        return Expected(variant.name, env, len(self.x), partial(samples.repeat_seconds, env, len(self.x)))
 
     def run(self, watch: Watch, provenance: Mapping[str, Any], command: str) -> FidelityRecord:
         """Measure what is missing and return the record."""

@@ -241,7 +241,7 @@ class ModelStudy(VariantStudy):
         if variant.changed != PART:
             return Expected(variant.name, env, len(self.x) * (REPEATS if variant.name == AGAIN else 1))
         timed = 4 * (samples.MIN_ROUNDS + 2) * max(1, self.env.threads)  # both models, both ways
-        return Expected(variant.name, env, len(self.x) + timed, seconds=samples.MIN_SECONDS)
+        return Expected(variant.name, env, len(self.x) + timed, lambda each: samples.MIN_SECONDS)
 
     def run(self, watch: Watch, provenance: Mapping[str, Any], command: str) -> ModelRecord:
         """Measure what is missing and return the record. Raises ValueError where the full model cannot be measured."""

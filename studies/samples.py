@@ -192,6 +192,19 @@ def _repeat_points(objective: Objective, x: Tensor, rows: int, each: float, larg
     return _repeat(x, rows), took
 
 
+def repeat_seconds(objective: Objective, points: int, each: float) -> float:
+    """Estimate what timing adds to one evaluation of points that take `each` [s per episode]: `measure`, then turns."""
+    full = min(objective.preferred_batch, points)
+    rows, added = _timed_rows(objective, full, each), each * full if each * full < BATCH_SECONDS else 0.0
+    while each * rows < BATCH_SECONDS and rows < objective.preferred_batch:
+        rows = min(4 * rows, objective.preferred_batch)
+        added += each * rows
+    took = each * rows
+    both = max(REPETITION, took / 2) + max(REPETITION, took)  # a loss takes about half of that
+    turns = TURNS - 1 if objective.device == "cpu" and took < DISTURBED else 0
+    return added + both + turns * (took + both)
+
+
 def _repeat(x: Tensor, rows: int) -> Tensor:
     return x.repeat(-(-rows // len(x)), 1)[:rows]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import abc
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -232,12 +232,15 @@ EVERY_STUDY = ("points", "seed")  # the options that every study takes
 
 @dataclass(frozen=True)
 class Expected:
-    """Say what is left to simulate of a variant: so many `episodes` with gradient, and `seconds` that timing adds."""
+    """Say what is left to simulate of a variant: so many `episodes` with gradient, and `repeats` to time it.
+
+    Its repeats take so long [s] where an episode takes so long [s].
+    """
 
     name: str
     env: Environment
     episodes: float
-    seconds: float = 0.0
+    repeats: Callable[[float], float] = lambda each: 0.0
 
 
 class Study(abc.ABC):

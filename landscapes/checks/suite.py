@@ -85,6 +85,12 @@ class Settings:
     follow: Callable[[str], None] = lambda name: None
 
 
+def makers(how: Settings) -> set[Callable[[], Objective]]:
+    """Return what makes other objectives for a check."""
+    found = [how.twin, how.other_mode, *how.finer.values(), *how.horizons.values(), *(one.make for one in how.variants)]
+    return {make for make in found if make is not None}
+
+
 def check(objective: Objective, settings: Settings | None = None, results: Results | None = None) -> Iterator[Finding]:
     """Check an objective and yield what was found, check by check; the rest of it is left in `results`.
 
