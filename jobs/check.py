@@ -44,6 +44,7 @@ POINT_ROWS = 32  # rows that are held for a point: those of all steps of a ladde
 FORWARD = 64  # parameters of which both modes are compared at most
 FINER, SAME_STEP = (2, 4), 0.01  # parts of the time step, and by which share of it the nearest may be another
 LENGTHS = 32  # of episodes, among which the first whose gradient is wrong is looked for
+COMPILED_ROWS = 12  # of the batch by which it is measured what another environment compiles: as many as it will get
 OWN_SECONDS = 1.0  # that checks take themselves, such as whether memory grows
 MODES = ("forward", "reverse")  # of automatic differentiation
 IDENTITY = "identity"  # in the record in a folder: what was checked, and how
@@ -236,7 +237,7 @@ class CheckJob:
             variants=[*_time_steps(self), *_materials(self), *_horizons(self)],
             horizons=_lengths(self),
             other_mode=_other_mode(self),
-            finer={factor: make for factor in FINER if (make := _finer(self, factor))},
+            finer={factor: self._keep(make) for factor in FINER if (make := _finer(self, factor))},
             lengths=_shorter(self.env),
             make_length=self.env.with_horizon,
             expected=self.env.known_failures.get(self.env.fidelity.name, {}),
@@ -248,9 +249,12 @@ class CheckJob:
         own = self.env.horizon
         if not own:
             return {}
-        keep = cache if self.env.device == "cpu" else lambda make: make  # there is no memory for all of them on a GPU
-        others = {factor: keep(partial(self.env.with_horizon, factor * own)) for factor in FACTORS[1:]}
+        others = {factor: self._keep(partial(self.env.with_horizon, factor * own)) for factor in FACTORS[1:]}
         return {1: self.itself, **others}
+
+    def _keep(self, make: Callable[[], Environment]) -> Callable[[], Environment]:
+        """Return what makes another environment, once: but there is no memory for all of them on a GPU."""
+        return cache(make) if self.env.device == "cpu" else make
 
     def work(self) -> list[Work]:
         """Return about how many episodes all checks take."""
@@ -267,16 +271,21 @@ class CheckJob:
         """Return what is checked, and how long it will take [s]: episodes, and what other environments compile."""
         env, cost, (work,) = self.env, episode_cost(self.env), self.work()
         plain, sloped = work.losses, work.gradients
-        start = next(iter(self._settings.finer.values()), env.remake)() if env.own_programs else env
-        others = self._others
-        compiling = others * start_seconds(start, env.space.uniform(env.preferred_batch, seed=0))
+        compiling = self._compiling_seconds()
         seconds = (plain * cost.forward + sloped * cost.gradient) / env.threads + compiling + OWN_SECONDS
         subject = f"{env.name} · {env.fidelity.name} · {env.device} · {env.engine} · {points_for(self.power)} points"
         if env.precision != env.fidelity.precision:
             subject += f" · its losses are {env.precision}"
         whole = f"{subject}: some {plain} episodes and {sloped} with gradients, about {duration(seconds)}"
-        more = f", {duration(compiling)} of it to compile {others} variants" if compiling else ""
-        return whole + more, seconds
+        return whole + (f", {duration(compiling)} of it to compile variants" if compiling else ""), seconds
+
+    def _compiling_seconds(self) -> float:
+        """Measure what one other environment compiles, and return what those take that are left [s]."""
+        if not self.env.own_programs or not self._others:
+            return 0.0
+        first = next(iter(self._settings.finer.values()), self.env.remake)()
+        rows = min(COMPILED_ROWS, first.preferred_batch)
+        return (self._others - 1) * start_seconds(first, first.space.uniform(rows, seed=0))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -23,7 +23,7 @@ from ..landscapes.plain import digest
 from ..landscapes.storage.checkpoint import Checkpoint
 from ..landscapes.storage.files import moved_by
 from ..landscapes.verification import StoredPoints, verify
-from .kept import own_folder
+from .own_folder import own_folder
 from .samples import Evaluate, Follow, Parts, evaluate_parts
 
 FOLDER = "references"

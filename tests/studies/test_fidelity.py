@@ -61,7 +61,7 @@ class Converging(Environment):
 @pytest.fixture(autouse=True)
 def own_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Keep measurements in a folder of the test's own, and time by the clock of the scene."""
-    monkeypatch.setattr("gradscape.studies.kept.user_data_path", lambda name: tmp_path / "data" / name)
+    monkeypatch.setattr("gradscape.studies.own_folder.user_data_path", lambda name: tmp_path / "data" / name)
     for module in (samples, cost):
         monkeypatch.setattr(module, "time", CLOCK)
     monkeypatch.setattr(samples, "RESAMPLES", 99)
