@@ -21,7 +21,8 @@ MEASURED = "measured here, now"
 class PlannedWork:
     """Say what one objective's share of a job takes: seconds of an episode by kind, in all, and bytes.
 
-    `rate` says where the seconds are from; `compiling` is what comes before the first episode, of all that are made [s].
+    `rate` says where the seconds are from; `compiling` is what comes before the first episode [s], and `repeating` what
+    is done again to be timed [s].
     """
 
     env: str
@@ -36,12 +37,13 @@ class PlannedWork:
     gpu_memory: int
     disk: int
     compiling: float = 0.0
+    repeating: float = 0.0
 
     @property
     def seconds(self) -> float:
         """What all of it takes to compile and to simulate [s]."""
         episodes = self.losses * self.seconds_per_loss + self.gradients * self.seconds_per_gradient
-        return self.compiling + episodes
+        return self.compiling + episodes + self.repeating
 
 
 @dataclass(frozen=True)
@@ -107,6 +109,7 @@ def plan_work(works: Sequence[Work], command: str, watch: Watch, *, device: str 
             disk=sum(work.disk for work in mine),
             memory=max(work.memory for work in mine),
             others=sum(work.others for work in mine),
+            repeats=lambda each, mine=mine: sum(work.repeats(each) for work in mine),  # type: ignore[misc]
         )
         with watch.busy(f"{same.name}: {PREPARING}"):
             parts.append(_plan_part(whole, device))
@@ -149,6 +152,7 @@ def _plan_part(work: Work, device: str | None) -> PlannedWork:
         gpu_memory=episodes if on_gpu else 0,
         disk=round(work.disk),
         compiling=compiling,
+        repeating=work.repeats(each[True]),
     )
 
 

@@ -60,7 +60,7 @@ class StudyJob(CheckpointedJob[StudyRecord]):
     def work(self) -> Iterator[Work]:
         """Yield the variants that are left."""
         for one in self.study.expected():
-            yield Work(one.env, 0, round(one.episodes))
+            yield Work(one.env, 0, round(one.episodes), repeats=one.repeats)
 
     def compute(self, watch: Watch) -> StudyRecord:
         """Measure what is missing, and return the record."""
