@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -81,10 +82,13 @@ class StudyJob(CheckpointedJob[StudyRecord]):
         left = [(one, expected_work(one.env)) for one in self.study.expected()]
         if not left:
             return {}
-        base = env.remake(fidelity=next(iter(env.fidelities)))
+        base, began = env.remake(fidelity=next(iter(env.fidelities))), time.perf_counter()
         base.prepare()
-        x = base.space.sobol(min(len(self.study.x), base.preferred_batch), seed=0)
-        start = start_seconds(base, x)
+        prepared = time.perf_counter() - began if base.own_programs else 0.0
+        part = base.device == "cuda" or base.whole_batches  # of which a part takes as long as all of it
+        rows = min(len(self.study.x), base.preferred_batch) if part else base.preferred_batch
+        x = base.space.sobol(rows, seed=0)
+        start = prepared + start_seconds(base, x)
         rate = seconds_per_episode(base, x, grad=True) / expected_work(base)
         return {one.name: start + one.episodes * rate * work + one.repeats(rate * work) for one, work in left}
 
