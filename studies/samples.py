@@ -21,6 +21,7 @@ from ..landscapes.statistics import CONFIDENCE, gradient_error, median_of, p95_o
 
 REPETITION, TURNS = 0.04, 4  # least seconds that repetitions of a quick batch take, each way, and how often
 LARGEST = 60.0  # most seconds that a batch larger than the study's points may take
+GIVEN_UP = 10.0  # seconds that all points have to take at least, for a variant to be given up at the first
 WORTH = 0.9  # of the time of an episode: a larger batch that saves less is not followed by one larger still
 RESAMPLES = 999  # of the bootstrap
 MIN_ROUNDS, MAX_ROUNDS = 9, 49  # in which two objectives are timed in turn
@@ -147,6 +148,7 @@ def measure(
     took = time.perf_counter() - began
     if took * full < BATCH_SECONDS:
         evaluate(objective, x[:full], grad=True)
+    limit = max(limit, GIVEN_UP / len(x))
     if took > limit and (first := _slow_start(objective, x, limit)):
         return first
     found, each = by(objective, x, follow)
