@@ -37,12 +37,9 @@ def evaluate_reference(
     Nothing is kept of a function, of which nothing says when it changes. Raises UnwritableError where nothing can be
     kept.
     """
-    identity = objective.identity()
-    if not identity.get(MODEL_VERSION):
+    if not objective.identity().get(MODEL_VERSION):
         return by(objective, x, follow)
-    store = Checkpoint(own_folder() / FOLDER)
-    of = digest([identity, x.tolist(), _machine(objective)])
-    name = f"{objective.name}-{objective.device}-{of}"
+    store, name = _place(objective, x)
     if (kept := store.load(name)) is not None and (found := _verified(objective, x, kept, store.folder / name)):
         follow(len(x))
         return found, float(kept["seconds"])
@@ -51,6 +48,18 @@ def evaluate_reference(
     with moved_by("XDG_DATA_HOME", "what was measured"):
         store.save(name, **arrays, error=np.array(found.error), seconds=np.array(seconds))
     return found, seconds
+
+
+def is_kept(objective: Objective, x: Float[Tensor, "point dim"]) -> bool:
+    """Say whether what a reference returns at points is kept."""
+    store, name = _place(objective, x)
+    return name in store.names()
+
+
+def _place(objective: Objective, x: Tensor) -> tuple[Checkpoint, str]:
+    """Return what holds all references, and the name of one there."""
+    of = digest([objective.identity(), x.tolist(), _machine(objective)])
+    return Checkpoint(own_folder() / FOLDER), f"{objective.name}-{objective.device}-{of}"
 
 
 def _machine(objective: Objective) -> list[object]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import abc
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -17,7 +17,8 @@ from ..landscapes.identity import MODEL_VERSION
 from ..landscapes.options import record_options
 from ..landscapes.sampling.memory import free_memory
 from ..landscapes.storage.checkpoint import Checkpoint
-from .references import evaluate_reference
+from ..landscapes.verification import POINTS
+from .references import evaluate_reference, is_kept
 from .samples import Sample, evaluate_parts, evaluate_points
 
 if TYPE_CHECKING:
@@ -393,13 +394,24 @@ class VariantStudy(Study):
         """Say how much there is to measure."""
         left = len(self.left())
         kept = f", {len(self.variants) - left} are there already" if left < len(self.variants) else ""
-        return f"{left} {self.what} to measure{kept}"
+        known = f", the {self.variants[0].name} by what is kept of it" if self._is_known(self.variants[0]) else ""
+        return f"{left} {self.what} to measure{kept}{known}"
+
+    def _is_known(self, variant: Variant) -> bool:
+        """Say whether a variant is the reference, and an earlier study has kept what it returns at these points."""
+        if variant.name != self.variants[0].name or self.checkpoint.load(self.part(variant)) is not None:
+            return False
+        with suppress(ValueError, RuntimeError, MemoryError):  # refused: whoever measures it will say so
+            return is_kept(self._make(variant), self.x)
+        return False
 
     def expected(self) -> Iterator[Expected]:
         """Yield the variants that are not measured yet and not refused."""
         for variant in self.left():
             with self.refusing(variant.name):
-                yield self._expect(variant, self._make(variant))
+                found = self._expect(variant, self._make(variant))
+                known = len(self.x) - POINTS if self._is_known(variant) else 0
+                yield replace(found, episodes=max(0.0, found.episodes - known))
 
     def _make(self, variant: Variant) -> Environment:
         return variant.make(self.env)

@@ -204,7 +204,8 @@ def test_the_reference_is_evaluated_once_for_studies_of_every_kind(run: Run, mon
     how = ["converging", "--points", "16", "--device", "cpu", "--out"]
     first = run.json("study", "fidelity", *how, "a")
     evaluated.clear()
-    run.ok("study", "convergence", *how, "b", "--settings", "precision")
+    done = run.ok("study", "convergence", *how, "b", "--settings", "precision")
+    assert "levels to measure, the reference by what is kept of it at 16 points" in done.stderr
     assert sum(evaluated) == 2 * POINTS  # what the study is verified by, and what the kept points are
     monkeypatch.setattr(Converging, "_evaluate", lambda *x, grad: _double(simulate(*x, grad=grad)))
     with pytest.warns(RuntimeWarning, match="losses are others now: .* it is evaluated again"):
