@@ -15,7 +15,7 @@ from ..landscapes.checks.examination import Share, points_for
 from ..landscapes.checks.finding import Finding
 from ..landscapes.checks.parameters import ParameterRow
 from ..landscapes.checks.slopes import Kind, counts
-from ..landscapes.checks.suite import POWER, Results, Settings, check, episodes, makers
+from ..landscapes.checks.suite import POWER, Results, Settings, check, count_others, episodes
 from ..landscapes.checks.usefulness import Usefulness
 from ..landscapes.convert import to_json
 from ..landscapes.cost import duration, episode_cost, start_seconds
@@ -263,9 +263,9 @@ class CheckJob:
         return [Work(self.env, losses, gradients, others=self._others)]
 
     @property
-    def _others(self) -> int:
-        """How many other environments are made."""
-        return len(makers(self._settings) - {self.itself})
+    def _others(self) -> float:
+        """How many other environments are made, by the time that it takes to compile them."""
+        return count_others(self._settings, self.itself)
 
     def _cost(self) -> tuple[str, float]:
         """Return what is checked, and how long it will take [s]: episodes, and what other environments compile."""
@@ -283,9 +283,10 @@ class CheckJob:
         """Measure what one other environment compiles, and return what those take that are left [s]."""
         if not self.env.own_programs or not self._others:
             return 0.0
-        first = next(iter(self._settings.finer.values()), self.env.remake)()
+        finer = [*self._settings.finer.values()]
+        first = (finer[0] if finer else self.env.remake)()
         rows = min(COMPILED_ROWS, first.preferred_batch)
-        return (self._others - 1) * start_seconds(first, first.space.uniform(rows, seed=0))
+        return (self._others - bool(finer)) * start_seconds(first, first.space.uniform(rows, seed=0))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -35,7 +35,7 @@ class Work:
     gradients: int = 0
     disk: float = 0.0
     memory: float = 0.0
-    others: int = 0
+    others: float = 0.0
     repeats: Callable[[float], float] = lambda each: 0.0
 
 
