@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +26,10 @@ from rich.text import Text
 
 from ..jobs.watch import Advance, AdvanceOne, Say, Watch
 from ..landscapes.plain import printable
+
+
+LATE, LATE_SECONDS = 1.5, 5.0  # times what was announced, and seconds more than that, from which a job is late
+ENOUGH_DONE = 0.02  # of a bar, by which it is told how long all of it takes
 
 
 class Console(rich.Console):
@@ -61,17 +67,68 @@ class Described(TextColumn):
         super().__init__("{task.description}", markup=False)
 
 
+@dataclass
+class Announcement:
+    """Hold how long a job said it would take [s], and when; a bar `begun` later says how much of it is done."""
+
+    seconds: float
+    said: float
+    begun: float = 0.0
+    first: float = 0.0
+    share: float = 0.0
+
+    def begin(self, share: float) -> None:
+        """Begin to count, at this share of the bar."""
+        self.begun, self.first, self.share = time.monotonic(), share, share
+
+    def describe_delay(self) -> str:
+        """Say that it takes longer, and how long if enough is done to tell; nothing where it does not."""
+        now = time.monotonic()
+        if now - self.said <= max(LATE * self.seconds, self.seconds + LATE_SECONDS):
+            return ""
+        from ..landscapes.cost import duration
+
+        done, said = self.share - self.first, f"takes longer than announced: {duration(self.seconds)} said"
+        if done < ENOUGH_DONE:
+            return f"{said}, {duration(now - self.said)} gone"
+        whole = self.begun - self.said + (now - self.begun) * (1 - self.first) / done
+        return f"{said}, now about {duration(whole)}"
+
+
 class Bars(Watch):
-    """Show what a job tells on a console: notes as lines, and bars while it works."""
+    """Show what a job tells on a console: notes as lines, and bars while it works.
+
+    A job that takes longer than it has announced says so, once.
+    """
 
     def __init__(self, console: Console | None = None) -> None:
         self.console = console or Console(stderr=True, soft_wrap=True)
+        self._announced: Announcement | None = None
+
+    def announce(self, text: str, seconds: float) -> None:
+        """Print a line, and hold the job to it."""
+        self.note(text)
+        self._announced = Announcement(seconds, time.monotonic())
+
+    def _look(self) -> None:
+        """Say where a job takes longer than announced."""
+        if self._announced and (said := self._announced.describe_delay()):
+            self._announced = None
+            self.note(said)
+
+    def _follow(self, share: float, *, begin: bool = False) -> None:
+        """Take what share of a bar is done."""
+        if self._announced and begin:
+            self._announced.begin(share)
+        if self._announced:
+            self._announced.share = share
+        self._look()
 
     folder: Path | None = None  # of the last job that has finished
 
     def finish(self, folder: Path, files: Sequence[str], said: str = "") -> None:
         """Print what came out, and which files are where."""
-        self.folder = folder
+        self.folder, self._announced = folder, None
         super().finish(folder, files, said)
 
     def note(self, text: str) -> None:
@@ -82,7 +139,13 @@ class Bars(Watch):
     def busy(self, text: str) -> Iterator[Say]:
         """Turn a wheel next to a text, which may change."""
         with self.console.status(text) as status:
-            yield status.update
+
+            def say(text: str) -> None:
+                status.update(text)
+                self._look()
+
+            yield say
+        self._look()
 
     @contextmanager
     def progress(self, total: int, what: str = "episodes") -> Iterator[Advance]:
@@ -92,9 +155,11 @@ class Bars(Watch):
 
             def advance(done: int, said: str = "") -> None:
                 nonlocal task
-                if task is None:
+                begin = task is None
+                if begin:
                     task = bar.add_task(what, total=total, completed=done)
                 bar.update(task, completed=done, description=said or what)
+                self._follow(done / max(1, total), begin=begin)
 
             yield advance
 
@@ -102,8 +167,15 @@ class Bars(Watch):
     def progress_of(self, totals: Mapping[str, int]) -> Iterator[AdvanceOne]:
         """Show a bar for each of several things, which is there from the beginning."""
         with Progress(*_columns(), console=self.console) as bar:
-            tasks = {name: bar.add_task(name, total=total) for name, total in totals.items()}
-            yield lambda name, done, said: bar.update(tasks[name], completed=done, description=said)
+            tasks, counts = {name: bar.add_task(name, total=total) for name, total in totals.items()}, dict[str, int]()
+
+            def advance(name: str, done: int, said: str) -> None:
+                bar.update(tasks[name], completed=done, description=said)
+                begin = len(counts) < len(totals)  # the first of each says where it begins
+                counts[name] = done
+                self._follow(sum(counts.values()) / max(1, sum(totals.values())), begin=begin)
+
+            yield advance
 
 
 def _columns() -> tuple[ProgressColumn, ...]:

@@ -10,6 +10,9 @@ if TYPE_CHECKING:
     from ..jobs.plan import Plan
 
 
+SHOWN_SECONDS = 0.5  # of compiling, from which it is worth a word
+
+
 def show(found: Plan, console: Console) -> None:
     """Print a row for each environment, and the sum of them."""
     from ..landscapes.capacity import size
@@ -24,10 +27,11 @@ def show(found: Plan, console: Console) -> None:
     console.print(rows)
     for part in found.parts:
         each = {"a loss": part.seconds_per_loss, "a gradient": part.seconds_per_gradient}
+        each |= {"to compile": part.compiling if part.compiling > SHOWN_SECONDS else 0.0}
         said = ", ".join(f"{seconds:.3g} s {what}" for what, seconds in each.items() if seconds)
         console.print(f"{part.env}: {said}, {part.rate}")
     console.print(
-        f"{found.episodes} episodes, {duration(found.seconds)} of simulation, {size(found.disk)} on disk; "
+        f"{found.episodes} episodes, {duration(found.seconds)} to compile and simulate, {size(found.disk)} on disk; "
         "what pictures and search methods take is not in it",
         soft_wrap=True,
     )

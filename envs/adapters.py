@@ -41,6 +41,7 @@ class FunctionEnvironment(Environment):
             engines=(function.backend.engine,),
             devices=function.backend.devices,
             horizon_option=function.horizon or "horizon",
+            own_programs=function.backend.own_programs,
         )
         self.loss_type = ""  # of numbers that the losses came in, once there are some
         super().__init__(**settings)

@@ -64,6 +64,7 @@ class Backend(abc.ABC):
 
     engine: ClassVar[str]
     devices: ClassVar[tuple[str, ...]] = ("cpu", "cuda")
+    own_programs: ClassVar[bool] = False  # whether a function is compiled, for each size of batch
     device: str  # where it runs by default: auto, cpu or cuda
 
     def has_cuda(self) -> bool:

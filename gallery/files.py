@@ -17,7 +17,8 @@ from ..jobs.folder import CARD as CARD_FILES
 from ..jobs.folder import LEAGUE as LEAGUE_FILES
 from ..jobs.folder import REPORT as REPORT_FILES
 from ..jobs.folder import SLICE as SLICE_FILES
-from ..studies.kept import FOLDER, file_name
+from ..studies.kept import file_name
+from ..studies.own_folder import STUDIES as STUDIES
 
 HERE = Path(__file__).parent
 FIGURES, PAPER = HERE / "figures.toml", HERE / "paper.toml"
@@ -32,7 +33,6 @@ REPORT, MEASURES, QUALITY, QUALITY_ARRAYS = REPORT_FILES.files
 COMPANIONS, COMPANION_PICTURE = "companions.json", "companions.png"
 SURFACES = ("surface.png", "surface.html", "surface.gltf", "surface.glb")
 RUNS, RUN_SUFFIX = "runs", ".zarr.zip"
-STUDIES = FOLDER  # the folder of studies
 CARD = "card"  # the folder of the report card of gradients
 CARD_RECORD, CARD_PICTURE = CARD_FILES.files[0], CARD_FILES.picture
 LEAGUE = "league"  # the folder of the league

@@ -223,7 +223,8 @@ class CensusJob(CheckpointedJob["Census"]):
         if left:
             each = simulation_seconds(self.env, without, having, samples)
             lower = "--slices, --resolution and --gradients"
-            watch.note(f"about {duration(len(left) * each)} here; {lower} change it")
+            seconds = len(left) * each
+            watch.announce(f"about {duration(seconds)} here; {lower} change it", seconds)
 
     def _survey(self, deviation: float, numerics: float, watch: Watch) -> dict[str, SurveyedSlice]:
         from ..landscapes.measures.census import SurveyedSlice

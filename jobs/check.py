@@ -15,10 +15,10 @@ from ..landscapes.checks.examination import Share, points_for
 from ..landscapes.checks.finding import Finding
 from ..landscapes.checks.parameters import ParameterRow
 from ..landscapes.checks.slopes import Kind, counts
-from ..landscapes.checks.suite import POWER, Results, Settings, check, episodes
+from ..landscapes.checks.suite import POWER, Results, Settings, check, count_others, episodes
 from ..landscapes.checks.usefulness import Usefulness
 from ..landscapes.convert import to_json
-from ..landscapes.cost import duration, episode_cost
+from ..landscapes.cost import duration, episode_cost, start_seconds
 from ..landscapes.identity import check_identity
 from ..landscapes.options import record_options
 from ..landscapes.plain import jsonable, plain_json
@@ -44,6 +44,8 @@ POINT_ROWS = 32  # rows that are held for a point: those of all steps of a ladde
 FORWARD = 64  # parameters of which both modes are compared at most
 FINER, SAME_STEP = (2, 4), 0.01  # parts of the time step, and by which share of it the nearest may be another
 LENGTHS = 32  # of episodes, among which the first whose gradient is wrong is looked for
+COMPILED_ROWS = 12  # of the batch by which it is measured what another environment compiles: as many as it will get
+OWN_SECONDS = 1.0  # that checks take themselves, such as whether memory grows
 MODES = ("forward", "reverse")  # of automatic differentiation
 IDENTITY = "identity"  # in the record in a folder: what was checked, and how
 
@@ -63,7 +65,7 @@ def _materials(job: CheckJob) -> list[ExtremeCase]:
     for name, bound in (("softest", space.lower), ("stiffest", space.upper)):
         x = space.center[None].clone()
         x[0, stiff] = bound[stiff]
-        found.append(ExtremeCase(name, lambda: job.env, x=x))
+        found.append(ExtremeCase(name, job.itself, x=x))
     return found
 
 
@@ -151,6 +153,10 @@ class CheckJob:
         """The name that the environment is registered by."""
         return self.spec.name if isinstance(self.spec.name, str) else self.env.name
 
+    def itself(self) -> Environment:
+        """Return the environment, where others of its kind are made."""
+        return self.env
+
     def findings(self, watch: Watch | None = None) -> Iterator[Finding]:
         """Say what it will cost, then yield what each check finds as soon as it is found.
 
@@ -162,7 +168,8 @@ class CheckJob:
         found = self._run(lambda check: say(f"{self.name}: {check}"))
         try:
             with watch.busy(f"{self.name}: {PREPARING}"):
-                watch.note(self._cost())
+                said, seconds = self._cost()
+            watch.announce(said, seconds)
             while True:
                 with watch.busy(f"{self.name}: checking") as say:
                     finding = next(found, None)
@@ -216,21 +223,25 @@ class CheckJob:
         return CheckFolder(check=self, identity=identity, folder=folder, command=self.command, prints=prints)
 
     def _run(self, follow: Callable[[str], None]) -> Iterator[Finding]:
-        settings = Settings(  # once the cost is known, and by that the type of the losses
+        # Once the cost is known, and by that the type of the losses.
+        how = replace(self._settings, precision=self.env.precision, follow=follow)
+        yield from check(self.env, how, self.results)
+
+    @cached_property
+    def _settings(self) -> Settings:
+        """What is checked, and what else can be made of the environment for that."""
+        return Settings(
             power=self.power,
             seed=self.seed,
-            precision=self.env.precision,
             twin=_twin(self),
             variants=[*_time_steps(self), *_materials(self), *_horizons(self)],
             horizons=_lengths(self),
             other_mode=_other_mode(self),
-            finer={factor: make for factor in FINER if (make := _finer(self, factor))},
+            finer={factor: self._keep(make) for factor in FINER if (make := _finer(self, factor))},
             lengths=_shorter(self.env),
             make_length=self.env.with_horizon,
             expected=self.env.known_failures.get(self.env.fidelity.name, {}),
-            follow=follow,
         )
-        yield from check(self.env, settings, self.results)
 
     @cached_property
     def longer(self) -> dict[int, Callable[[], Environment]]:
@@ -238,25 +249,44 @@ class CheckJob:
         own = self.env.horizon
         if not own:
             return {}
-        keep = cache if self.env.device == "cpu" else lambda make: make  # there is no memory for all of them on a GPU
-        others = {factor: keep(partial(self.env.with_horizon, factor * own)) for factor in FACTORS[1:]}
-        return {1: lambda: self.env, **others}
+        others = {factor: self._keep(partial(self.env.with_horizon, factor * own)) for factor in FACTORS[1:]}
+        return {1: self.itself, **others}
+
+    def _keep(self, make: Callable[[], Environment]) -> Callable[[], Environment]:
+        """Return what makes another environment, once: but there is no memory for all of them on a GPU."""
+        return cache(make) if self.env.device == "cpu" else make
 
     def work(self) -> list[Work]:
         """Return about how many episodes all checks take."""
         losses, gradients = episodes(self.env.space.dim, self.power, tuple(_lengths(self)))
         gradients += 2 * (sum(FACTORS) + 4)  # two points over longer horizons, time steps and materials
-        return [Work(self.env, losses, gradients)]
+        return [Work(self.env, losses, gradients, others=self._others)]
 
-    def _cost(self) -> str:
-        """Return what is checked and how long it will take."""
+    @property
+    def _others(self) -> float:
+        """How many other environments are made, by the time that it takes to compile them."""
+        return count_others(self._settings, self.itself)
+
+    def _cost(self) -> tuple[str, float]:
+        """Return what is checked, and how long it will take [s]: episodes, and what other environments compile."""
         env, cost, (work,) = self.env, episode_cost(self.env), self.work()
         plain, sloped = work.losses, work.gradients
-        seconds = (plain * cost.forward + sloped * cost.gradient) / env.threads
+        compiling = self._compiling_seconds()
+        seconds = (plain * cost.forward + sloped * cost.gradient) / env.threads + compiling + OWN_SECONDS
         subject = f"{env.name} · {env.fidelity.name} · {env.device} · {env.engine} · {points_for(self.power)} points"
         if env.precision != env.fidelity.precision:
             subject += f" · its losses are {env.precision}"
-        return f"{subject}: some {plain} episodes and {sloped} with gradients, about {duration(seconds)}"
+        whole = f"{subject}: some {plain} episodes and {sloped} with gradients, about {duration(seconds)}"
+        return whole + (f", {duration(compiling)} of it to compile variants" if compiling else ""), seconds
+
+    def _compiling_seconds(self) -> float:
+        """Measure what one other environment compiles, and return what those take that are left [s]."""
+        if not self.env.own_programs or not self._others:
+            return 0.0
+        finer = [*self._settings.finer.values()]
+        first = (finer[0] if finer else self.env.remake)()
+        rows = min(COMPILED_ROWS, first.preferred_batch)
+        return (self._others - bool(finer)) * start_seconds(first, first.space.uniform(rows, seed=0))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -329,7 +359,7 @@ def _time_step(job: CheckJob, factor: int, dt: float) -> ExtremeCase:
     from ..landscapes.checks.extremes import ExtremeCase
 
     if factor == 1:
-        return ExtremeCase("dt 1x", lambda: job.env)
+        return ExtremeCase("dt 1x", job.itself)
     own = job.env.fidelity
     longer_steps = replace(job.spec, fidelity=replace(own, name=f"{own.name}, dt {factor}x", dt=dt))
     note = ""

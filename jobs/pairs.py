@@ -158,7 +158,9 @@ class PairsJob(CheckpointedJob[PairRanking]):
             each = seconds_per_episode(env, design.move_one(range(1))[: env.preferred_batch], grad=False)
         samples, dim = len(design.base), env.space.dim
         watch.note(f"{env.name} · {env.fidelity.name} · {env.device} · {self.folder}")
-        watch.note(
+        seconds = design.episodes * each
+        watch.announce(
             f"{design.episodes} episodes, {samples} with gradients, for {dim} parameters and {dim * (dim - 1) // 2} "
-            f"pairs: at most about {duration(design.episodes * each)}; --samples lowers it"
+            f"pairs: at most about {duration(seconds)}; --samples lowers it",
+            seconds,
         )

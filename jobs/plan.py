@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
 from ..landscapes.capacity import peak_memory
-from ..landscapes.cost import seconds_per_episode
+from ..landscapes.cost import seconds_per_episode, start_seconds
 from .watch import PREPARING, Watch, Work
 
 if TYPE_CHECKING:
@@ -20,7 +21,8 @@ MEASURED = "measured here, now"
 class PlannedWork:
     """Say what one objective's share of a job takes: seconds of an episode by kind, in all, and bytes.
 
-    `rate` says where the seconds are from.
+    `rate` says where the seconds are from; `compiling` is what comes before the first episode [s], and `repeating` what
+    is done again to be timed [s].
     """
 
     env: str
@@ -34,11 +36,14 @@ class PlannedWork:
     memory: int
     gpu_memory: int
     disk: int
+    compiling: float = 0.0
+    repeating: float = 0.0
 
     @property
     def seconds(self) -> float:
-        """What all of it takes to simulate [s]."""
-        return self.losses * self.seconds_per_loss + self.gradients * self.seconds_per_gradient
+        """What all of it takes to compile and to simulate [s]."""
+        episodes = self.losses * self.seconds_per_loss + self.gradients * self.seconds_per_gradient
+        return self.compiling + episodes + self.repeating
 
 
 @dataclass(frozen=True)
@@ -64,7 +69,7 @@ class Plan:
 
     @property
     def seconds(self) -> float:
-        """What it takes to simulate [s]."""
+        """What it takes to compile and to simulate [s]."""
         return sum(part.seconds for part in self.parts)
 
     @property
@@ -103,6 +108,8 @@ def plan_work(works: Sequence[Work], command: str, watch: Watch, *, device: str 
             gradients=sum(work.gradients for work in mine),
             disk=sum(work.disk for work in mine),
             memory=max(work.memory for work in mine),
+            others=sum(work.others for work in mine),
+            repeats=lambda each, mine=mine: sum(work.repeats(each) for work in mine),  # type: ignore[misc]
         )
         with watch.busy(f"{same.name}: {PREPARING}"):
             parts.append(_plan_part(whole, device))
@@ -119,7 +126,7 @@ def simulation_seconds(objective: Objective, losses: int, gradients: int, rows: 
 
 def _plan_part(work: Work, device: str | None) -> PlannedWork:
     objective, identity = work.objective, work.objective.identity()
-    counts, rate = {False: work.losses, True: work.gradients}, MEASURED
+    counts, rate, compiling = {False: work.losses, True: work.gradients}, MEASURED, 0.0
     if device is not None:
         from ..envs.registry import as_environment
         from .scene import find_variant
@@ -128,7 +135,7 @@ def _plan_part(work: Work, device: str | None) -> PlannedWork:
         kept = variant.comparison.seconds
         each, rate = {False: kept.forward, True: kept.with_gradient}, f"kept in {path}"
     else:
-        objective.prepare()
+        compiling = _compiling_seconds(objective, work)
         each = {grad: _seconds(objective, count, grad=grad) for grad, count in counts.items()}
     episodes = objective.memory() * objective.preferred_batch
     on_gpu = (device or objective.device) == "cuda"
@@ -144,7 +151,19 @@ def _plan_part(work: Work, device: str | None) -> PlannedWork:
         memory=round(peak_memory() + work.memory),
         gpu_memory=episodes if on_gpu else 0,
         disk=round(work.disk),
+        compiling=compiling,
+        repeating=work.repeats(each[True]),
     )
+
+
+def _compiling_seconds(objective: Objective, work: Work) -> float:
+    """Measure what comes before the first episode [s], of the objective and of the others of its kind."""
+    began = time.perf_counter()
+    objective.prepare()
+    prepared = time.perf_counter() - began
+    rows = max(1, min(objective.preferred_batch, work.losses + work.gradients))
+    start = start_seconds(objective, objective.space.uniform(rows, seed=0), grad=work.gradients > 0)
+    return prepared + (1 + work.others) * start
 
 
 def _seconds(objective: Objective, count: int, *, grad: bool) -> float:

@@ -300,10 +300,11 @@ def _announce(env: Environment, dataset: xr.Dataset, points: int, watch: Watch) 
     episodes = env.memory() * env.preferred_batch
     device = f", {size(episodes)} of the GPU's" if env.device == "cuda" else ""
     memory = peak_memory() + own_bytes + need_of(rank, env.space.dim, points).memory + (0 if device else episodes)
-    watch.note(
+    watch.announce(
         f"{env.name} · {env.fidelity.name} · {env.device}: up to {losses} episodes and {gradients} with gradients: "
         f"about {duration(seconds)}, and {duration(own_seconds)} to measure {dataset['loss'].size} samples; "
-        f"{size(memory)} of memory{device}"
+        f"{size(memory)} of memory{device}",
+        seconds + own_seconds,
     )
 
 

@@ -327,7 +327,7 @@ def _time(env: Environment, variants: Sequence[Environment]) -> dict[str, float]
     from ..landscapes.storage.files import write_json
     from ..landscapes.storage.records import read_json, reading
     from ..studies import variants as timing
-    from ..studies.kept import own_folder
+    from ..studies.own_folder import own_folder
 
     # Others take another time.
     of = digest([record_options(env.options), env.engine, env.version_on(env.engine), __version__])

@@ -21,7 +21,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..landscapes.capacity import peak_memory, size
-from ..landscapes.cost import duration, seconds_per_episode
+from ..landscapes.cost import PICTURE_SECONDS, duration, seconds_per_episode
 from ..landscapes.directions import barrier
 from ..landscapes.identity import plane_of, stored_identity, with_stride
 from ..landscapes.lattice import check_gradients, count_gradients
@@ -295,9 +295,12 @@ class SliceJob(SummaryJob[SliceSummary]):
         again = floor_episodes(self.objective, total)
         more = [f"{losses} between samples"] * (losses > 0) + [f"{again} of its replicas"] * (again > 0)
         between = f"; plus at most {' and '.join(more)}" if more else ""
-        watch.note(
-            f"{most}{cost.episodes} {kind} to compute{kept}: about {duration(cost.seconds)}, "
-            f"{size(cost.memory)} of memory{_gpu_memory(self.objective)}{between}"
+        floors = len(self.objective.replicas()) * total if self.floor else 0
+        seconds = cost.seconds * (1 + (losses + again + floors) / cost.episodes) + PICTURE_SECONDS
+        watch.announce(
+            f"{most}{cost.episodes} {kind} to compute{kept}: about {duration(seconds)} with all that follows, "
+            f"{size(cost.memory)} of memory{_gpu_memory(self.objective)}{between}",
+            seconds,
         )
 
     def _sample(self, watch: Watch) -> tuple[xr.Dataset, int]:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..landscapes.cost import duration, seconds_per_episode
+from ..landscapes.cost import PICTURE_SECONDS, duration, seconds_per_episode, start_seconds
 from ..studies import study_class
 from ..studies.variants import Study, StudyOptions, StudyRecord, expected_work
 from .folder import ROOT, STUDIES, Results, folder_named
@@ -60,7 +61,7 @@ class StudyJob(CheckpointedJob[StudyRecord]):
     def work(self) -> Iterator[Work]:
         """Yield the variants that are left."""
         for one in self.study.expected():
-            yield Work(one.env, 0, round(one.episodes))
+            yield Work(one.env, 0, round(one.episodes), repeats=one.repeats)
 
     def compute(self, watch: Watch) -> StudyRecord:
         """Measure what is missing, and return the record."""
@@ -76,15 +77,20 @@ class StudyJob(CheckpointedJob[StudyRecord]):
         return self.study.describe_kept()
 
     def seconds(self) -> dict[str, float]:
-        """Estimate the seconds of each variant that is left, by the work of an episode."""
+        """Estimate the seconds of each variant that is left, by the work of an episode and what is to be compiled."""
         env = self.study.env
         left = [(one, expected_work(one.env)) for one in self.study.expected()]
         if not left:
             return {}
-        base = env.remake(fidelity=next(iter(env.fidelities)))
+        base, began = env.remake(fidelity=next(iter(env.fidelities))), time.perf_counter()
         base.prepare()
-        rate = seconds_per_episode(base, base.space.sobol(len(self.study.x), seed=0), grad=True) / expected_work(base)
-        return {one.name: one.seconds + rate * work * one.episodes for one, work in left}
+        prepared = time.perf_counter() - began if base.own_programs else 0.0
+        part = base.device == "cuda" or base.whole_batches  # of which a part takes as long as all of it
+        rows = min(len(self.study.x), base.preferred_batch) if part else base.preferred_batch
+        x = base.space.sobol(rows, seed=0)
+        start = prepared + start_seconds(base, x)
+        rate = seconds_per_episode(base, x, grad=True) / expected_work(base)
+        return {one.name: start + one.episodes * rate * work + one.repeats(rate * work) for one, work in left}
 
     def _announce(self, watch: Watch) -> None:
         """Say what is left to measure and about how long that takes."""
@@ -96,4 +102,5 @@ class StudyJob(CheckpointedJob[StudyRecord]):
         if seconds:
             dearest = max(seconds, key=lambda name: seconds[name])
             most = f"{duration(seconds[dearest])} of it {dearest}, " if len(seconds) > 1 else ""
-            watch.note(f"about {duration(sum(seconds.values()))}, {most}by the work of an episode; {study.advice}")
+            whole = sum(seconds.values()) + PICTURE_SECONDS
+            watch.announce(f"about {duration(whole)}, {most}by the work of an episode; {study.advice}", whole)

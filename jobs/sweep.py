@@ -18,7 +18,7 @@ import numpy as np
 import xarray as xr
 
 from ..landscapes.capacity import BLOCK, Need, require, size
-from ..landscapes.cost import duration
+from ..landscapes.cost import FRAME_SECONDS, PICTURE_SECONDS, duration
 from ..landscapes.identity import with_stride
 from ..landscapes.lattice import check_gradients
 from ..landscapes.objective import BoxedObjective, Objective, failed
@@ -230,8 +230,9 @@ class SweepJob(SummaryJob[SweepSummary]):
             cost = self.cost()
         kept = f", {self.total - left} are there already" if left < self.total else ""
         slices = f"{len(self.stores)} slices" if len(self.stores) > 1 else "one slice"
-        takes = f"about {duration(cost.seconds)}, {size(cost.memory)} of memory"
-        watch.note(f"{left} {kind} of {slices} to compute{kept}: {takes}")
+        seconds = cost.seconds + PICTURE_SECONDS + FRAME_SECONDS * len(self.motion.values)
+        takes = f"about {duration(seconds)} with the film, {size(cost.memory)} of memory"
+        watch.announce(f"{left} {kind} of {slices} to compute{kept}: {takes}", seconds)
 
     def _sample(self, number: int, count: _Count) -> xr.Dataset:
         (objective, made), store = self._sampled(number), self.stores[number]

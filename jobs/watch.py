@@ -25,7 +25,9 @@ PREPARING = "preparing (kernels are compiled once, then kept)"
 class Work:
     """Hold what a job has to simulate: `losses` without gradients and `gradients` with, and the bytes it leaves.
 
-    `memory` is what its own arrays take [bytes], without the simulation's.
+    `memory` is what its own arrays take [bytes], without the simulation's. It makes so many `others` of the objective's
+    kind, each of which compiles programs of its own where the objective does. Its repeats, by which it is timed, take so
+    long [s] where an episode with gradient takes so long [s].
     """
 
     objective: Objective
@@ -33,6 +35,8 @@ class Work:
     gradients: int = 0
     disk: float = 0.0
     memory: float = 0.0
+    others: float = 0.0
+    repeats: Callable[[float], float] = lambda each: 0.0
 
 
 class Stopped(KeyboardInterrupt):
@@ -74,6 +78,10 @@ class Watch:
 
     def note(self, text: str) -> None:
         """Take a line that is worth keeping: what a job will cost, a warning, what it has left out."""
+
+    def announce(self, text: str, seconds: float) -> None:
+        """Take a line that says what is left to do, which is expected to take so long [s] from now."""
+        self.note(text)
 
     def plan(self, works: Iterable[Work]) -> None:
         """Take what a job is about to simulate; a watch that only plans raises Planned."""

@@ -15,6 +15,8 @@ from .sampling.memory import MemoryBound
 MOMENT = 0.5  # seconds to spend on measuring what an episode alone costs
 LONG = 5.0  # seconds from which the first, which warms things up, must do
 ENOUGH = 1.0  # seconds that a batch must take to be an estimate
+PICTURE_SECONDS = 2.0  # of the first picture, with what is imported for it
+FRAME_SECONDS = 0.3  # of each frame of a film
 WARM_UP = 10.0  # seconds from which a first batch, which may compile, is not repeated
 
 
@@ -36,9 +38,12 @@ def episode_cost(objective: Objective, *, grad: bool = True) -> EpisodeCost:
     objective.prepare()
     x = objective.space.uniform(1, seed=0)
     best = {False: float("inf"), True: float("inf") if grad else float("nan")}
+    ways = (False, True) if grad else (False,)
+    for way in ways if objective.own_programs else ():
+        objective.evaluate(x, grad=way)  # compiles it, however long that takes
     began, rounds = time.perf_counter(), 0
     while time.perf_counter() - began < (MOMENT if rounds > 1 else LONG):
-        for way in (False, True) if grad else (False,):
+        for way in ways:
             best[way] = min(best[way], measure_seconds(objective, x, grad=way))
         rounds += 1
     return EpisodeCost(best[False], best[True])
@@ -59,12 +64,25 @@ def seconds_per_episode(
     whole = objective.device == "cuda" or objective.whole_batches
     rows = len(points) if whole else min(len(points), objective.threads)
     seconds = measure_seconds(bound, points[:rows], grad=grad)
-    if seconds < WARM_UP:
+    if seconds < WARM_UP or objective.own_programs:
         seconds = measure_seconds(bound, points[:rows], grad=grad)
     while seconds < ENOUGH <= seconds / rows * count and rows < len(points):
         rows = min(round(max(4.0, ENOUGH / max(seconds, 1e-9)) * rows), len(points))  # they take no longer than enough
+        if objective.own_programs:
+            bound.evaluate(points[:rows], grad=grad)  # compiles what such a batch takes
         seconds = measure_seconds(bound, points[:rows], grad=grad)
     return seconds / rows
+
+
+def start_seconds(objective: Objective, points: Float[Tensor, "batch dim"], *, grad: bool = True) -> float:
+    """Measure what an objective that compiles programs of its own takes until it can evaluate as many points [s].
+
+    It is 0 for others: what these compile, all objectives of their kind share.
+    """
+    if not objective.own_programs:
+        return 0.0
+    first, then = (measure_seconds(objective, points, grad=grad) for _ in range(2))
+    return max(0.0, first - then)
 
 
 def measure_seconds(objective: Objective, points: Float[Tensor, "batch dim"], *, grad: bool) -> float:

@@ -193,6 +193,7 @@ class Objective(abc.ABC):
     threads: int = 1  # that a batch is spread over
     preferred_batch: int = 1  # points worth evaluating at once
     whole_batches: bool = False  # whether a part of a batch takes as long as all of it
+    own_programs: bool = False  # whether each one made compiles programs of its own, for each size of batch
     decisions: int = 1  # how often controls are chosen in an episode: dim / decisions of them, time first
     _named: bool = False
 
@@ -303,7 +304,7 @@ class ObjectiveWrapper(Objective):
         self.objective = objective
         self.name, self.space, self.loss_unit = objective.name, objective.space, objective.loss_unit
         self.beyond_box, self.device, self.decisions = objective.beyond_box, objective.device, objective.decisions
-        self.whole_batches = objective.whole_batches
+        self.whole_batches, self.own_programs = objective.whole_batches, objective.own_programs
 
 
 PASSED_ON = (

@@ -22,7 +22,7 @@ from ..landscapes.statistics import gradient_error, median_of, p95_of
 from .divergence import Distributions, Divergence, Neighbours
 from .order import UNMOVED, Order, Shapes, Verdict, choose_order, extrapolate, find_floor, fit_order, measure_order
 from .samples import Bootstrap, Sample, loss_range
-from .variants import StudyRecord, Variant, VariantStudy, refuse_single, samples_of
+from .variants import Expected, StudyRecord, Variant, VariantStudy, refuse_single, samples_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -281,8 +281,8 @@ class ConvergenceStudy(VariantStudy):
     takes = ("settings",)
     what = "levels"
     advice = (
-        "compiling kernels and the divergence of neighbours come on top; --points (16 are enough) and --settings lower "
-        "it"
+        "compiling kernels, and distributions where it is chaotic, come on top; --points (16 are enough) and --settings "
+        "lower it"
     )
 
     def __init__(self, env: Environment, options: StudyOptions) -> None:
@@ -310,6 +310,15 @@ class ConvergenceStudy(VariantStudy):
             require("episodes", 1, lambda count: Need(float(count * env.memory())))
         return env
 
+    def expected(self) -> Iterator[Expected]:
+        """Yield the variants that are not measured yet and not refused, and the neighbours."""
+        yield from super().expected()
+        if count := self._neighbours(1.0).count_left():
+            yield Expected("the divergence of neighbours", self.env, count)
+
+    def _neighbours(self, spread: float) -> Neighbours:
+        return Neighbours(self.env, self.x, self.seed, self.checkpoint, spread)
+
     def run(self, watch: Watch, provenance: Mapping[str, Any], command: str) -> ConvergenceRecord:
         """Measure what is missing and return the record."""
         samples = samples_of(self.measure_all(watch))
@@ -322,7 +331,7 @@ class ConvergenceStudy(VariantStudy):
         pairs = [(one, order) for one, (_, order) in zip(refined, found, strict=True) if one in asked]
         losses = {one: samples[one].loss for one in self.env.fidelities if one in samples}
         settings = tuple(one for one, _ in found)
-        neighbours = Neighbours(self.env, self.x, self.seed, self.checkpoint, scale.spread)
+        neighbours = self._neighbours(scale.spread)
         divergence = neighbours.measure_divergence(watch)
         chaos = divergence is not None and divergence.is_chaos
         return ConvergenceRecord(

@@ -237,6 +237,9 @@ def _sum_up(apart: Array, seed: int) -> Distance:
     return Distance(*(Bootstrap.of(lambda values: values.mean(axis=-1), column, seed=seed) for column in apart.T))
 
 
+RESPONSES = "responses"  # the part with the losses of neighbours
+
+
 @dataclass(frozen=True)
 class Neighbours:
     """The neighbours of the points `x` of a scene at its reference `env`, shape (point, dim); parts of a checkpoint.
@@ -249,6 +252,13 @@ class Neighbours:
     seed: int
     checkpoint: Checkpoint
     spread: float
+
+    def count_left(self) -> float:
+        """Count the episodes with gradients that following neighbours takes as long as; 0 where that is done."""
+        if self.checkpoint.load(RESPONSES) is not None:
+            return 0.0
+        alone = self.env.threads * (1 + NEIGHBOURS) * len(self.x[:FOLLOWED_POINTS])
+        return alone + (1 + len(SIZES)) * len(self.x) / 2  # a loss takes about half of a gradient
 
     def measure_divergence(self, watch: Watch) -> Divergence | None:
         """Follow neighbours at some points, and say how they part; None where a scene shows no motion."""
@@ -310,7 +320,7 @@ class Neighbours:
         space = self.env.space
         turns = _directions(len(self.x), space.dim, seed=self.seed)
         every = torch.cat([self.x, *(self.x + size * turns * (space.upper - space.lower) for size in SIZES)])
-        losses = self._losses("responses", self.env, torch.clamp(every, space.lower, space.upper))
+        losses = self._losses(RESPONSES, self.env, torch.clamp(every, space.lower, space.upper))
         base, *others = losses.reshape(1 + len(SIZES), -1)
         found = []
         for size, loss in zip(SIZES, others, strict=True):

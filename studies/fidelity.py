@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
 from ..envs.records import Fidelity
+from ..landscapes.sampling.memory import sparing_collections
 from ..landscapes.statistics import fit_line
 from . import samples
 from .samples import Comparison, Sample, compare, pareto_front, spread
@@ -27,6 +29,8 @@ SETTINGS = ("dt", "resolution", "particles", "precision", "stiffness", "engine",
 DT_FACTORS, CELL_FACTORS, PARTICLE_FACTORS = (0.5, 2.0, 4.0), (2 / 3, 1.5), (0.5, 2.0)
 STIFFNESS_FACTORS = (0.25, 0.5, 2.0, 4.0)
 MIN_ERRORS = 3  # that an order of convergence is fitted to
+IN_TURN = "timed-in-turn"  # the part of the checkpoint that holds these times
+OUT_OF_REACH = 3.0  # times the reference's time: a variant that takes more is measured at its first points alone
 
 
 @dataclass(frozen=True)
@@ -34,7 +38,8 @@ class MeasuredVariant:
     """Hold one way to simulate a scene and what was measured of it.
 
     `changed` names the setting that differs from a named fidelity, "named" where none does; `memory` is what an episode
-    takes [bytes] as the scene estimates it.
+    takes [bytes] as the scene estimates it. What takes far longer than the reference is `given_up` after that many
+    points, 0 of others.
     """
 
     name: str
@@ -45,6 +50,7 @@ class MeasuredVariant:
     options: dict[str, Any]
     memory: int | None
     comparison: Comparison
+    given_up: int = 0
 
     @property
     def seconds(self) -> float:
@@ -109,7 +115,7 @@ class FidelityRecord(StudyRecord):
 
     def cheapest(self, tolerance: float) -> MeasuredVariant | None:
         """Return the quickest of the variants but the reference that is within a share of the spread, None if none."""
-        others = [row for row in self.by_time if row.name != self.reference]
+        others = [row for row in self.by_time if row.name != self.reference and not row.given_up]
         return next((row for row in others if (off := row.p95(relative=True)) is not None and off <= tolerance), None)
 
     def table(self) -> pd.DataFrame:
@@ -132,8 +138,10 @@ class FidelityRecord(StudyRecord):
         return pd.DataFrame(rows).set_index("name")
 
     def sentences(self) -> list[str]:
-        """Return the orders of convergence in dt."""
-        return [
+        """Return the orders of convergence in dt, and what was given up."""
+        lost = [f"{one.name} after {one.given_up} of {self.points}" for one in self.variants if one.given_up]
+        said = [f"given up, more than {OUT_OF_REACH:g} times the reference's time: {', '.join(lost)} points"]
+        return said * bool(lost) + [
             f"error ~ dt^{fit.order:z.2f} ± {fit.standard_error:.2f}: {', '.join(fit.variants)}" for fit in self.orders
         ]
 
@@ -151,6 +159,7 @@ class FidelityStudy(VariantStudy):
     def __init__(self, env: Environment, options: StudyOptions) -> None:
         super().__init__(env, options)
         self._variants = self._list_variants()
+        self._made: dict[str, Environment] = {}
 
     def _list_variants(self) -> list[Variant]:
         refuse_single(self.env)
@@ -163,15 +172,48 @@ class FidelityStudy(VariantStudy):
 
     def measure(self, variant: Variant, follow: Follow) -> Mapping[str, Any]:
         """Return the arrays of a variant's sample, with its times."""
-        return samples.measure(self._make(variant), self.x, follow=follow).arrays()
+        reference = self.checkpoint.load(self.part(self.variants[0]))
+        limit = math.inf if reference is None else OUT_OF_REACH * float(reference["with_gradient"])
+        env, by = self._make(variant), self.evaluates(variant)
+        if variant.device == "cpu":
+            self._made[variant.name] = env
+        found = samples.measure(env, self.x, follow=follow, limit=limit, by=by).arrays()
+        env.release()
+        return found
 
     def _expect(self, variant: Variant, env: Environment) -> Expected:
-        repeated = 2 / 3 * min(len(self.x), env.preferred_batch)
-        return Expected(variant.name, env, len(self.x) + repeated, seconds=2 * samples.REPETITION)
+        return Expected(variant.name, env, len(self.x), partial(samples.repeat_seconds, env, len(self.x)))
 
     def run(self, watch: Watch, provenance: Mapping[str, Any], command: str) -> FidelityRecord:
         """Measure what is missing and return the record."""
-        return self.conclude(samples_of(self.measure_all(watch)), provenance, command)
+        with sparing_collections():
+            found = self._time_in_turn(samples_of(self.measure_all(watch)), watch)
+        return self.conclude(found, provenance, command)
+
+    def _time_in_turn(self, found: Mapping[str, Sample], watch: Watch) -> dict[str, Sample]:
+        """Time quick variants again, all in each turn, so that what else keeps the machine busy hits not one alone."""
+        kept, quick = self.checkpoint.load(IN_TURN), [one for one in self.variants if self._is_quick(found, one)]
+        names, times = [one.name for one in quick], ("forward", "with_gradient")
+        if kept is None or kept["names"].tolist() != names:
+            timed = {name: found[name] for name in names}
+            with watch.busy(f"{self.env.name}: timing {len(names)} {self.what} in turn"):
+                for one in quick * (samples.TURNS - 1):
+                    timed[one.name] = samples.time_again(self._remade(one), self.x, timed[one.name])
+                    self._remade(one).release()
+            kept = {part: np.array([getattr(one, part) for one in timed.values()]) for part in times}
+            self.checkpoint.save(IN_TURN, names=np.array(names), **kept)
+        rows = zip(names, *(kept[part].tolist() for part in times), strict=True)
+        again = {name: replace(found[name], forward=forward, with_gradient=both) for name, forward, both in rows}
+        return {**found, **again}
+
+    def _is_quick(self, found: Mapping[str, Sample], variant: Variant) -> bool:
+        return variant.device == "cpu" and variant.name in found and found[variant.name].quick
+
+    def _remade(self, variant: Variant) -> Environment:
+        """Return the environment that was measured, which is made again where an earlier process has done that."""
+        if variant.name not in self._made:
+            self._made[variant.name] = self._make(variant)
+        return self._made[variant.name]
 
     def conclude(self, found: Mapping[str, Sample], provenance: Mapping[str, Any], command: str) -> FidelityRecord:
         """Compare the samples with that of the reference, which is the first variant."""
@@ -190,9 +232,13 @@ class FidelityStudy(VariantStudy):
 
     def compare(self, variant: Variant, sample: Sample, reference: Sample) -> MeasuredVariant:
         """Compare a variant's sample with the reference's."""
-        one, memory = variant, variant.make(self.env).memory()
-        found = compare(sample, reference, seed=self.seed)
-        return MeasuredVariant(one.name, one.changed, one.fidelity, one.engine, one.device, one.options, memory, found)
+        memory, points = variant.make(self.env).memory(), len(sample.loss)
+        return MeasuredVariant(
+            **{name: getattr(variant, name) for name in ("name", "changed", "fidelity", "engine", "device", "options")},
+            memory=memory,
+            comparison=compare(sample, reference, seed=self.seed),
+            given_up=points if points < len(self.x) else 0,
+        )
 
 
 def list_variants(env: Environment, settings: Sequence[str]) -> list[Variant]:
@@ -246,6 +292,7 @@ def fit_orders(variants: tuple[MeasuredVariant, ...]) -> tuple[ConvergenceOrder,
             (one.fidelity.dt, error, one.name)
             for one in variants
             if not one.differs_beyond_dt(reference)
+            and not one.given_up
             and one.fidelity.precision == precision
             and one.fidelity.dt > reference.fidelity.dt
             and (error := one.comparison.loss_error.median.value)

@@ -8,8 +8,6 @@ from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar, cast
 
-from platformdirs import user_data_path
-
 from ..landscapes.convert import from_json, to_json
 from ..landscapes.identity import MODEL_VERSION, current_identity
 from ..landscapes.options import record_options
@@ -17,6 +15,7 @@ from ..landscapes.plain import digest, number, text
 from ..landscapes.storage.files import moved_by
 from ..landscapes.storage.records import read_json, reading, write_record
 from . import record_class
+from .own_folder import STUDIES, own_folder
 
 if TYPE_CHECKING:
     from ..envs.base import Environment
@@ -26,7 +25,6 @@ if TYPE_CHECKING:
 
 Record = TypeVar("Record", bound="StudyRecord")
 DEVICES = ("cpu", "cuda")
-FOLDER = "studies"
 
 
 def keep(found: StudyRecord) -> Path | None:
@@ -42,11 +40,6 @@ def keep(found: StudyRecord) -> Path | None:
     with moved_by("XDG_DATA_HOME", "what was measured"):
         write_record(path, to_json(kept))
     return path
-
-
-def own_folder() -> Path:
-    """Return where the user's own studies are kept."""
-    return user_data_path("gradscape") / FOLDER
 
 
 def file_name(env: str, device: str, kind: str, of: str = "") -> str:
@@ -69,7 +62,7 @@ def read_study(path: Path, kind: str) -> StudyRecord:
 
 def kept_studies(kind: type[Record], env: str) -> Iterator[tuple[Path, Record]]:
     """Yield the studies of a kind that are kept of a scene, the user's own before the gallery's."""
-    for folder in (own_folder(), Path(str(resources.files("gradscape.gallery"))) / "data" / FOLDER):
+    for folder in (own_folder(), Path(str(resources.files("gradscape.gallery"))) / "data" / STUDIES):
         for device in DEVICES:
             for path in sorted(folder.glob(f"{env}-{device}*.{kind.kind}.json")):
                 yield path, cast("Record", read_study(path, kind.kind))

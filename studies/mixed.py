@@ -330,7 +330,7 @@ class MixedStudy(FidelityStudy):
         started, sample = time.perf_counter(), None
         free_memory()
         with self.refusing(variant.name):
-            sample = samples.measure(self._make(variant), x, patience=PATIENCE)
+            sample = samples.measure(self._make(variant), x, patience=PATIENCE, by=self.evaluates(variant))
         self.took[variant.name] = self.took.get(variant.name, 0.0) + time.perf_counter() - started
         if sample is None:
             return None

@@ -211,7 +211,8 @@ class ModelStudy(VariantStudy):
     def measure(self, variant: Variant, follow: Follow) -> Mapping[str, Any]:
         """Return the arrays of a model's sample, and of one with a part changed the times in turn with the full one."""
         if variant.changed != PART:
-            return evaluate_points(self.env, self._moved() if variant.name == AGAIN else self.x, follow).arrays()
+            x = self._moved() if variant.name == AGAIN else self.x
+            return evaluate_points(self.env, x, follow, by=self.evaluates(variant)).arrays()
         env = self._make(variant)
         sample = evaluate_points(env, self.x, follow)
         for one in (self.env, env):
@@ -240,7 +241,7 @@ class ModelStudy(VariantStudy):
         if variant.changed != PART:
             return Expected(variant.name, env, len(self.x) * (REPEATS if variant.name == AGAIN else 1))
         timed = 4 * (samples.MIN_ROUNDS + 2) * max(1, self.env.threads)  # both models, both ways
-        return Expected(variant.name, env, len(self.x) + timed, seconds=samples.MIN_SECONDS)
+        return Expected(variant.name, env, len(self.x) + timed, lambda each: samples.MIN_SECONDS)
 
     def run(self, watch: Watch, provenance: Mapping[str, Any], command: str) -> ModelRecord:
         """Measure what is missing and return the record. Raises ValueError where the full model cannot be measured."""

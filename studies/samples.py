@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -18,17 +19,22 @@ from ..landscapes.objective import Evaluation, Objective, Status, evaluate, has_
 from ..landscapes.plain import finite
 from ..landscapes.statistics import CONFIDENCE, gradient_error, median_of, p95_of, spearman
 
-REPETITION = 4.0  # least seconds that repetitions of a quick batch take, each way
+REPETITION, TURNS = 0.04, 4  # least seconds that repetitions of a quick batch take, each way, and how often
 LARGEST = 60.0  # most seconds that a batch larger than the study's points may take
+GIVEN_UP = 10.0  # seconds that all points have to take at least, for a variant to be given up at the first
+WORTH = 0.9  # of the time of an episode: a larger batch that saves less is not followed by one larger still
 RESAMPLES = 999  # of the bootstrap
 MIN_ROUNDS, MAX_ROUNDS = 9, 49  # in which two objectives are timed in turn
 MIN_SECONDS = 8.0  # that the rounds take together, up to the most rounds
+DISTURBED = 1.0  # seconds from which a batch is timed once only
 BATCH_SECONDS = 0.2  # that a batch should take to be timed in turn
 Array = NDArray[np.float64]
 Follow = Callable[[int], None]  # hears how many points are done
+Parts = tuple[Evaluation, float]  # what points return, and the seconds of an episode in the best batch
+Evaluate = Callable[[Objective, Tensor, Follow], Parts]  # with gradients
 
 
-def _ignore(done: int) -> None:
+def ignore(done: int) -> None:
     """Take no notice."""
 
 
@@ -83,72 +89,144 @@ class Sample:
         )
 
     @property
+    def quick(self) -> bool:
+        """Whether it was timed, and in so little time that what else kept the machine busy can have disturbed it."""
+        return self.forward > 0 and self.batch * self.with_gradient < DISTURBED
+
+    @property
     def fine(self) -> NDArray[np.bool_]:
         """Which points have a finite loss and a finite gradient, shape (point,)."""
         found: NDArray[np.bool_] = self.status == Status.OK
         return found
 
 
-def evaluate_points(objective: Objective, x: Float[Tensor, "point dim"], follow: Follow = _ignore) -> Sample:
-    """Evaluate losses and gradients in the batches that an objective prefers; seconds are those of the best batch."""
+def evaluate_parts(objective: Objective, x: Float[Tensor, "point dim"], follow: Follow = ignore) -> Parts:
+    """Evaluate points in the batches that an objective prefers."""
     objective.prepare()
-    found, seconds = _evaluate_parts(objective, x, follow)
-    each = min(took / rows for took, rows in zip(seconds, _rows(objective, x), strict=True))
+    parts, each, done = list[Evaluation](), math.inf, 0
+    for part in torch.split(x, objective.preferred_batch):
+        began = time.perf_counter()
+        parts.append(evaluate(objective, part, grad=True))
+        each = min(each, (time.perf_counter() - began) / len(part))
+        follow(done := done + len(part))
+    return Evaluation.join(parts, dim=objective.space.dim, grad=True), each
+
+
+def evaluate_points(
+    objective: Objective,
+    x: Float[Tensor, "point dim"],
+    follow: Follow = ignore,
+    *,
+    by: Evaluate = evaluate_parts,
+) -> Sample:
+    """Evaluate losses and gradients in the batches that an objective prefers; seconds are those of the best batch."""
+    found, each = by(objective, x, follow)
     return Sample.of(found, objective, with_gradient=each)
 
 
 def measure(
-    objective: Objective, x: Float[Tensor, "point dim"], *, follow: Follow = _ignore, patience: float | None = None
+    objective: Objective,
+    x: Float[Tensor, "point dim"],
+    *,
+    follow: Follow = ignore,
+    patience: float | None = None,
+    limit: float = math.inf,
+    by: Evaluate = evaluate_parts,
 ) -> Sample:
     """Evaluate an objective at the points of a study, then time it.
 
-    Seconds are the best of repetitions, of batches as large as the objective prefers, or as patience allows: both take
-    at most `patience` [s] beyond one evaluation, where that is given.
+    Seconds are the best of repetitions, of batches as large as saves time: both take at most `patience` [s] beyond one
+    evaluation, where that is given. What takes more than `limit` [s per episode] for its first points, at best, is
+    given up there: the sample is that of these points.
     """
-    repetition, largest = (REPETITION, LARGEST) if patience is None else (patience, patience)
+    alone = REPETITION * (1 if objective.device == "cpu" else TURNS)  # a GPU is nobody else's, and takes no turns
+    repetition, largest = (alone, LARGEST) if patience is None else (patience, patience)
     full = min(objective.preferred_batch, len(x))
     objective.prepare()
     began = time.perf_counter()
     evaluate(objective, x[:1], grad=True)  # what is made at first use is made now, a batch's threads too if quick
-    if (time.perf_counter() - began) * full < repetition:
+    took = time.perf_counter() - began
+    if took * full < BATCH_SECONDS:
         evaluate(objective, x[:full], grad=True)
-    found, seconds = _evaluate_parts(objective, x, follow)
-    batch = _repeat_points(objective, x, full, seconds[0], largest)
-    taken = min(seconds[: len(x) // full]) if len(batch) == full else np.inf
-    forward = _best(objective, batch, grad=False, known=np.inf, repetition=repetition)
-    with_gradient = _best(objective, batch, grad=True, known=taken, repetition=repetition)
+    limit = max(limit, GIVEN_UP / len(x))
+    if took > limit and (first := _slow_start(objective, x, limit)):
+        return first
+    found, each = by(objective, x, follow)
+    batch, took = _repeat_points(objective, x, _timed_rows(objective, full, each), each, largest)
+    forward = _best(objective, batch, grad=False, known=math.inf, repetition=repetition)
+    with_gradient = _best(objective, batch, grad=True, known=took, repetition=repetition)
     return Sample.of(found, objective, forward=forward, with_gradient=with_gradient, batch=len(batch))
 
 
-def _rows(objective: Objective, x: Tensor) -> list[int]:
-    return [len(part) for part in torch.split(x, objective.preferred_batch)]
+def _whole(objective: Objective) -> bool:
+    """Say whether a part of a batch takes as long as all of it."""
+    return objective.device == "cuda" or objective.whole_batches
 
 
-def _evaluate_parts(objective: Objective, x: Tensor, follow: Follow) -> tuple[Evaluation, list[float]]:
-    """Evaluate points batch by batch; return the seconds of each batch, too."""
-    parts, seconds, done = list[Evaluation](), list[float](), 0
-    for part in torch.split(x, objective.preferred_batch):
+def _slow_start(objective: Objective, x: Tensor, limit: float) -> Sample | None:
+    """Return the sample of as many points as are computed at once, if even so one takes more than `limit` [s]."""
+    most = objective.preferred_batch if _whole(objective) else objective.threads
+    found, each = evaluate_parts(objective, x[:most])
+    rows = len(found.loss)
+    at_best = each * rows / most if _whole(objective) else each
+    return Sample.of(found, objective, with_gradient=each, batch=rows) if at_best > limit else None
+
+
+def _timed_rows(objective: Objective, full: int, each: float) -> int:
+    """Return how many of the points are timed: a batch, of which threads need no more than take long enough."""
+    turns = DISTURBED / max(each, 1e-9) / objective.threads
+    return full if _whole(objective) else min(full, objective.threads * max(1, math.ceil(turns)))
+
+
+def _repeat_points(objective: Objective, x: Tensor, rows: int, each: float, largest: float) -> tuple[Tensor, float]:
+    """Return the points, repeated to as many as are worth evaluating at once, and the seconds that they took.
+
+    So many `rows` take `each` [s per episode]. More are tried up to what the objective prefers, or what takes `largest`
+    seconds, as long as that saves time.
+    """
+    at_once, took = objective.preferred_batch, each * rows
+    worth = _whole(objective) or took < BATCH_SECONDS
+    while worth and rows < at_once and took * (more := min(4 * rows, at_once)) / rows < largest:
         began = time.perf_counter()
-        parts.append(evaluate(objective, part, grad=True))
-        seconds.append(time.perf_counter() - began)
-        follow(done := done + len(part))
-    return Evaluation.join(parts, dim=objective.space.dim, grad=True), seconds
+        objective.evaluate(_repeat(x, more), grad=True)
+        before, rows, took = took / rows, more, time.perf_counter() - began
+        worth = took < BATCH_SECONDS or (_whole(objective) and took / rows < WORTH * before)
+    return _repeat(x, rows), took
 
 
-def _repeat_points(objective: Objective, x: Tensor, rows: int, took: float, largest: float) -> Tensor:
-    """Return the points repeated to as many as are worth evaluating at once, or to what takes `largest` seconds."""
-    at_once = objective.preferred_batch
-    while rows < at_once and took * (more := min(4 * rows, at_once)) / rows < largest:
-        began = time.perf_counter()
-        objective.evaluate(x.repeat(-(-more // len(x)), 1)[:more], grad=True)
-        rows, took = more, time.perf_counter() - began
+def repeat_seconds(objective: Objective, points: int, each: float) -> float:
+    """Estimate what timing adds to one evaluation of points that take `each` [s per episode]: `measure`, then turns."""
+    full = min(objective.preferred_batch, points)
+    rows, added = _timed_rows(objective, full, each), each * full if each * full < BATCH_SECONDS else 0.0
+    while each * rows < BATCH_SECONDS and rows < objective.preferred_batch:
+        rows = min(4 * rows, objective.preferred_batch)
+        added += each * rows
+    took = each * rows
+    both = max(REPETITION, took / 2) + max(REPETITION, took)  # a loss takes about half of that
+    turns = TURNS - 1 if objective.device == "cpu" and took < DISTURBED else 0
+    return added + both + turns * (took + both)
+
+
+def _repeat(x: Tensor, rows: int) -> Tensor:
     return x.repeat(-(-rows // len(x)), 1)[:rows]
+
+
+def time_again(objective: Objective, x: Float[Tensor, "point dim"], sample: Sample) -> Sample:
+    """Time a quick objective once more, as `measure` has done; seconds are the best of both."""
+    batch = _repeat(x, sample.batch)
+    objective.evaluate(batch, grad=True)
+    known = {False: sample.forward, True: sample.with_gradient}
+    found = {
+        grad: min(before, _best(objective, batch, grad=grad, known=math.inf, repetition=REPETITION))
+        for grad, before in known.items()
+    }
+    return replace(sample, forward=found[False], with_gradient=found[True])
 
 
 def _best(objective: Objective, batch: Tensor, *, grad: bool, known: float, repetition: float) -> float:
     """Return seconds per episode, the least of repetitions; `known` is what the batch took before."""
     best, start = known, time.perf_counter()
-    while not np.isfinite(best) or time.perf_counter() - start + best < repetition:
+    while not math.isfinite(best) or time.perf_counter() - start + best < repetition:
         began = time.perf_counter()
         objective.evaluate(batch, grad=grad)
         best = min(best, time.perf_counter() - began)
@@ -293,18 +371,18 @@ class Comparison:
 
 
 def compare(variant: Sample, reference: Sample, *, seed: int) -> Comparison:
-    """Hold a variant against the reference.
+    """Hold a variant against the reference, at its first points where the variant was given up after these.
 
     The 95th percentile is the next larger error of the sample, not interpolated. Gradients are per width of the box;
     they are equal where both are exactly zero, and where one is, their cosine is 0 and they are infinitely far off.
     """
+    scale, reference = spread(reference), reference.first(len(variant.loss))
     known = has_loss(reference.status)
     both = known & has_loss(variant.status)
     wanted = both & reference.fine
     gradients = wanted & variant.fine
     error = np.where(has_loss(variant.status), np.abs(variant.loss - reference.loss), np.inf)[known]
     cosine, off = gradient_error(variant.grad[gradients], reference.grad[gradients])
-    scale = spread(reference)
     median, p95 = (Bootstrap.of(of, error, seed=seed) for of in (median_of, p95_of))
     return Comparison(
         LossError(median, p95, median.share(scale), p95.share(scale)),

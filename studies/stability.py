@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,7 +17,8 @@ from torch import Tensor
 
 from ..landscapes.objective import Evaluation, Objective, Status
 from ..landscapes.sampling.memory import MemoryBound
-from .samples import Sample, loss_range
+from .references import evaluate_reference
+from .samples import Evaluate, Follow, Parts, Sample, ignore, loss_range
 from .variants import one_line
 
 ACCURATE, INACCURATE, UNJUDGED, REFUSED = "accurate", "inaccurate", "not judged", "refused"
@@ -33,23 +36,33 @@ def is_stable(sample: Sample) -> bool:
     return not sample.refused and bool(sample.fine.all())
 
 
-def ask(objective: Objective, x: Float[Tensor, "point dim"]) -> Sample:
+def evaluate_bound(objective: Objective, x: Float[Tensor, "point dim"], follow: Follow) -> Parts:
+    """Evaluate points in batches that the device has memory for."""
+    began = time.perf_counter()
+    found = MemoryBound(objective).evaluate(x, grad=True)
+    return found, (time.perf_counter() - began) / len(x)
+
+
+evaluate_kept = partial(evaluate_reference, by=evaluate_bound)
+
+
+def ask(objective: Objective, x: Float[Tensor, "point dim"], by: Evaluate = evaluate_bound) -> Sample:
     """Evaluate an objective at the points of a study; whatever it raises is an answer, too.
 
     A ValueError refuses the setting, and so does too little memory for a single point, which says nothing of how the
     setting behaves. Any other error is that of a point: points are then asked one by one.
     """
     try:
-        found, error = _ask_together(objective, x)
+        found, error = _ask_together(objective, x, by)
     except (ValueError, MemoryError) as refusal:
         return refuse(_line(refusal))
     return Sample.of(found, objective, error=error)
 
 
-def _ask_together(objective: Objective, x: Float[Tensor, "point dim"]) -> tuple[Evaluation, str]:
+def _ask_together(objective: Objective, x: Float[Tensor, "point dim"], by: Evaluate) -> tuple[Evaluation, str]:
     """Evaluate all points, one by one where that raises, and return what the first of them raised, too."""
     try:
-        found = MemoryBound(objective).evaluate(x, grad=True)
+        found, _ = by(objective, x, ignore)
         return found, found.error
     except (OSError, ValueError, MemoryError):  # of the system or of the setting, not of a point
         raise

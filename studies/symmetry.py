@@ -160,7 +160,7 @@ class SymmetryStudy(VariantStudy):
     def measure(self, variant: Variant, follow: Follow) -> Mapping[str, Any]:
         """Return the arrays that are measured of a variant, and give back its memory."""
         env = self._make(variant)
-        found = evaluate_points(env, self.x, follow).arrays()
+        found = evaluate_points(env, self.x, follow, by=self.evaluates(variant)).arrays()
         env.release()
         return found
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import abc
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -17,7 +17,9 @@ from ..landscapes.identity import MODEL_VERSION
 from ..landscapes.options import record_options
 from ..landscapes.sampling.memory import free_memory
 from ..landscapes.storage.checkpoint import Checkpoint
-from .samples import Sample, evaluate_points
+from ..landscapes.verification import POINTS
+from .references import evaluate_reference, is_kept
+from .samples import Sample, evaluate_parts, evaluate_points
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -26,7 +28,7 @@ if TYPE_CHECKING:
     from ..envs.base import Environment
     from ..jobs.watch import Watch
     from ..landscapes.draw.figures.page import Picture
-    from .samples import Follow
+    from .samples import Evaluate, Follow
 
 FLOAT64_COST = 1.5  # what float64 is expected to take, in times what float32 takes
 MAX_TIMED_WORK, MIN_HORIZON_SHARE = 1e6, 0.05  # of an episode that is timed: it is shortened to that, if it can be
@@ -231,12 +233,15 @@ EVERY_STUDY = ("points", "seed")  # the options that every study takes
 
 @dataclass(frozen=True)
 class Expected:
-    """Say what is left to simulate of a variant: so many `episodes` with gradient, and `seconds` that timing adds."""
+    """Say what is left to simulate of a variant: so many `episodes` with gradient, and `repeats` to time it.
+
+    Its repeats take so long [s] where an episode takes so long [s].
+    """
 
     name: str
     env: Environment
     episodes: float
-    seconds: float = 0.0
+    repeats: Callable[[float], float] = lambda each: 0.0
 
 
 class Study(abc.ABC):
@@ -346,7 +351,11 @@ class VariantStudy(Study):
 
     def measure(self, variant: Variant, follow: Follow) -> Mapping[str, Any]:
         """Return the arrays that are measured of a variant."""
-        return evaluate_points(self._make(variant), self.x, follow).arrays()
+        return evaluate_points(self._make(variant), self.x, follow, by=self.evaluates(variant)).arrays()
+
+    def evaluates(self, variant: Variant) -> Evaluate:
+        """Return what evaluates a variant: the reference is kept for every study of the same points."""
+        return evaluate_reference if variant.name == self.variants[0].name else evaluate_parts
 
     def measure_all(self, watch: Watch) -> dict[str, dict[str, Any]]:
         """Return the arrays of each variant that can be measured, by its name; what is kept is not measured again.
@@ -385,13 +394,24 @@ class VariantStudy(Study):
         """Say how much there is to measure."""
         left = len(self.left())
         kept = f", {len(self.variants) - left} are there already" if left < len(self.variants) else ""
-        return f"{left} {self.what} to measure{kept}"
+        known = f", the {self.variants[0].name} by what is kept of it" if self._is_known(self.variants[0]) else ""
+        return f"{left} {self.what} to measure{kept}{known}"
+
+    def _is_known(self, variant: Variant) -> bool:
+        """Say whether a variant is the reference, and an earlier study has kept what it returns at these points."""
+        if variant.name != self.variants[0].name or self.checkpoint.load(self.part(variant)) is not None:
+            return False
+        with suppress(ValueError, RuntimeError, MemoryError):  # refused: whoever measures it will say so
+            return is_kept(self._make(variant), self.x)
+        return False
 
     def expected(self) -> Iterator[Expected]:
         """Yield the variants that are not measured yet and not refused."""
         for variant in self.left():
             with self.refusing(variant.name):
-                yield self._expect(variant, self._make(variant))
+                found = self._expect(variant, self._make(variant))
+                known = len(self.x) - POINTS if self._is_known(variant) else 0
+                yield replace(found, episodes=max(0.0, found.episodes - known))
 
     def _make(self, variant: Variant) -> Environment:
         return variant.make(self.env)

@@ -226,7 +226,7 @@ STUDIES: dict[str, Callable[[Path], Any]] = {
 @pytest.mark.parametrize("study", STUDIES)
 def test_the_same_call_after_an_edit_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, study: str) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("gradscape.studies.kept.user_data_path", lambda name: tmp_path / "user" / name)
+    monkeypatch.setattr("gradscape.studies.own_folder.user_data_path", lambda name: tmp_path / "user" / name)
     for name in ("REPETITION", "LARGEST", "MIN_SECONDS", "BATCH_SECONDS"):
         monkeypatch.setattr(f"gradscape.studies.samples.{name}", 0.002)
     out = tmp_path / "made"

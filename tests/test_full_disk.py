@@ -65,7 +65,7 @@ def test_every_verb_that_writes_is_tried() -> None:
 def test_a_full_disk_says_what_is_kept_and_the_same_command_goes_on(
     run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, verb: str
 ) -> None:
-    monkeypatch.setattr("gradscape.studies.kept.user_data_path", lambda name: tmp_path / "data" / name)
+    monkeypatch.setattr("gradscape.studies.own_folder.user_data_path", lambda name: tmp_path / "data" / name)
     for name in ("REPETITION", "LARGEST"):
         monkeypatch.setattr(samples, name, 0.002)
     monkeypatch.setattr(samples, "RESAMPLES", 9)

@@ -136,7 +136,7 @@ def test_what_a_kill_left_in_a_folder_is_no_other_file_and_goes(
     place.mkdir(parents=True)
     (place / "zarr.json").write_text("{}")
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("gradscape.studies.kept.user_data_path", lambda name: tmp_path / "data" / name)
+    monkeypatch.setattr("gradscape.studies.own_folder.user_data_path", lambda name: tmp_path / "data" / name)
     for name in ("REPETITION", "LARGEST"):
         monkeypatch.setattr(f"gradscape.studies.samples.{name}", 0.002)
     with pytest.raises(SystemExit) as ended:

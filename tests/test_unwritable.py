@@ -12,7 +12,7 @@ import pytest
 from gradscape.envs.engines import runtime
 from gradscape.envs.mpm import targets
 from gradscape.landscapes.storage.files import moved_by
-from gradscape.studies import kept
+from gradscape.studies import kept, own_folder
 
 from .made_studies import fidelities
 
@@ -53,7 +53,7 @@ def test_other_folders_of_the_user_say_so_too(tmp_path: Path, monkeypatch: pytes
     monkeypatch.setattr(targets, "user_cache_path", lambda name: tmp_path / "file" / name)
     with pytest.raises(OSError, match=r"targets cannot be kept at .* XDG_CACHE_HOME"):
         targets.load_or_make("rope", "content", lambda: np.zeros(1))
-    monkeypatch.setattr(kept, "user_data_path", lambda name: tmp_path / "file" / name)
+    monkeypatch.setattr(own_folder, "user_data_path", lambda name: tmp_path / "file" / name)
     with pytest.raises(OSError, match=r"what was measured cannot be kept at .* XDG_DATA_HOME"):
         kept.keep(replace(fidelities(), identity={"device": "cpu", "options": {}, "model_version": 1}))
 

@@ -29,7 +29,7 @@ _TRACED: dict[str, str] = {}  # the precision that JAX has last traced a functio
 class JaxBackend(Backend):
     """Call functions of JAX, in its default device unless another one is named."""
 
-    engine = "jax"
+    engine, own_programs = "jax", True
     mode: str
     batch: str
     device: str = "auto"

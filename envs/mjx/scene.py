@@ -75,7 +75,7 @@ class MjxScene(Environment):
     duration: ClassVar[float]
     segments: ClassVar[int] = 1
     engines: ClassVar[tuple[str, ...]] = ("mjx",)
-    whole_batches = True  # one point costs as much as a batch
+    whole_batches = own_programs = True  # one point costs as much as a batch
     fidelities: ClassVar[dict[str, Fidelity]] = {
         "draft": Fidelity("draft", dt=1 / 250, precision="float64"),
         "standard": Fidelity("standard", dt=1 / 500, precision="float64"),

@@ -36,6 +36,7 @@ from .usefulness import Usefulness, usefulness
 REPEATS = 3
 PROMISE_POINTS = 8  # at which batches, repeats and refusals are checked
 POWER = 0.05  # share of the box
+FEW_POINTS = 0.75  # of the time that a program of a whole batch takes to compile: that of one of two or three points
 CANNOT_TELL = 0.1  # of the points is what has to be judged, to say anything
 LATE_POINTS = 2  # at which episodes of other lengths are judged
 ON_AVERAGE = ("levels", "length_off")  # numbers of diagnoses of all gradients, though none is wrong by itself
@@ -83,6 +84,16 @@ class Settings:
     expected: Mapping[str, str] = dataclasses.field(default_factory=dict)
     memory_seconds: float = 0.5
     follow: Callable[[str], None] = lambda name: None
+
+
+def count_others(how: Settings, itself: Callable[[], Objective]) -> float:
+    """Count what a check makes besides the objective `itself`, by the time that it takes to compile.
+
+    Most are asked at a few points, of which a program is compiled sooner than one of a whole batch, which counts 1.
+    """
+    whole = {how.twin, how.other_mode, *how.finer.values()} - {None, itself}
+    few = {*how.horizons.values(), *(one.make for one in how.variants)} - {None, itself, *whole}
+    return len(whole) + FEW_POINTS * len(few)
 
 
 def check(objective: Objective, settings: Settings | None = None, results: Results | None = None) -> Iterator[Finding]:

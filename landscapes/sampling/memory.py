@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import gc
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import torch
 from jaxtyping import Float
@@ -71,6 +73,17 @@ def free_memory() -> None:
     """Collect garbage and empty the cache of GPU memory."""
     gc.collect()  # an error that has been raised and what it tells of may refer to each other
     torch.cuda.empty_cache()
+
+
+@contextmanager
+def sparing_collections() -> Iterator[None]:
+    """Spare what is there to the collections of garbage meanwhile: to look through it takes longer than a batch."""
+    gc.collect()
+    gc.freeze()
+    try:
+        yield
+    finally:
+        gc.unfreeze()
 
 
 def is_out_of_memory(error: BaseException) -> bool:

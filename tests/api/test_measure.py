@@ -16,7 +16,7 @@ from gradscape.studies import samples
 def own_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Leave results and what is kept for a tolerance in the test's own folder, and time little."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("gradscape.studies.kept.user_data_path", lambda name: tmp_path / "data" / name)
+    monkeypatch.setattr("gradscape.studies.own_folder.user_data_path", lambda name: tmp_path / "data" / name)
     for module, names in ((cost, ("MOMENT", "ENOUGH", "WARM_UP")), (samples, ("REPETITION", "LARGEST"))):
         for name in names:
             monkeypatch.setattr(module, name, 0.0)

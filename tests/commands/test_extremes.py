@@ -44,7 +44,7 @@ class Stepping(Environment):
 
 @pytest.fixture(autouse=True)
 def own_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setattr("gradscape.studies.kept.user_data_path", lambda name: tmp_path / "data" / name)
+    monkeypatch.setattr("gradscape.studies.own_folder.user_data_path", lambda name: tmp_path / "data" / name)
     monkeypatch.setitem(registry.entries(), "stepping", registry.Entry("stepping", f"{__name__}:Stepping"))
     return tmp_path / "data"
 

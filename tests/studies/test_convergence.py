@@ -62,7 +62,7 @@ class Wild(Second):
 @pytest.fixture(autouse=True)
 def own_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Keep measurements in a folder of the test's own."""
-    monkeypatch.setattr("gradscape.studies.kept.user_data_path", lambda name: tmp_path / "data" / name)
+    monkeypatch.setattr("gradscape.studies.own_folder.user_data_path", lambda name: tmp_path / "data" / name)
     for name, value in (("RESAMPLES", 99), ("REPETITION", 0.002), ("LARGEST", 0.002)):
         monkeypatch.setattr(samples, name, value)
     for kind in (Second, Wild):

@@ -26,7 +26,7 @@ WIDTH = 0.05
 @pytest.fixture(autouse=True)
 def own_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Keep margins in a folder of the test's own; foretell what a job takes by one episode."""
-    monkeypatch.setattr("gradscape.studies.kept.user_data_path", lambda name: tmp_path / "data" / name)
+    monkeypatch.setattr("gradscape.studies.own_folder.user_data_path", lambda name: tmp_path / "data" / name)
     monkeypatch.setattr("gradscape.landscapes.draw.figures.page.save", lambda figure, path: path.touch())
     for name in ("MOMENT", "ENOUGH", "WARM_UP"):
         monkeypatch.setattr(f"gradscape.landscapes.cost.{name}", 0.0)
@@ -266,11 +266,11 @@ def test_a_stopped_study_goes_on_where_it_was(tmp_path: Path, monkeypatch: pytes
     whole = turn(Spring, tmp_path / "whole", "dt", "k")
     ask, asked = stability.ask, list[int]()
 
-    def stopped(env: Any, x: Tensor) -> Sample:
+    def stopped(env: Any, x: Tensor, **how: Any) -> Sample:
         if len(asked) == 9:
             raise KeyboardInterrupt
         asked.append(1)
-        return ask(env, x)
+        return ask(env, x, **how)
 
     monkeypatch.setattr("gradscape.studies.extremes.ask", stopped)
     with pytest.raises(KeyboardInterrupt, match="9 settings are kept"):

@@ -61,12 +61,16 @@ class Converging(Environment):
 @pytest.fixture(autouse=True)
 def own_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Keep measurements in a folder of the test's own, and time by the clock of the scene."""
-    monkeypatch.setattr("gradscape.studies.kept.user_data_path", lambda name: tmp_path / "data" / name)
+    monkeypatch.setattr("gradscape.studies.own_folder.user_data_path", lambda name: tmp_path / "data" / name)
     for module in (samples, cost):
         monkeypatch.setattr(module, "time", CLOCK)
     monkeypatch.setattr(samples, "RESAMPLES", 99)
     monkeypatch.setitem(registry.entries(), "converging", registry.Entry("converging", f"{__name__}:Converging"))
     return tmp_path / "data"
+
+
+def _double(found: Evaluation) -> Evaluation:
+    return Evaluation(2 * found.loss, None if found.grad is None else 2 * found.grad, found.status)
 
 
 def by_name(report: dict[str, Any]) -> dict[str, dict[str, Any]]:
@@ -147,20 +151,66 @@ def test_a_variant_whose_engine_gives_up_is_listed_too(run: Run, monkeypatch: py
     assert {"draft", "draft-float64", "standard-float64", "reference"} < set(by_name(report))
 
 
-def test_a_variant_is_gone_when_the_next_one_is_measured(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    """On a GPU it would hold the memory that the next one measures how quick it is with."""
-    simulate, simulated = Converging._evaluate, list[weakref.ref[Converging]]()
+def test_a_variant_has_given_back_its_memory_when_the_next_one_is_measured(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    simulate, release, holding = Converging._evaluate, Environment.release, list[weakref.ref[Converging]]()
+    beside = set[int]()
 
     def followed(self: Converging, x: Tensor, *, grad: bool) -> Evaluation:
-        if not simulated or simulated[-1]() is not self:
-            assert all(env() is None for env in simulated)
+        beside.add(sum(env() not in (None, self) for env in holding))
+        if all(env() is not self for env in holding):
             self.cycle = self  # type: ignore[attr-defined]
-            simulated.append(weakref.ref(self))
+            holding.append(weakref.ref(self))
         return simulate(self, x, grad=grad)
 
+    def released(self: Converging) -> None:
+        holding[:] = [env for env in holding if env() is not self]
+        release(self)
+
     monkeypatch.setattr(Converging, "_evaluate", followed)
-    found = run.json(*TRADE, "--settings", "precision")
-    assert len(simulated) == 2 + len(found["variants"])  # one to verify by, one for the estimate
+    monkeypatch.setattr(Environment, "release", released)
+    assert len(run.json(*TRADE, "--settings", "precision")["variants"]) == 6
+    assert beside == {0}
+
+
+def test_what_is_far_slower_than_the_reference_is_given_up_at_its_first_points(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    simulate = Converging._evaluate
+
+    def slower(self: Converging, x: Tensor, *, grad: bool) -> Evaluation:
+        CLOCK.sleep(1e3 * len(x) * (self.fidelity.name == "draft-float64"))
+        return simulate(self, x, grad=grad)
+
+    monkeypatch.setattr(Converging, "_evaluate", slower)
+    done = run(*TRADE, "--settings", "precision", "--json")
+    rows = by_name(done.json)
+    assert {name: row["given_up"] for name, row in rows.items() if row["given_up"]} == {"draft-float64": 1}
+    assert rows["draft-float64"]["comparison"]["compared"] == 1
+    assert "given up, more than 3 times the reference's time: draft-float64 after 1 of 16 points" in done.stderr
+
+
+def test_the_reference_is_evaluated_once_for_studies_of_every_kind(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where a few of its points say other numbers now, it is evaluated again."""
+    simulate, evaluated = Converging._evaluate, list[int]()
+
+    def counted(self: Converging, x: Tensor, *, grad: bool) -> Evaluation:
+        if self.fidelity.name == "reference" and grad:
+            evaluated.append(len(x))
+        return simulate(self, x, grad=grad)
+
+    monkeypatch.setattr(Converging, "_evaluate", counted)
+    how = ["converging", "--points", "16", "--device", "cpu", "--out"]
+    first = run.json("study", "fidelity", *how, "a")
+    evaluated.clear()
+    done = run.ok("study", "convergence", *how, "b", "--settings", "precision")
+    assert "levels to measure, the reference by what is kept of it at 16 points" in done.stderr
+    assert sum(evaluated) == 2 * POINTS  # what the study is verified by, and what the kept points are
+    monkeypatch.setattr(Converging, "_evaluate", lambda *x, grad: _double(simulate(*x, grad=grad)))
+    with pytest.warns(RuntimeWarning, match="losses are others now: .* it is evaluated again"):
+        renewed = run.json("study", "fidelity", *how, "c")
+    assert renewed["spread"] == pytest.approx(2 * first["spread"])
 
 
 def test_a_dt_that_does_not_divide_the_episode_is_refused() -> None:

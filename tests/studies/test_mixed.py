@@ -43,9 +43,10 @@ class TradingOptions:
 
 
 class Trading(Environment):
-    """A bowl whose loss is off by 5 dt^2 ke / 8 + 4 / cells^2 + 1e-3 (8 - ke), in 1e-3 cells^2 / dt seconds a point.
+    """A bowl whose loss is off by 5 dt^2 ke / 8 + 4 / cells^2 + 1e-3 (8 - ke).
 
-    Fails in half of the box at dt of `stable` or more.
+    A point takes 2^-10 cells^2 / dt seconds, which the clock adds up exactly, so that variants of the same work tie
+    every time. Fails in half of the box at dt of `stable` or more.
     """
 
     name = "trading"
@@ -64,7 +65,7 @@ class Trading(Environment):
     def _evaluate(self, x: Tensor, *, grad: bool) -> Evaluation:
         dt, ke = self.fidelity.dt, self.options.ke
         slower = 1.5 if self.fidelity.precision == "float64" else 1.0
-        CLOCK.sleep(len(x) * 1e-3 * self.work().count * slower)
+        CLOCK.sleep(len(x) * 2**-10 * self.work().count * slower)
         off = 5 * dt**2 * ke / 8 + 4 / self.fidelity.resolution**2 + 1e-3 * abs(8 - ke)
         loss = x.square().sum(dim=1) + off * (1 + x[:, 0] * torch.cos(40 * x[:, 1]))
         loss[(x[:, 0] > 0.5) & (dt >= self.stable)] = torch.nan
@@ -75,8 +76,8 @@ class Trading(Environment):
 @pytest.fixture(autouse=True)
 def own_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Keep measurements in a folder of the test's own, and time by the clock of the scene."""
-    monkeypatch.setattr("gradscape.studies.kept.user_data_path", lambda name: tmp_path / "data" / name)
-    CLOCK.now = 0.0  # rounding of its times, which decides between variants of the same work, is the same every time
+    monkeypatch.setattr("gradscape.studies.own_folder.user_data_path", lambda name: tmp_path / "data" / name)
+    CLOCK.now = 0.0
     for module in (samples, cost, mixed):
         monkeypatch.setattr(module, "time", CLOCK)
     monkeypatch.setattr(samples, "RESAMPLES", 29)

@@ -84,7 +84,8 @@ def fidelity_figure(
     """Draw the 95th percentile of each variant's loss errors, with its interval, over the time of an episode.
 
     The reference is a line at its time: its own error is zero by definition. Variants without a finite percentile are
-    on the upper edge and counted in the legend; those without any error are on the lower edge. The mark of a variant
+    on the upper edge and counted in the legend; those without any error are on the lower edge, and those given up
+    nowhere. The mark of a variant
     says which option was changed, its name from which fidelity and to what. Where there is little room a line leads to
     the name, or the name is in the legend, by number. Of mixed variants only those on the front have names, and those
     that are `chosen`, by the names of fidelities that should be theirs: these have a ring.
@@ -100,7 +101,7 @@ class _Drawing:
     def __init__(self, record: FidelityRecord, chosen: Mapping[str, str]) -> None:
         self.record, self.chosen = record, chosen
         self.reference = record.variant(record.reference)
-        self.rows = [row for row in record.variants if row is not self.reference]
+        self.rows = [row for row in record.variants if row is not self.reference and not row.given_up]
         self.relative = record.spread is not None
         self.factor, self.unit = (1.0, "s") if self.reference.seconds >= 2.0 else (1e3, "ms")
         self.low, self.high = 1e-3, 1.0  # the errors of the lower and the upper edge
@@ -133,7 +134,7 @@ class _Drawing:
 
     def _limit(self, ax: Axes) -> None:
         """Span what is drawn, on logarithmic axes."""
-        seconds = [self._time(row) for row in self.record.variants]
+        seconds = [self._time(row) for row in (self.reference, *self.rows)]
         errors = [end for row in self.rows for end in self._ends(row) if end]
         low, high = (min(errors), max(errors)) if errors else (self.low, self.high)
         self.low, self.high = low / REACH, high * REACH
