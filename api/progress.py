@@ -27,7 +27,6 @@ from rich.text import Text
 from ..jobs.watch import Advance, AdvanceOne, Say, Watch
 from ..landscapes.plain import printable
 
-
 LATE, LATE_SECONDS = 1.5, 5.0  # times what was announced, and seconds more than that, from which a job is late
 ENOUGH_DONE = 0.02  # of a bar, by which it is told how long all of it takes
 

@@ -26,8 +26,8 @@ class Work:
     """Hold what a job has to simulate: `losses` without gradients and `gradients` with, and the bytes it leaves.
 
     `memory` is what its own arrays take [bytes], without the simulation's. It makes so many `others` of the objective's
-    kind, each of which compiles programs of its own where the objective does. Its repeats, by which it is timed, take so
-    long [s] where an episode with gradient takes so long [s].
+    kind, each of which compiles programs of its own where the objective does. Its repeats, by which it is timed, take
+    so long [s] where an episode with gradient takes so long [s].
     """
 
     objective: Objective

@@ -281,8 +281,8 @@ class ConvergenceStudy(VariantStudy):
     takes = ("settings",)
     what = "levels"
     advice = (
-        "compiling kernels, and distributions where it is chaotic, come on top; --points (16 are enough) and --settings "
-        "lower it"
+        "compiling kernels, and distributions where it is chaotic, come on top; --points (16 are enough) and "
+        "--settings lower it"
     )
 
     def __init__(self, env: Environment, options: StudyOptions) -> None:

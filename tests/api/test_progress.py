@@ -33,9 +33,7 @@ def follow(clock: Clock, *, said: float, each: float, resumed: int = 0) -> list[
 
 def test_a_job_that_outruns_its_announcement_says_so_once_with_how_long_it_will_take(clock: Clock) -> None:
     assert follow(clock, said=8.0, each=0.4) == ["takes longer than announced: 8.0 s said, now about 40 s"]
-    assert follow(clock, said=8.0, each=0.4, resumed=50) == [
-        "takes longer than announced: 8.0 s said, now about 20 s"
-    ]
+    assert follow(clock, said=8.0, each=0.4, resumed=50) == ["takes longer than announced: 8.0 s said, now about 20 s"]
 
 
 @pytest.mark.parametrize(("said", "each"), [(30.0, 0.4), (0.1, 0.04)])
