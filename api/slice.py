@@ -60,7 +60,7 @@ def slice(
 ) -> Slice:
     """Sample losses and gradients on a plane through parameter space, and draw them.
 
-    The folder then holds slice.zarr (the samples), landscape.png and summary.json. Stop at any time: the same command
+    The folder then holds slice.zarr.zip (the samples), landscape.png and summary.json. Stop at any time: the same command
     continues from there. The status of each sample tells which are interpolated, and no measure uses those. A function
     is sampled in memory unless it is given a folder.
 
@@ -140,7 +140,7 @@ def bounce(
 ) -> Slice:
     """Draw loss and gradient of the bouncing ball along one velocity, and mark where the number of bounces changes.
 
-    The folder then holds slice.zarr (the samples), landscape.png and summary.json.
+    The folder then holds slice.zarr.zip (the samples), landscape.png and summary.json.
 
     Raises ValueError for another axis, and as `slice` does.
 
@@ -204,11 +204,12 @@ def as_slice(given: str | Path | Slice, *, env: Scene = None) -> Slice:
 def _open(path: Path, env: Scene, remake: Callable[[], Objective] | None) -> Slice:
     from ..landscapes.slice import Slice
     from ..landscapes.storage.floor_map import open_floor_map, with_map
+    from ..landscapes.storage.paths import FILLING, FOLDER
     from ..landscapes.storage.store import open_slice
 
     dataset = open_slice(path)
     mapped = open_floor_map(path, dataset)
-    folder = path if path.suffix != ".zarr" else None
+    folder = path if path.is_dir() and path.suffix not in (FOLDER, FILLING) else None
     return Slice(with_map(dataset, mapped), folder, remake or (lambda: environment_of(dataset, "auto", env)), mapped)
 
 

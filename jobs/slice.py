@@ -248,7 +248,7 @@ class SliceJob(SummaryJob[SliceSummary]):
             mapped = self._map_floor(dataset, watch)
         dataset = with_map(dataset, mapped)
         printed = self.draw(partial(self.plot, dataset, floor=mapped))
-        files = [STORE, *([] if mapped is None else [FLOOR]), PICTURE, *printed, SUMMARY]
+        files = [SLICE.files[0], *([] if mapped is None else [FLOOR]), PICTURE, *printed, SUMMARY]
         return self._summary(dataset, computed, time.monotonic() - start, files)
 
     def holding(self, watch: Watch) -> AbstractContextManager[None]:
