@@ -32,9 +32,9 @@ def compute(
 ) -> Computed:
     """Compute what is missing of the figures, after an estimate of its cost.
 
-    The data folder then holds a folder per figure: slice.zarr.zip at the fidelity of the figure, companions.json (the same
-    slice through other points), episode-*.mp4 at some of its points, sweep.mp4 at draft fidelity, report.json and
-    measures.json. runs/ holds searches at the fidelity of the figures, studies/ the accuracy and time of each
+    The data folder then holds a folder per figure: slice.zarr.zip at the fidelity of the figure, companions.json (the
+    same slice through other points), episode-*.mp4 at some of its points, sweep.mp4 at draft fidelity, report.json
+    and measures.json. runs/ holds searches at the fidelity of the figures, studies/ the accuracy and time of each
     environment, league/ races of nine methods. Stop at any time: the same command continues from there. A figure that
     fails does not stop the others; the exit code is then 1.
 

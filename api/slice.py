@@ -60,9 +60,9 @@ def slice(
 ) -> Slice:
     """Sample losses and gradients on a plane through parameter space, and draw them.
 
-    The folder then holds slice.zarr.zip (the samples), landscape.png and summary.json. Stop at any time: the same command
-    continues from there. The status of each sample tells which are interpolated, and no measure uses those. A function
-    is sampled in memory unless it is given a folder.
+    The folder then holds slice.zarr.zip (the samples), landscape.png and summary.json. Stop at any time: the same
+    command continues from there. The status of each sample tells which are interpolated, and no measure uses those. A
+    function is sampled in memory unless it is given a folder.
 
     Raises ValueError for what the scene does not have, and where the folder holds something else or another slice;
     Stopped where it is interrupted.

@@ -69,8 +69,8 @@ class ReportedSlice:
     @classmethod
     def of(cls, path: Path) -> ReportedSlice:
         """Return the slice in a folder, or at the path itself."""
-        name = path.resolve().parent.name if path.name in (SLICE_STORE, SLICE_FILE) else path.name or path.resolve().name
-        return cls(name, store_in(path, SLICE_STORE))
+        folder = path.parent if path.name in (SLICE_STORE, SLICE_FILE) else path
+        return cls(folder.name or folder.resolve().name, store_in(path, SLICE_STORE))
 
 
 def sample_subject(env: Environment, points: int, command: str, watch: Watch) -> ReportedSlice:

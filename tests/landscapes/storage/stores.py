@@ -47,6 +47,15 @@ def unpacked(path: Path) -> Path:
     return folder_path(path)
 
 
+def break_chunk(path: Path, name: str) -> None:
+    """Damage a chunk of a finished slice, by its name in the store."""
+    with ZipFile(archive_path(path)) as archive:
+        chunk = archive.read(name)
+    content = bytearray(archive_path(path).read_bytes())
+    content[content.index(chunk) + len(chunk) // 2] ^= 1
+    archive_path(path).write_bytes(bytes(content))
+
+
 def chunks(place: Path) -> list[Path]:
     """Return the files of a slice's samples: of its tiles, or of its chunks in a folder of a finished one."""
     parts = (place / name / "c" for name in ("loss", "grad", "status", "checksum"))
