@@ -7,6 +7,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Unpack
 
+from cyclopts import Parameter
+
 from ..jobs.scene import environment_of, with_policy
 from .call import current, verb
 from .options import (
@@ -51,6 +53,7 @@ def slice(
     budget: Annotated[int | None, at_least(1)] = None,
     floor: bool = False,
     policy: str | None = None,
+    picture: Annotated[bool, Parameter(negative_bool="no-", show_default=False)] = True,
     gradients: Gradients = True,
     scheduler: Scheduler = None,
     figure_width_mm: FigureWidth = (),
@@ -95,6 +98,9 @@ def slice(
     policy
         Sample over the weights of a neural policy instead of the parameters of the environment: mlp:32x32 has two
         hidden layers of 32. It has losses only.
+    picture
+        Draw landscape.png, which takes longer than the samples of a quick function; --no-picture leaves it out. It can
+        be drawn from the samples at any time.
     """
     from ..jobs.cut import PlaneSpec
 
@@ -117,7 +123,7 @@ def slice(
 
     with workers(scheduler, env.device) as executor:
         job = SliceJob.of(
-            objective, plane, command=call.command, cut=spec.cut, force=force, floor=floor,
+            objective, plane, command=call.command, cut=spec.cut, force=force, floor=floor, picture=picture,
             executor=executor, prints=as_widths(figure_width_mm), **begun,
         )  # fmt: skip
         job.run(call.watch)

@@ -8,7 +8,8 @@ import re
 import threading
 import warnings
 import zlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import cached_property
@@ -358,13 +359,21 @@ class Chunks:
     A chunk counts when it decodes and its checksum is right. Copies that xarray wrote have no checksums.
     """
 
-    def __init__(self, group: zarr.Group) -> None:
-        arrays = dict(group.arrays())
-        self._arrays = {name: arrays[name] for name in SAMPLES if name in arrays}
-        status = self._arrays["status"]
-        self._shape, self.sides = status.shape, status.chunks
+    def __init__(self, open_it: Callable[[], zarr.Group], shape: tuple[int, ...], sides: tuple[int, ...]) -> None:
+        self._open, self._shape, self.sides = open_it, shape, sides
+
+    @cached_property
+    def _all(self) -> dict[str, zarr.Array[Any]]:
+        return dict(self._open().arrays())
+
+    @cached_property
+    def _arrays(self) -> dict[str, zarr.Array[Any]]:
+        return {name: self._all[name] for name in SAMPLES if name in self._all}
+
+    @cached_property
+    def _sums(self) -> zarr.Array[Any] | None:
         counts = tuple(math.ceil(points / side) for points, side in zip(self._shape, self.sides, strict=True))
-        self._sums = arrays.get(SUMS) if SUMS in arrays and arrays[SUMS].shape == counts else None
+        return self._all[SUMS] if SUMS in self._all and self._all[SUMS].shape == counts else None
 
     @classmethod
     def open(cls, path: Path) -> tuple[xr.Dataset, Path, Chunks]:
@@ -375,11 +384,22 @@ class Chunks:
         check_layouts(path)
         try:
             group = open_group(path)
-            return _read_blank(path, group), path, cls(group)
+            status = group["status"]
+            if not isinstance(status, zarr.Array):
+                raise TypeError("its status is no array")
+            return _read_blank(path, group), path, cls(lambda: group, status.shape, status.chunks)
         except DamagedError:
             raise
         except Exception as error:  # a damaged axis raises whatever reads it; no chunk is read here
             raise damage(path, f"{type(error).__name__}: {error}") from error
+
+    @classmethod
+    def written(cls, path: Path, dataset: xr.Dataset) -> tuple[xr.Dataset, Path, Chunks]:
+        """Return the same of a slice that was just written there; nothing is read before a sample is wanted."""
+        arrays = {name: dataset[name] for name in SAMPLES if name in dataset}
+        empty = {name: one.copy(data=_nothing(one.dtype.name, one.shape)) for name, one in arrays.items()}
+        shape = dataset["status"].shape
+        return dataset.assign(empty), path, cls(lambda: open_group(path), shape, analysis_chunks(shape))
 
     def read(self, tile: Tile) -> Arrays | None:
         """Return the samples of a chunk, None where they are not what was written."""
@@ -448,13 +468,23 @@ ANEW = "restore it, or sample the slice again in another folder"
 
 def check_layouts(path: Path) -> None:
     """Raise DamagedError, naming the file, where how an array is stored is not readable or not what the index says."""
-    root = _read(path, "")
+    try:
+        with _files(path) as read:
+            _check_layouts(path, read)
+    except DamagedError:
+        raise
+    except Exception as error:  # a damaged zip raises anything
+        raise damage(path, str(error)) from None
+
+
+def _check_layouts(path: Path, read: Callable[[str], bytes]) -> None:
+    root = _layout(path, "", read)
     index = root.get("consolidated_metadata", {"metadata": {}})  # copies that xarray wrote may have none
     known = index.get("metadata") if isinstance(index, dict) else None
     if not isinstance(known, dict) or not (known or "consolidated_metadata" not in root):
         raise damage(path, "the index of its arrays is not what it was made")
     for name in known or [name for name in (*SAMPLES, *AXES, "dim", "unit") if (path / name).is_dir()]:
-        layout = _read(path, name)
+        layout = _layout(path, name, read)
         if layout.get("node_type") != "array" or known.get(name, layout) != layout:
             raise damage(path / name, "its layout is not what the store's index says")
 
@@ -476,17 +506,27 @@ def _values(path: Path, array: Any) -> NDArray[Any]:
         raise damage(path, str(error)) from None
 
 
-def read_layout(store: Path, name: str = "") -> dict[str, Any]:
-    """Return how a store, a folder or a zip, or an array in it is laid out.
+@contextmanager
+def _files(store: Path) -> Iterator[Callable[[str], bytes]]:
+    """Give what reads a file of a store, a folder or a zip, by its name in it."""
+    if store.is_file():
+        with ZipFile(store) as archive:
+            yield archive.read
+    else:
+        yield lambda name: (store / name).read_bytes()
+
+
+def read_layout(store: Path) -> dict[str, Any]:
+    """Return how a store, a folder or a zip, is laid out, with its attributes.
 
     Raises whatever a file raises that is damaged or something else.
     """
-    file = f"{name}/{ROOT}" if name else ROOT
-    if store.is_file():
-        with ZipFile(store) as archive:
-            found = json.loads(archive.read(file))
-    else:
-        found = json.loads((store / file).read_text())
+    with _files(store) as read:
+        return _object(read(ROOT))
+
+
+def _object(content: bytes) -> dict[str, Any]:
+    found = json.loads(content)
     if not isinstance(found, dict):
         raise TypeError("it is no JSON object")
     return found
@@ -502,9 +542,10 @@ def is_torn(archive: Path) -> bool:
         return not begins or FIRST_BYTES.match(begins) is not None
 
 
-def _read(store: Path, name: str) -> dict[str, Any]:
+def _layout(store: Path, name: str, read: Callable[[str], bytes]) -> dict[str, Any]:
+    """Return the layout of an array in a store, or without a name that of the store."""
     try:
-        return read_layout(store, name)
+        return _object(read(f"{name}/{ROOT}" if name else ROOT))
     except Exception as error:  # a damaged zip raises anything
         raise damage(store / name / ROOT, str(error)) from None
 

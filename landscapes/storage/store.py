@@ -334,7 +334,7 @@ class SliceStore:
         archive = archive_path(self.path)
         with replacing(archive) as new:
             write_finished(new, dataset)
-        self._move_on(archive)
+        self._move_on(*Chunks.written(archive, dataset))
 
     def coarse(self) -> xr.Dataset | None:
         """Return the largest coarse picture of the whole that is complete, axes ascending; None before the first.
@@ -404,13 +404,13 @@ class SliceStore:
         with contextlib.suppress(StoreError):
             now = SliceStore.open(self.path)
             if now.ascending and now.path and now.identity == self.identity:
-                self._move_on(now.path)
+                self._move_on(*Chunks.open(now.path))
                 return True
         raise StoreError(f"{self.path} was replaced or removed while it was being filled; run the command again")
 
-    def _move_on(self, path: Path) -> None:
+    def _move_on(self, empty: xr.Dataset, path: Path, chunks: Chunks) -> None:
         """Become the finished slice, and clear away what it was made of."""
-        self._adopt(*Chunks.open(path))
+        self._adopt(empty, path, chunks)
         self._clear_others(path)
 
     @staticmethod
