@@ -32,6 +32,7 @@ from .scene import environment, is_in_memory
 from .values import as_path, as_share, as_widths, as_window
 
 if TYPE_CHECKING:
+    import pandas as pd
     import xarray as xr
 
     from ..landscapes.objective import Objective
@@ -127,7 +128,7 @@ def slice(
             executor=executor, prints=as_widths(figure_width_mm), **begun,
         )  # fmt: skip
         job.run(call.watch)
-    return _open(job.folder, None, lambda: objective)
+    return _opened(job.store.dataset(), job.folder, lambda: objective)
 
 
 @verb
@@ -194,7 +195,23 @@ def open_slice(path: str | Path, *, env: Scene = None) -> Slice:
     What is not sampled yet is NaN, with status MISSING. Raises StoreError, a ValueError, where there is no slice, and
     where it is damaged.
     """
-    return _open(Path(path), env, None)
+    from ..landscapes.storage.store import open_slice as read
+
+    dataset = read(path)
+    return _opened(dataset, Path(path), lambda: environment_of(dataset, "auto", env))
+
+
+def slices(folder: str | Path, where: str | None = None) -> pd.DataFrame:
+    """Return what the summaries of all slices in a folder say, a row each, without opening them.
+
+    It looks at any depth. `where` is a condition of SQLite over the columns: "env = 'branin' and lowest < 0.5". What is
+    read is kept as .slices.sqlite in the folder; only summaries that are new or changed are read the next time.
+
+    Raises ValueError where there is no such folder, and for what is no condition.
+    """
+    from ..jobs.slices import find_slices
+
+    return find_slices(Path(folder), where).rows
 
 
 def as_slice(given: str | Path | Slice, *, env: Scene = None) -> Slice:
@@ -207,16 +224,15 @@ def as_slice(given: str | Path | Slice, *, env: Scene = None) -> Slice:
     return open_slice(given, env=env)
 
 
-def _open(path: Path, env: Scene, remake: Callable[[], Objective] | None) -> Slice:
+def _opened(dataset: xr.Dataset, path: Path, remake: Callable[[], Objective]) -> Slice:
+    """Return a slice that lies at a path, with its map of the numerical floor."""
     from ..landscapes.slice import Slice
     from ..landscapes.storage.floor_map import open_floor_map, with_map
     from ..landscapes.storage.paths import FILLING, FOLDER
-    from ..landscapes.storage.store import open_slice
 
-    dataset = open_slice(path)
     mapped = open_floor_map(path, dataset)
     folder = path if path.is_dir() and path.suffix not in (FOLDER, FILLING) else None
-    return Slice(with_map(dataset, mapped), folder, remake or (lambda: environment_of(dataset, "auto", env)), mapped)
+    return Slice(with_map(dataset, mapped), folder, remake, mapped)
 
 
 def _sample_in_memory(

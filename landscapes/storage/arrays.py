@@ -396,7 +396,7 @@ class Chunks:
     @classmethod
     def written(cls, path: Path, dataset: xr.Dataset) -> tuple[xr.Dataset, Path, Chunks]:
         """Return the same of a slice that was just written there; nothing is read before a sample is wanted."""
-        arrays = {name: dataset[name] for name in SAMPLES if name in dataset}
+        arrays = {name: dataset.variables[name] for name in SAMPLES if name in dataset}
         empty = {name: one.copy(data=_nothing(one.dtype.name, one.shape)) for name, one in arrays.items()}
         shape = dataset["status"].shape
         return dataset.assign(empty), path, cls(lambda: open_group(path), shape, analysis_chunks(shape))

@@ -383,7 +383,7 @@ class SliceStore:
 
     def _dataset(self) -> xr.Dataset:
         found = self._collect([name for name in SAMPLES if name in self._empty])
-        return self._empty.assign({name: self._empty[name].copy(data=array) for name, array in found.items()})
+        return self._empty.assign({name: self._empty.variables[name].copy(data=one) for name, one in found.items()})
 
     def _read_steadily(self, read: Callable[[], T]) -> T:
         """Return what is read, once more where another process has finished the slice meanwhile."""
