@@ -78,6 +78,8 @@ def list_(
 
     It writes no file but a table of the slices in that folder, .slices.sqlite, which may be deleted.
 
+    Raises ValueError where there is no such folder, and for what is no condition.
+
     Example: landscape gallery list out --where "env = 'branin' and lowest < 0.5"
 
     Parameters
