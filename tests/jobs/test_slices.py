@@ -1,5 +1,6 @@
 """The table of slices: right however slices come, change and go, and made without opening one."""
 
+import faulthandler
 import json
 import os
 import shutil
@@ -153,6 +154,8 @@ def test_a_name_that_is_not_unicode_is_one_all_the_same(many: Path, made: dict[s
 @pytest.mark.parametrize("count", [20, pytest.param(10_000, marks=pytest.mark.nightly)])
 def test_slices_of_two_workers_are_written_listed_and_queried(tmp_path: Path, count: int) -> None:
     """A slice to a task, each in one file, and none opened afterwards."""
+    if count > 20:
+        faulthandler.cancel_dump_traceback_later()  # 15 minutes of a core: half an hour and more beside other programs
 
     def cut(number: int) -> float:
         import gradscape
