@@ -233,7 +233,7 @@ def test_a_scheduler_that_is_gone_ends_it_with_a_slice_to_go_on_with(tmp_path, m
         if now.done:
             scheduler.kill()
 
-    gone = r"the workers are gone .*; 16 of 288 points are kept in .*s\.zarr.*the same command continues"
+    gone = r"the workers are gone .*; 16 of 288 points are kept in .*s\.filling.*the same command continues"
     objective = from_torch(partial(once, mark=tmp_path / "mark"), SPACE)
     with pytest.raises(WorkersLostError, match=gone), workers(address, "cpu") as executor:
         sample(objective, PLANE, store, batch=1, executor=executor, progress=kill)
