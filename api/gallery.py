@@ -9,12 +9,13 @@ from cyclopts import Parameter
 from cyclopts.validators import Number
 
 from .call import current, verb
-from .options import Data, Device, FidelityName, Names, Scheduler, Side
+from .options import ARGUMENT, Data, Device, FidelityName, Names, Scheduler, Side
 from .values import as_names
 
 if TYPE_CHECKING:
     from ..gallery.compute import Computed
     from ..gallery.parts import FigureList
+    from ..jobs.slices import SliceTable
 
 Site = Annotated[str, Parameter(help="Folder of the site.")]
 
@@ -32,9 +33,9 @@ def compute(
 ) -> Computed:
     """Compute what is missing of the figures, after an estimate of its cost.
 
-    The data folder then holds a folder per figure: slice.zarr at the fidelity of the figure, companions.json (the same
-    slice through other points), episode-*.mp4 at some of its points, sweep.mp4 at draft fidelity, report.json and
-    measures.json. runs/ holds searches at the fidelity of the figures, studies/ the accuracy and time of each
+    The data folder then holds a folder per figure: slice.zarr.zip at the fidelity of the figure, companions.json (the
+    same slice through other points), episode-*.mp4 at some of its points, sweep.mp4 at draft fidelity, report.json
+    and measures.json. runs/ holds searches at the fidelity of the figures, studies/ the accuracy and time of each
     environment, league/ races of nine methods. Stop at any time: the same command continues from there. A figure that
     fails does not stop the others; the exit code is then 1.
 
@@ -70,13 +71,31 @@ def compute(
 
 
 @verb
-def list_(*, data: Data = None) -> FigureList:
-    """List the figures, and how much of each is computed.
+def list_(
+    folder: Annotated[str | Path | None, ARGUMENT] = None, *, where: str | None = None, data: Data = None
+) -> FigureList | SliceTable:
+    """List the figures, and how much of each is computed; or the slices in a folder, by what their summaries say.
 
-    It writes no file.
+    It writes no file but a table of the slices in that folder, .slices.sqlite, which may be deleted.
 
-    Example: landscape gallery list
+    Raises ValueError where there is no such folder, and for what is no condition.
+
+    Example: landscape gallery list out --where "env = 'branin' and lowest < 0.5"
+
+    Parameters
+    ----------
+    folder
+        A folder with slices, at any depth, to list instead of the figures.
+    where
+        List only slices for which this condition holds: one of SQLite over the columns that `landscape gallery list
+        FOLDER --json` names.
     """
+    if folder is not None:
+        from ..jobs.slices import find_slices
+
+        return find_slices(Path(folder), where)
+    if where is not None:
+        raise ValueError("--where chooses among the slices in a folder; give that folder, too")
     from ..gallery.figures import read_figures
     from ..gallery.files import data_folder
     from ..gallery.parts import FigureList, SlicePart

@@ -7,6 +7,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Unpack
 
+from cyclopts import Parameter
+
 from ..jobs.scene import environment_of, with_policy
 from .call import current, verb
 from .options import (
@@ -30,6 +32,7 @@ from .scene import environment, is_in_memory
 from .values import as_path, as_share, as_widths, as_window
 
 if TYPE_CHECKING:
+    import pandas as pd
     import xarray as xr
 
     from ..landscapes.objective import Objective
@@ -51,6 +54,7 @@ def slice(
     budget: Annotated[int | None, at_least(1)] = None,
     floor: bool = False,
     policy: str | None = None,
+    picture: Annotated[bool, Parameter(negative_bool="no-", show_default=False)] = True,
     gradients: Gradients = True,
     scheduler: Scheduler = None,
     figure_width_mm: FigureWidth = (),
@@ -60,9 +64,9 @@ def slice(
 ) -> Slice:
     """Sample losses and gradients on a plane through parameter space, and draw them.
 
-    The folder then holds slice.zarr (the samples), landscape.png and summary.json. Stop at any time: the same command
-    continues from there. The status of each sample tells which are interpolated, and no measure uses those. A function
-    is sampled in memory unless it is given a folder.
+    The folder then holds slice.zarr.zip (the samples), landscape.png and summary.json. Stop at any time: the same
+    command continues from there. The status of each sample tells which are interpolated, and no measure uses those. A
+    function is sampled in memory unless it is given a folder.
 
     Raises ValueError for what the scene does not have, and where the folder holds something else or another slice;
     Stopped where it is interrupted.
@@ -95,6 +99,9 @@ def slice(
     policy
         Sample over the weights of a neural policy instead of the parameters of the environment: mlp:32x32 has two
         hidden layers of 32. It has losses only.
+    picture
+        Draw landscape.png, which takes longer than the samples of a quick function; --no-picture leaves it out. It can
+        be drawn from the samples at any time.
     """
     from ..jobs.cut import PlaneSpec
 
@@ -117,11 +124,11 @@ def slice(
 
     with workers(scheduler, env.device) as executor:
         job = SliceJob.of(
-            objective, plane, command=call.command, cut=spec.cut, force=force, floor=floor,
+            objective, plane, command=call.command, cut=spec.cut, force=force, floor=floor, picture=picture,
             executor=executor, prints=as_widths(figure_width_mm), **begun,
         )  # fmt: skip
         job.run(call.watch)
-    return _open(job.folder, None, lambda: objective)
+    return _opened(job.store.dataset(), job.folder, lambda: objective)
 
 
 @verb
@@ -140,7 +147,7 @@ def bounce(
 ) -> Slice:
     """Draw loss and gradient of the bouncing ball along one velocity, and mark where the number of bounces changes.
 
-    The folder then holds slice.zarr (the samples), landscape.png and summary.json.
+    The folder then holds slice.zarr.zip (the samples), landscape.png and summary.json.
 
     Raises ValueError for another axis, and as `slice` does.
 
@@ -188,7 +195,23 @@ def open_slice(path: str | Path, *, env: Scene = None) -> Slice:
     What is not sampled yet is NaN, with status MISSING. Raises StoreError, a ValueError, where there is no slice, and
     where it is damaged.
     """
-    return _open(Path(path), env, None)
+    from ..landscapes.storage.store import open_slice as read
+
+    dataset = read(path)
+    return _opened(dataset, Path(path), lambda: environment_of(dataset, "auto", env))
+
+
+def slices(folder: str | Path, where: str | None = None) -> pd.DataFrame:
+    """Return what the summaries of all slices in a folder say, a row each, without opening them.
+
+    It looks at any depth. `where` is a condition of SQLite over the columns: "env = 'branin' and lowest < 0.5". What is
+    read is kept as .slices.sqlite in the folder; only summaries that are new or changed are read the next time.
+
+    Raises ValueError where there is no such folder, and for what is no condition.
+    """
+    from ..jobs.slices import find_slices
+
+    return find_slices(Path(folder), where).rows
 
 
 def as_slice(given: str | Path | Slice, *, env: Scene = None) -> Slice:
@@ -201,15 +224,15 @@ def as_slice(given: str | Path | Slice, *, env: Scene = None) -> Slice:
     return open_slice(given, env=env)
 
 
-def _open(path: Path, env: Scene, remake: Callable[[], Objective] | None) -> Slice:
+def _opened(dataset: xr.Dataset, path: Path, remake: Callable[[], Objective]) -> Slice:
+    """Return a slice that lies at a path, with its map of the numerical floor."""
     from ..landscapes.slice import Slice
     from ..landscapes.storage.floor_map import open_floor_map, with_map
-    from ..landscapes.storage.store import open_slice
+    from ..landscapes.storage.paths import FILLING, FOLDER
 
-    dataset = open_slice(path)
     mapped = open_floor_map(path, dataset)
-    folder = path if path.suffix != ".zarr" else None
-    return Slice(with_map(dataset, mapped), folder, remake or (lambda: environment_of(dataset, "auto", env)), mapped)
+    folder = path if path.is_dir() and path.suffix not in (FOLDER, FILLING) else None
+    return Slice(with_map(dataset, mapped), folder, remake, mapped)
 
 
 def _sample_in_memory(

@@ -46,7 +46,7 @@ def sweep(
 ) -> Sweep:
     """Sample one slice per value of a third parameter, and film them on one colour scale.
 
-    The folder then holds frames/ (the samples of each frame; slice.zarr if there is only one slice), sweep.mp4,
+    The folder then holds frames/ (the samples of each frame; slice.zarr.zip if there is only one slice), sweep.mp4,
     sweep.gif, sweep.rrd (a 3-D scene, which `landscape view` opens) and summary.json. Stop at any time: the same
     command continues from there. Smoothed losses have no gradients.
 

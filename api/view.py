@@ -99,9 +99,9 @@ def launch(path: Path) -> bool:
 
 def _choose(path: Path, *, serve: bool) -> Path:
     """Return what to open for a path; of a folder that is to be served, first a recording."""
-    from ..jobs.folder import RUN_STORE, SLICE_STORE
+    from ..jobs.folder import RUN_STORE, SLICE_FILE, SLICE_STORE
 
-    folder = path.parent if path.name in (SLICE_STORE, RUN_STORE) else path
+    folder = path.parent if path.name in (SLICE_STORE, SLICE_FILE, RUN_STORE) else path
     if folder.is_dir():
         for name in sorted(SHOWN, key=lambda name: serve and not name.endswith(".rrd")):
             if (folder / name).exists():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from typing import TYPE_CHECKING
 
 from .terminal import Console, table
@@ -9,6 +10,9 @@ from .terminal import Console, table
 if TYPE_CHECKING:
     from ..gallery.compute import Computed
     from ..gallery.parts import FigureList
+    from ..jobs.slices import SliceTable
+
+MAX_ROWS = 100  # of slices, on a terminal
 
 
 def show_computed(found: Computed, console: Console) -> int:
@@ -34,3 +38,23 @@ def show_figures(found: FigureList, console: Console) -> None:
             f"to sample one again, delete its folder in {found.folder}",
             soft_wrap=True,
         )
+
+
+def show_slices(found: SliceTable, console: Console) -> None:
+    """Print a row for each slice, and how many folders of slices have no summary."""
+    listed = table("slice", "environment", "dims", "resolution", "fidelity", "losses", "failed", "undersampled")
+    for _, row in found.rows.head(MAX_ROWS).iterrows():
+        losses = "none" if row.isna()["lowest"] else f"{row['lowest']:.4g} to {row['highest']:.4g}"
+        hidden = "" if row.isna()["undersampled"] else f"{row['undersampled']:.0%}"
+        about = (row[name] or "" for name in ("env", "dims", "resolution", "fidelity"))
+        listed.add_row(
+            os.path.relpath(row["folder"], found.folder), *map(str, about), losses, str(row["failed"]), hidden
+        )
+    console.print(listed)
+    more = f", of which the first {MAX_ROWS} are shown; --json prints all" if len(found.rows) > MAX_ROWS else ""
+    console.print(f"{len(found.rows)} slices in {found.folder}{more}", soft_wrap=True)
+    for count, what in ((found.damaged, "a damaged summary"), (found.bare, "no summary, as they are not finished")):
+        if count:
+            console.print(
+                f"{count} more have {what}; the commands that made them continue from what is there", soft_wrap=True
+            )

@@ -28,6 +28,7 @@ SHOWN = {
     "Report": "report:show",
     "Reports": "report:show_several",
     "SliceComparison": "compare:show",
+    "SliceTable": "gallery:show_slices",
     "StudyRecord": "study:show",
     "type[Optimizer]": "environments:show_method",
 }

@@ -1,6 +1,6 @@
 """The files of the gallery: what it shows, what the paper says, and what is computed of both, each named here alone.
 
-Of the data, a figure's folder holds `slice.zarr` and what else was made of it: `sweep.mp4` with `sweep.json`,
+Of the data, a figure's folder holds `slice.zarr.zip` and what else was made of it: `sweep.mp4` with `sweep.json`,
 `episodes.json` with a film and a picture of each episode, `companions.json` and `companions.png` of the same cut
 through other points, and the files of `landscape report`. Searches lie in `runs/ENVIRONMENT-OPTIONS/`, studies in
 `studies/`, censuses in `census/`, the races of the league in `league/`: figures share them. The report card of
@@ -52,7 +52,7 @@ def data_folder(named: str | Path | None) -> Path:
     """Return where the figures' data is: as named, else a checkout's own, else under the folder where one stands."""
     if named:
         return Path(named)
-    return DATA if any(DATA.glob(f"*/{STORE}")) else ELSEWHERE
+    return DATA if any(DATA.glob(f"*/{STORE}*")) else ELSEWHERE
 
 
 def dark_name(picture: str) -> str:

@@ -28,6 +28,7 @@ from ..landscapes.objective import Status
 from ..landscapes.overlay import IMPROVEMENTS_OF, lowered, overlay
 from ..landscapes.storage.arrays import flags
 from ..landscapes.storage.files import make_folder, replacing
+from ..landscapes.storage.paths import is_finished
 from ..landscapes.storage.records import read_json, reading, write_record
 from ..optim.base import Kind
 from ..optim.league import League, SceneStandings
@@ -139,7 +140,7 @@ class LeagueSlicePart(FigurePart):
         standings, files = self._standings(), self._files.slice
         if standings is None or standings.best is None:
             return 0
-        there = files.there() and files.dark.is_file() and (files.record.parent / STORE).is_dir()
+        there = files.there() and files.dark.is_file() and is_finished(files.record.parent)
         return 0 if there and kept_key(files.record) == self._key(standings) else RESOLUTION**2
 
     def make(self, watch: Watch) -> str:

@@ -34,11 +34,12 @@ def export(source: Path, to: str, *, out: Path | None = None, force: bool = Fals
     `force` replaces.
     """
     from ..landscapes.export import SUFFIXES, save_as
+    from ..landscapes.storage.paths import folder_path
 
     if to not in SUFFIXES:
         raise ValueError(f"--to takes {', '.join(SUFFIXES)}; got {to!r}")
     dataset, store = open_results(source)
-    path = out or store.with_suffix(SUFFIXES[to])
+    path = out or folder_path(store).with_suffix(SUFFIXES[to])
     if path.exists() and not force:
         raise ValueError(f"{path} exists already; write elsewhere with --out, or replace it with --force")
     save_as(dataset, path, to)

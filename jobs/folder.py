@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
 SLICE_STORE, RUN_STORE = paths.SLICE, runs.RUN
+SLICE_FILE = paths.SLICE + paths.ARCHIVE  # what a slice's store is once it is finished
 ROOT = Path("out")  # where results go that are given no folder
 
 
@@ -43,9 +44,9 @@ class Results:
 
 
 SUMMARY = "summary.json"
-SLICE = Results("slice", (SLICE_STORE, "landscape.png", SUMMARY), "landscape.png", SLICE_STORE)
+SLICE = Results("slice", (SLICE_FILE, "landscape.png", SUMMARY), "landscape.png", SLICE_STORE)
 RUN = Results("run", (RUN_STORE, "progress.png", SUMMARY), "progress.png", RUN_STORE)
-SWEEP = Results("sweep", ("frames", SLICE_STORE, "sweep.mp4", "sweep.gif", "sweep.rrd", SUMMARY))
+SWEEP = Results("sweep", ("frames", SLICE_FILE, "sweep.mp4", "sweep.gif", "sweep.rrd", SUMMARY))
 RACE_FIGURES = "race.json"
 RACE = Results("race", (RACE_FIGURES, "race.png"), "race.png")
 LEAGUE = Results("league", ("league.json", "league.png"), "league.png")

@@ -30,7 +30,7 @@ from ..landscapes.plain import digest
 from ..landscapes.storage.files import is_full, make_folder, other_files, replacing, tidy, write_json
 from ..landscapes.storage.records import read_json, reading, write_record
 from ..landscapes.verification import RESAMPLE, verify_dataset
-from .folder import REPORT, REPORTS, ROOT, SLICE_STORE, folder_named, store_in
+from .folder import REPORT, REPORTS, ROOT, SLICE_FILE, SLICE_STORE, folder_named, store_in
 from .plan import simulation_seconds
 from .scene import environment_of
 from .watch import PREPARING, Watch, Work, resumable
@@ -69,8 +69,8 @@ class ReportedSlice:
     @classmethod
     def of(cls, path: Path) -> ReportedSlice:
         """Return the slice in a folder, or at the path itself."""
-        name = path.resolve().parent.name if path.name == SLICE_STORE else path.name or path.resolve().name
-        return cls(name, store_in(path, SLICE_STORE))
+        folder = path.parent if path.name in (SLICE_STORE, SLICE_FILE) else path
+        return cls(folder.name or folder.resolve().name, store_in(path, SLICE_STORE))
 
 
 def sample_subject(env: Environment, points: int, command: str, watch: Watch) -> ReportedSlice:

@@ -176,6 +176,7 @@ class SliceJob(SummaryJob[SliceSummary]):
     remake: Callable[[], Objective] | None = None
     refinement: Refinement | None = None
     floor: bool = False
+    drawn: bool = True
 
     @classmethod
     def of(
@@ -194,15 +195,16 @@ class SliceJob(SummaryJob[SliceSummary]):
         prints: Sequence[float] = (),
         refinement: Refinement | None = None,
         floor: bool = False,
+        picture: bool = True,
     ) -> SliceJob:
         """Continue the slice in `out`, by default a folder under `root` named after it, or begin it there.
 
         Losses are at all samples, gradients at every so many along each axis, `gradients`, 0 for none. `boxed` leaves
         out what lies beyond the parameters' bounds. With a `cut`, how it was cut along directions, it is boxed; of one
         that was begun, `kept_plane` has the plane. With an `executor` its workers compute. `force` begins again where
-        another slice is. `floor` also maps the numerical floor, which is no setting of the slice. Raises ValueError
-        where gradients cannot be so far apart, where there is no floor to map, and where the folder holds something
-        else, StoreMismatchError where it holds another slice.
+        another slice is. `floor` also maps the numerical floor, which is no setting of the slice. Without `picture`
+        nothing is drawn but for `prints`. Raises ValueError where gradients cannot be so far apart, where there is no
+        floor to map, and where the folder holds something else, StoreMismatchError where it holds another slice.
         """
         if floor:
             refuse_without_replicas(objective, refined=refinement is not None)
@@ -220,7 +222,7 @@ class SliceJob(SummaryJob[SliceSummary]):
         return cls(
             objective=BoxedObjective(objective) if boxed else objective, remake=None if boxed else recipe(objective),
             plane=plane, store=store, plot=picture_of(objective, plane), folder=folder, command=command,
-            executor=executor, prints=prints, refinement=refinement, floor=floor,
+            executor=executor, prints=prints, refinement=refinement, floor=floor, drawn=picture or bool(prints),
         )  # fmt: skip
 
     def work(self) -> list[Work]:
@@ -247,8 +249,8 @@ class SliceJob(SummaryJob[SliceSummary]):
         if mapped is None and self.floor:
             mapped = self._map_floor(dataset, watch)
         dataset = with_map(dataset, mapped)
-        printed = self.draw(partial(self.plot, dataset, floor=mapped))
-        files = [STORE, *([] if mapped is None else [FLOOR]), PICTURE, *printed, SUMMARY]
+        pictures = [PICTURE, *self.draw(partial(self.plot, dataset, floor=mapped))] if self.drawn else []
+        files = [SLICE.files[0], *([] if mapped is None else [FLOOR]), *pictures, SUMMARY]
         return self._summary(dataset, computed, time.monotonic() - start, files)
 
     def holding(self, watch: Watch) -> AbstractContextManager[None]:
@@ -262,6 +264,8 @@ class SliceJob(SummaryJob[SliceSummary]):
 
     def picture(self) -> None:
         """Draw the finest complete picture of the whole so far, if there is one."""
+        if not self.drawn:
+            return
         coarse = partly_refined(self.store) if self.refinement else self.store.coarse()
         if coarse is not None and bool((coarse["status"] != Status.MISSING).any()):
             from ..landscapes.draw.figures.page import save

@@ -26,7 +26,7 @@ from ..landscapes.plain import plain_name
 from ..landscapes.sampling.fill import Progress, sample
 from ..landscapes.storage.arrays import need_of as slice_need
 from ..landscapes.storage.files import discard, refuse_others, visible_files
-from ..landscapes.storage.paths import check_replaceable, filling_path, slice_exists
+from ..landscapes.storage.paths import check_replaceable, slice_exists, slice_places
 from ..landscapes.storage.store import SliceStore
 from .folder import ROOT, SWEEP, folder_named
 from .job import SummaryJob
@@ -53,12 +53,12 @@ if TYPE_CHECKING:
     from ..landscapes.plane import Plane
 
 FRAMES, ONLY, FILM, GIF, STREAM, SUMMARY = SWEEP.files
-FRAME = re.compile(r"\d{3,}\.(?:filling|zarr)")  # what the folder of a sweep's slices holds
+FRAME = re.compile(r"\d{3,}\.(?:filling|zarr|zarr\.zip)")  # what the folder of a sweep's slices holds
 SMOOTHING = "smoothing"
 MAX_SMOOTHING = 0.25  # the widest Gaussian's standard deviation, as a fraction of the box's sides
 PARALLEL_TOLERANCE = 1e-9  # of a parameter's unit: as near as rounding lets a point on a plane be to it
 HORIZON = "horizon"  # a scene option: the episode's duration as a multiple of the scene's own
-STORE_MEMORY, STORE_FILES = 100e3, 25  # of a slice without samples: bytes of its arrays' records, and files
+STORE_MEMORY, STORE_BLOCKS = 100e3, 4  # of a slice without samples: bytes of its arrays' records, and blocks of disk
 
 
 @dataclass(frozen=True)
@@ -333,7 +333,7 @@ def _along_kept(path: Path, plane: Plane, cut: Mapping[str, Any]) -> Plane:
 def check_folder(folder: Path) -> None:
     """Raise ValueError where a folder holds anything but a sweep: its films without any slice are somebody else's."""
     held = visible_files(folder)
-    begun = [file for file in held if file.name in (FRAMES, ONLY, filling_path(Path(ONLY)).name)]
+    begun = [file for file in held if file.name in (FRAMES, *(place.name for place in slice_places(Path(ONLY))))]
     strange = [file for file in visible_files(folder / FRAMES) if not FRAME.fullmatch(file.name)]
     refuse_others(folder, strange if begun else held, SWEEP.kind)
     SWEEP.check(folder, begun)
@@ -341,7 +341,7 @@ def check_folder(folder: Path) -> None:
 
 def _clear(folder: Path) -> None:
     """Remove the slices of a sweep, and what was made of them."""
-    places = [*visible_files(folder / FRAMES), folder / ONLY, filling_path(folder / ONLY)]
+    places = [*visible_files(folder / FRAMES), *slice_places(folder / ONLY)]
     stores = [store for store in places if store.exists()]
     for store in stores:
         check_replaceable(store)
@@ -380,7 +380,7 @@ class Motion:
         """Where in the sweep's folder the slice of each plane is."""
         if len(self.planes) == 1:
             return (ONLY,)
-        return tuple(f"{FRAMES}/{number:03d}.zarr" for number in range(len(self.planes)))
+        return tuple(f"{FRAMES}/{number:03d}.zarr.zip" for number in range(len(self.planes)))
 
 
 def refuse_too_large(plane: Plane, frames: int, folder: Path, *, grad: bool, over: int | str) -> None:
@@ -402,7 +402,7 @@ def need_of(shape: tuple[int, ...], dim: int, frames: int, *, grad: bool, over: 
     slices, samples = 1 if over == SMOOTHING else frames, math.prod(shape)
     array, one = samples * (9 + 8 * dim * grad), slice_need(shape, dim, grad=grad)
     memory = one.memory + slices * (STORE_MEMORY + array) + frames * 9.0 * samples
-    return Need(memory, one.disk + slices * (STORE_FILES * BLOCK + float(array)))
+    return Need(memory, one.disk + slices * (STORE_BLOCKS * BLOCK + float(array)))
 
 
 def _parameter(name: int | str, env: Environment, plane: Plane, frames: int) -> Motion:

@@ -23,7 +23,7 @@ import numpy as np
 import pytest
 
 from gradscape.cli import main
-from gradscape.landscapes.storage.paths import FILLING, finished_path
+from gradscape.landscapes.storage.paths import ARCHIVE, FILLING, FOLDER, finished_path, is_slice
 
 from .clock import Clock
 from .command import Said
@@ -261,14 +261,13 @@ def _readable(folder: Path) -> Iterator[tuple[Path, Callable[[Path], Numbers]]]:
             continue
         if path.name.startswith("."):
             continue
-        if path.suffix in (".zarr", FILLING):
+        if path.suffix in (".zarr", FILLING) or (path.name.endswith(FOLDER + ARCHIVE) and is_slice(path)):
             yield path, _store
         elif path.suffix in kinds and path.name not in ("settings.json", "summary.json"):
             yield path, kinds[path.suffix]
 
 
 def _store(path: Path) -> Numbers:
-    from gradscape.landscapes.storage.paths import is_slice
     from gradscape.landscapes.storage.store import SliceStore
     from gradscape.optim.runs.store import RunStore
 

@@ -13,8 +13,9 @@ CUT = "slice branin --dims 0 1 --resolution 4 --out cut"
 
 def test_a_slice_with_a_damaged_layout_is_begun_anew_by_force(run: Run, tmp_path: Path) -> None:
     run.ok(CUT)
-    for place in ("zarr.json", "loss/zarr.json"):
-        (tmp_path / "cut/slice.zarr" / place).write_text("{")
+    for layout in (b"cut off", b""):
+        file = tmp_path / "cut/slice.zarr.zip"
+        file.write_bytes(file.read_bytes()[:2000] if layout else b"")
         run.refuse(CUT, said="restore it, or sample the slice again in another folder")
         run.ok(*CUT.split(), "--force")
 
@@ -29,12 +30,13 @@ def test_a_report_of_several_slices_leaves_somebody_elses_alone(run: Run, tmp_pa
         assert (tmp_path / "mine" / name).read_text() == "precious"
 
 
-@pytest.mark.parametrize("mine", ["frames/000.zarr/notes.txt", "frames/001.png", "slice.zarr/notes.txt"])
+@pytest.mark.parametrize("mine", ["frames/notes.txt", "frames/001.png", "slice.zarr/notes.txt"])
 def test_a_sweep_with_anything_else_in_it_is_not_begun_anew(run: Run, tmp_path: Path, mine: str) -> None:
     over = "smoothing" if mine.startswith("slice") else "2"
     sweep = ["sweep", "ackley", "--set", "dim=3", "--dims", "0", "1", "--over", over, "--frames", "2"]
     sweep += ["--resolution", "4", "--out", "made"]
     run.ok(*sweep)
+    (tmp_path / "made" / mine).parent.mkdir(exist_ok=True)
     (tmp_path / "made" / mine).write_text("precious")
     run.refuse(*sweep, "--force", said="holds")
     held = {path.name for path in (tmp_path / "made").iterdir()}

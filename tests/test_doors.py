@@ -139,7 +139,7 @@ def commands(f: str, name: str) -> dict[str, str]:
     }
 
 
-OTHER_FUNCTIONS = {"bench", "bounce", "card", "list_envs", "log", "register"}  # of no simulator that is given
+OTHER_FUNCTIONS = {"bench", "bounce", "card", "list_envs", "log", "register", "slices"}  # of no simulator that is given
 OTHER_VERBS = {"bench", "bounce", "card", "info", "methods", "view"}  # so are these; bench times, which takes long
 
 

@@ -28,6 +28,7 @@ from distributed.security import Security
 from gradscape.envs.adapters import from_torch
 from gradscape.envs.functions import Branin
 from gradscape.envs.registry import make
+from gradscape.jobs.folder import SLICE
 from gradscape.jobs.slice import STORE
 from gradscape.jobs.workers import recipe, workers
 from gradscape.landscapes.plane import Plane
@@ -232,7 +233,7 @@ def test_a_scheduler_that_is_gone_ends_it_with_a_slice_to_go_on_with(tmp_path, m
         if now.done:
             scheduler.kill()
 
-    gone = r"the workers are gone .*; 16 of 288 points are kept in .*s\.zarr.*the same command continues"
+    gone = r"the workers are gone .*; 16 of 288 points are kept in .*s\.filling.*the same command continues"
     objective = from_torch(partial(once, mark=tmp_path / "mark"), SPACE)
     with pytest.raises(WorkersLostError, match=gone), workers(address, "cpu") as executor:
         sample(objective, PLANE, store, batch=1, executor=executor, progress=kill)
@@ -269,7 +270,7 @@ def test_a_race_has_the_same_runs_whoever_searches(tmp_path, run, address):
 def test_the_gallerys_slices_go_over_an_address(tmp_path, run, address):
     how = ["gallery", "compute", "--only", "bounce", "--part", "slices", "--fidelity", "draft", "--device", "cpu"]
     run.ok(*how, "--resolution", "8", "--data", str(tmp_path / "data"), "--scheduler", address)
-    assert list((tmp_path / "data").glob(f"*/{STORE}"))
+    assert list((tmp_path / "data").glob(f"*/{SLICE.files[0]}"))
 
 
 @pytest.mark.parametrize("wrong", ["local:0", "local:two"])

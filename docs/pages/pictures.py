@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from gradscape.envs.registry import make
-from gradscape.gallery.files import STORE, dark_name
+from gradscape.gallery.files import dark_name
 from gradscape.gallery.league import save_both
 from gradscape.landscapes import draw
 from gradscape.landscapes.draw.figures.contour import landscape_figure
@@ -13,6 +13,7 @@ from gradscape.landscapes.draw.figures.multiples import thumbnail_figure
 from gradscape.landscapes.draw.figures.profile import profile_figure
 from gradscape.landscapes.plane import Plane
 from gradscape.landscapes.sampling.fill import sample
+from gradscape.landscapes.storage.paths import slice_path
 
 from .kept import KeptFigure
 
@@ -23,7 +24,7 @@ def draw_slice(kept: KeptFigure, folder: Path, *, small: bool = False) -> dict[s
     """Draw a figure's slice, if its pictures are not there already, and return their names."""
     assert kept.slice is not None
     name, data = f"{kept.figure.id}{'-small' if small else ''}.png", kept.slice.data
-    if _is_old(folder / name, kept.folder / STORE):
+    if _is_old(folder / name, slice_path(kept.folder)):
         full = landscape_figure if len(data["loss"].dims) == 2 else profile_figure
         save_both((thumbnail_figure if small else full)(data), folder / name)
     return _both(name)
@@ -45,7 +46,7 @@ def _both(name: str) -> dict[str, str]:
 def _is_old(picture: Path, *data: Path) -> bool:
     """Say whether a picture is not there, or is older than its data or the code that draws."""
     picture.parent.mkdir(parents=True, exist_ok=True)
-    sources = [file for folder in (*data, *map(Path, draw.__path__)) for file in folder.rglob("[!_]*")]
+    sources = [*data, *(file for folder in (*data, *map(Path, draw.__path__)) for file in folder.rglob("[!_]*"))]
     newest = max(file.stat().st_mtime for file in sources)
     pair = (picture, picture.with_name(dark_name(picture.name)))
     return not all(one.exists() and one.stat().st_mtime > newest for one in pair)

@@ -6,7 +6,6 @@ import csv
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
-from zipfile import ZIP_STORED, ZipFile
 
 import numpy as np
 import torch
@@ -14,6 +13,8 @@ import xarray as xr
 
 from ...landscapes.export import frame, quoted, save_csv
 from ...landscapes.identity import plane_of
+from ...landscapes.storage.arrays import write_finished
+from ...landscapes.storage.paths import is_finished
 from ..files import CSV, ZARR
 
 
@@ -28,11 +29,9 @@ def save_slice(dataset: xr.Dataset, store: Path, folder: Path) -> list[str]:
         table[name] = column
     exact = table.select_dtypes(float).columns  # digits of single precision say all there is
     save_csv(table.astype(dict.fromkeys(exact, np.float32)), folder / CSV)
-    if not store.is_dir():
+    if not is_finished(store):
         return [CSV]
-    with ZipFile(folder / ZARR, "w", ZIP_STORED) as packed:  # chunks are compressed already
-        for file in sorted(one for one in store.rglob("*") if one.is_file()):
-            packed.write(file, file.relative_to(store).as_posix())
+    write_finished(folder / ZARR, dataset)
     return [CSV, ZARR]
 
 

@@ -11,6 +11,7 @@ from typing import Any
 
 from ...landscapes.convert import to_json
 from ...landscapes.plain import text
+from ...landscapes.storage.paths import is_finished
 from ...landscapes.storage.records import read_json, reading, write_record
 from ...landscapes.storage.store import open_slice
 from ...optim.claims import ClaimFinding, ClaimVerdict
@@ -104,7 +105,7 @@ def place_slice(data: Path, out: Path, env: str) -> str | None:
     """Put the slice through a scene's best point into the site, and return its command; None where there is none."""
     source, target = (LeagueFiles.of(root, env).slice for root in (data, out))
     store = source.record.parent / STORE
-    if not (source.there() and source.dark.is_file() and store.is_dir()):
+    if not (source.there() and source.dark.is_file() and is_finished(store)):
         return None
     with reading(source.record, REMAKE.format("league-slices")):
         command = text(read_json(source.record)["command"])

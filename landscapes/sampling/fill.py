@@ -123,7 +123,7 @@ def describe(objective: Objective) -> dict[str, dict[str, Any]]:
 
 def _warn_of_damage(store: SliceStore, pending: Sequence[Tile]) -> None:
     for tile in store.damaged_tiles(pending):
-        warnings.warn(f"{store.path}: tile {tile.index} is damaged and computed again", RuntimeWarning, stacklevel=3)
+        warnings.warn(f"{store.place}: tile {tile.index} is damaged and computed again", RuntimeWarning, stacklevel=3)
 
 
 @contextmanager
@@ -135,7 +135,7 @@ def resumable(store: SliceStore, counts: Counter[Status]) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        kept = f"{counts.total()} of {math.prod(store.shape)} points are kept in {store.path or 'memory'}"
+        kept = f"{counts.total()} of {math.prod(store.shape)} points are kept in {store.place or 'memory'}"
         if isinstance(error, WorkersLostError):
             raise WorkersLostError(f"{error}; {kept}, and the same command continues from there") from error
         if is_full(error):

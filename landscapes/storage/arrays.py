@@ -8,7 +8,8 @@ import re
 import threading
 import warnings
 import zlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import cached_property
@@ -16,6 +17,7 @@ from heapq import heappop, heappush
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal
+from zipfile import ZIP_DEFLATED, ZIP_STORED, ZipFile, ZipInfo
 
 import numpy as np
 import torch
@@ -24,7 +26,10 @@ import zarr
 from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
+from zarr.abc.store import Store
 from zarr.codecs import BloscCodec, Crc32cCodec, ZstdCodec
+from zarr.core.buffer import Buffer
+from zarr.storage import MemoryStore, ZipStore
 
 from ..capacity import BLOCK, Need, require
 from ..identity import ERROR, PACKAGE, VERSIONS, DamagedError, current_identity, current_provenance
@@ -42,7 +47,9 @@ SAMPLES = ("loss", "grad", "status")  # the arrays of what was evaluated
 CF = "CF-1.11"
 SUMS = "checksum"
 INTERPOLATED = "interpolated"  # the array of a refined slice that has what was not sampled
-FILES = store_files((*SAMPLES, INTERPOLATED, SUMS, *AXES, "dim", "unit"))  # of a finished slice
+ROOT = "zarr.json"  # what a zarr store is, and every array in it
+FIRST_BYTES = re.compile(rb"PK\x03\x04.{26}zarr\.json", re.DOTALL)  # of a finished slice's file
+FILES = store_files((*SAMPLES, INTERPOLATED, SUMS, *AXES, "dim", "unit"))  # of one that is a folder
 POINTS = "points"  # what names of files begin with that hold points of a slice that is refined
 FILLING_FILES = re.compile(rf"{HEADER}|{PARTS}/(?:{POINTS}-)?\d+(?:-\d+)*\.npz").fullmatch  # of one that is filled
 DRAWN = 150  # bytes that a picture takes for each sample
@@ -102,8 +109,12 @@ def _nothing(dtype: str, shape: tuple[int, ...]) -> NDArray[Any]:
 
 
 def write_finished(path: Path, dataset: xr.Dataset) -> None:
-    """Write a slice that is complete to a new folder: ascending, in chunks as analysis wants them."""
-    group = zarr.create_group(path, zarr_format=3)
+    """Write a slice that is complete to a new file, a zarr store in a zip: ascending, in chunks as analysis wants them.
+
+    The same slice makes the same bytes. Chunks are compressed by themselves, what describes them by the zip.
+    """
+    files: dict[str, Buffer] = {}
+    group = zarr.create_group(MemoryStore(files), zarr_format=3)
     group.attrs.update({**dataset.attrs, **COORDINATES})
     samples = dataset["loss"].shape
     for name, values in dataset.variables.items():
@@ -117,7 +128,11 @@ def write_finished(path: Path, dataset: xr.Dataset) -> None:
         else:
             _keep(group, str(name), values.to_numpy(), dims, values.attrs)
     write_sums(group, dataset.drop_vars(INTERPOLATED, errors="ignore"))
-    consolidate(path)
+    consolidate(group.store)
+    with ZipFile(path, "w") as archive:
+        for name in sorted(files, key=lambda name: (name != ROOT, name)):
+            packing = ZIP_DEFLATED if name.endswith(ROOT) else ZIP_STORED
+            archive.writestr(ZipInfo(name), files[name].to_bytes(), packing)
 
 
 def attributes_of(node: zarr.Group | zarr.Array[Any]) -> dict[str, Any]:
@@ -170,8 +185,9 @@ SIDE, VALUES = 256, 1 << 20  # of a chunk of a finished slice: samples along an 
 
 
 def open_group(path: Path, mode: Literal["r", "r+"] = "r") -> zarr.Group:
-    """Open a store of zarr's format 3 alone: format 2 has a codec (pickle) that runs what it reads."""
-    return zarr.open_group(path, mode=mode, zarr_format=3, use_consolidated=False)
+    """Open a folder or a zip of zarr's format 3 alone: format 2 has a codec (pickle) that runs what it reads."""
+    store = ZipStore(path, mode="r") if path.is_file() else path
+    return zarr.open_group(store, mode=mode, zarr_format=3, use_consolidated=False)
 
 
 def create_array(
@@ -212,11 +228,11 @@ def flags(kind: type[IntEnum]) -> dict[str, Any]:
     return {"flag_values": [int(k) for k in kind], "flag_meanings": " ".join(k.name.lower() for k in kind)}
 
 
-def consolidate(path: Path) -> None:
+def consolidate(store: Path | Store) -> None:
     """Gather a store's layout in one file, so that plain xarray.open_zarr reads it."""
     with _QUIET, warnings.catch_warnings():  # not in zarr's specification yet
         warnings.simplefilter("ignore")
-        zarr.consolidate_metadata(str(path))
+        zarr.consolidate_metadata(store)
 
 
 @dataclass(frozen=True)
@@ -338,18 +354,26 @@ def _halfway(start: int, width: int, size: int) -> tuple[int, int, int, int]:
 
 
 class Chunks:
-    """Read and write the samples of a finished slice, a chunk at a time, each with a checksum.
+    """Read the samples of a finished slice, a chunk at a time, each with a checksum.
 
     A chunk counts when it decodes and its checksum is right. Copies that xarray wrote have no checksums.
     """
 
-    def __init__(self, group: zarr.Group) -> None:
-        arrays = dict(group.arrays())
-        self._arrays = {name: arrays[name] for name in SAMPLES if name in arrays}
-        status = self._arrays["status"]
-        self._shape, self.sides = status.shape, status.chunks
+    def __init__(self, open_it: Callable[[], zarr.Group], shape: tuple[int, ...], sides: tuple[int, ...]) -> None:
+        self._open, self._shape, self.sides = open_it, shape, sides
+
+    @cached_property
+    def _all(self) -> dict[str, zarr.Array[Any]]:
+        return dict(self._open().arrays())
+
+    @cached_property
+    def _arrays(self) -> dict[str, zarr.Array[Any]]:
+        return {name: self._all[name] for name in SAMPLES if name in self._all}
+
+    @cached_property
+    def _sums(self) -> zarr.Array[Any] | None:
         counts = tuple(math.ceil(points / side) for points, side in zip(self._shape, self.sides, strict=True))
-        self._sums = arrays.get(SUMS) if SUMS in arrays and arrays[SUMS].shape == counts else None
+        return self._all[SUMS] if SUMS in self._all and self._all[SUMS].shape == counts else None
 
     @classmethod
     def open(cls, path: Path) -> tuple[xr.Dataset, Path, Chunks]:
@@ -359,12 +383,23 @@ class Chunks:
         """
         check_layouts(path)
         try:
-            group = open_group(path, "r+")
-            return _read_blank(path, group), path, cls(group)
+            group = open_group(path)
+            status = group["status"]
+            if not isinstance(status, zarr.Array):
+                raise TypeError("its status is no array")
+            return _read_blank(path, group), path, cls(lambda: group, status.shape, status.chunks)
         except DamagedError:
             raise
         except Exception as error:  # a damaged axis raises whatever reads it; no chunk is read here
             raise damage(path, f"{type(error).__name__}: {error}") from error
+
+    @classmethod
+    def written(cls, path: Path, dataset: xr.Dataset) -> tuple[xr.Dataset, Path, Chunks]:
+        """Return the same of a slice that was just written there; nothing is read before a sample is wanted."""
+        arrays = {name: dataset.variables[name] for name in SAMPLES if name in dataset}
+        empty = {name: one.copy(data=_nothing(one.dtype.name, one.shape)) for name, one in arrays.items()}
+        shape = dataset["status"].shape
+        return dataset.assign(empty), path, cls(lambda: open_group(path), shape, analysis_chunks(shape))
 
     def read(self, tile: Tile) -> Arrays | None:
         """Return the samples of a chunk, None where they are not what was written."""
@@ -374,13 +409,6 @@ class Chunks:
         except Exception:  # a damaged chunk raises whatever its codec does
             return None
         return values if known is None or known == tile_sum(tile.index, values) else None
-
-    def write(self, tile: Tile, values: Arrays) -> None:
-        """Write the samples of a chunk that was damaged."""
-        for name, array in self._arrays.items():
-            array[self._box(tile)] = values[name]
-        if self._sums is not None:
-            self._sums[tile.index] = tile_sum(tile.index, values)
 
     def _box(self, tile: Tile) -> tuple[slice, ...]:
         parts = zip(tile.index, self.sides, self._shape, strict=True)
@@ -402,6 +430,8 @@ def _read_blank(path: Path, group: zarr.Group) -> xr.Dataset:
         one.attrs = attributes_of(arrays[str(name)])
     if INTERPOLATED in arrays:
         inside = arrays[INTERPOLATED]
+        if inside.nchunks_initialized != inside.nchunks:
+            raise damage(path / INTERPOLATED, "some of its chunks are missing")
         empty[INTERPOLATED] = (empty["loss"].dims, np.asarray(inside[...]), attributes_of(inside))
     return empty.drop_attrs(deep=False).assign_attrs(about)
 
@@ -438,13 +468,23 @@ ANEW = "restore it, or sample the slice again in another folder"
 
 def check_layouts(path: Path) -> None:
     """Raise DamagedError, naming the file, where how an array is stored is not readable or not what the index says."""
-    root = _read(path)
+    try:
+        with _files(path) as read:
+            _check_layouts(path, read)
+    except DamagedError:
+        raise
+    except Exception as error:  # a damaged zip raises anything
+        raise damage(path, str(error)) from None
+
+
+def _check_layouts(path: Path, read: Callable[[str], bytes]) -> None:
+    root = _layout(path, "", read)
     index = root.get("consolidated_metadata", {"metadata": {}})  # copies that xarray wrote may have none
     known = index.get("metadata") if isinstance(index, dict) else None
     if not isinstance(known, dict) or not (known or "consolidated_metadata" not in root):
         raise damage(path, "the index of its arrays is not what it was made")
     for name in known or [name for name in (*SAMPLES, *AXES, "dim", "unit") if (path / name).is_dir()]:
-        layout = _read(path / name)
+        layout = _layout(path, name, read)
         if layout.get("node_type") != "array" or known.get(name, layout) != layout:
             raise damage(path / name, "its layout is not what the store's index says")
 
@@ -466,15 +506,48 @@ def _values(path: Path, array: Any) -> NDArray[Any]:
         raise damage(path, str(error)) from None
 
 
-def _read(folder: Path) -> dict[str, Any]:
-    path = folder / "zarr.json"
-    try:
-        found = json.loads(path.read_text())
-    except (OSError, ValueError) as error:
-        raise damage(path, str(error)) from None
+@contextmanager
+def _files(store: Path) -> Iterator[Callable[[str], bytes]]:
+    """Give what reads a file of a store, a folder or a zip, by its name in it."""
+    if store.is_file():
+        with ZipFile(store) as archive:
+            yield archive.read
+    else:
+        yield lambda name: (store / name).read_bytes()
+
+
+def read_layout(store: Path) -> dict[str, Any]:
+    """Return how a store, a folder or a zip, is laid out, with its attributes.
+
+    Raises whatever a file raises that is damaged or something else.
+    """
+    with _files(store) as read:
+        return _object(read(ROOT))
+
+
+def _object(content: bytes) -> dict[str, Any]:
+    found = json.loads(content)
     if not isinstance(found, dict):
-        raise damage(path, "it is no JSON object")
+        raise TypeError("it is no JSON object")
     return found
+
+
+def is_torn(archive: Path) -> bool:
+    """Whether a file is a finished slice's, empty or as it begins, and does not open any more."""
+    with archive.open("rb") as file:
+        begins = file.read(64)
+    try:
+        return not isinstance(read_layout(archive)["attributes"], dict)
+    except Exception:  # a damaged zip raises anything
+        return not begins or FIRST_BYTES.match(begins) is not None
+
+
+def _layout(store: Path, name: str, read: Callable[[str], bytes]) -> dict[str, Any]:
+    """Return the layout of an array in a store, or without a name that of the store."""
+    try:
+        return _object(read(f"{name}/{ROOT}" if name else ROOT))
+    except Exception as error:  # a damaged zip raises anything
+        raise damage(store / name / ROOT, str(error)) from None
 
 
 def damage(path: Path, why: str) -> DamagedError:

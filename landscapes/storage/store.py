@@ -1,4 +1,4 @@
-"""A slice on disk: a file for each tile while it is being filled, and a zarr store once it is finished.
+"""A slice on disk: a file for each tile while it is being filled, and one file, a zarr store, once it is finished.
 
 A slice is `loss(v, u)`, `grad(v, u, dim)` unless sampled without gradients, `status(v, u)` and the coordinates `u`,
 `v`, `dim`, `unit(dim)`; a line has no `v`. It lies in one of two places:
@@ -6,9 +6,11 @@ A slice is `loss(v, u)`, `grad(v, u, dim)` unless sampled without gradients, `st
 - `slice.filling` while it is being filled: a record of what it is, and a file for each tile, written whole. Samples
   are taken coarse to fine (`arrays.coarse_to_fine`), so the first tile is a coarse picture of the whole box and every
   square of tiles from it a finer one. A file that is damaged is as if it had never been written.
-- `slice.zarr` once every point is there, with ascending axes and chunks as large as analysis wants them
+- `slice.zarr.zip` once every point is there, with ascending axes and chunks as large as analysis wants them
   (`arrays.analysis_chunks`), so that anybody's xarray or zarr reads it right. It appears whole, and only then the tiles
-  go: a process killed at any instant leaves one or the other. Its tiles are its chunks, each with a checksum.
+  go: a process killed at any instant leaves one or the other. Its tiles are its chunks, each with a checksum. It is
+  never changed: where a chunk is damaged and computed again, another whole file takes its place. Earlier versions left
+  the same store as a folder, `slice.zarr`, which is read alike.
 """
 
 from __future__ import annotations
@@ -53,6 +55,7 @@ from .arrays import (
     FORMAT,
     HEADER,
     MARK,
+    ROOT,
     SAMPLES,
     Arrays,
     Chunks,
@@ -64,15 +67,17 @@ from .arrays import (
     write_finished,
 )
 from .checkpoint import Checkpoint
-from .files import placing, remove, resolve
+from .files import placing, remove, replacing, resolve
 from .paths import (
+    archive_path,
     check_replaceable,
     filling_path,
     finished_path,
+    folder_path,
     has_lost_root,
     is_slice,
-    place_of,
     slice_path,
+    slice_places,
 )
 from .records import read_json, reading, write_record
 
@@ -103,7 +108,7 @@ class SliceStore:
         self.plane = Plane.from_record(self.identity["plane"])
         self.dims = AXES[: self.plane.rank][::-1]
         self.tiling = Tiling(self.plane, self.every if self.grad else 0, chunks.sides if chunks else ())
-        self._tiles: dict[Tile, Arrays] = {}  # what is known of a slice that is being filled
+        self._tiles: dict[Tile, Arrays] = {}  # what is known of a slice that is being filled, or was computed again
         # the files of what is being filled: of tiles, or of the points of a slice that is refined
         self.parts = Checkpoint(self.place, digest(self.identity)) if self.place and not chunks else None
 
@@ -128,20 +133,22 @@ class SliceStore:
         Raises StoreExistsError where the path is taken, StoreError where what is there is not replaced, and
         TooLargeError where the slice does not fit onto the disk or into memory.
         """
-        path = resolve(path)
+        path = _resolve(path)
         header = _header(plane, space, identity, provenance or {}, grad=grad)
-        for taken in (path, filling_path(path)):
-            if taken.exists() and not overwrite:
-                raise StoreExistsError(f"{path} exists already; write elsewhere with --out, or replace it with --force")
-            if taken.exists():
-                check_replaceable(taken)
+        for taken in filter(Path.exists, slice_places(path)):
+            if not overwrite:
+                raise StoreExistsError(
+                    f"{taken} exists already; write elsewhere with --out, or replace it with --force"
+                )
+            check_replaceable(taken)
         refuse_too_large(plane, path, grad=grad)
         try:
             with placing(filling_path(path), overwrite=overwrite) as new:
                 write_record(new / HEADER, header)
         except FileExistsError as error:
             raise StoreExistsError(str(error)) from None
-        remove(path, FILES)
+        archive_path(path).unlink(missing_ok=True)
+        remove(folder_path(path), FILES)
         return cls.open(path)
 
     @classmethod
@@ -150,13 +157,14 @@ class SliceStore:
 
         Raises StoreError where there is none, DamagedError where it is not what was written.
         """
-        path = finished_path(resolve(path))
-        place = place_of(path)
+        path = _resolve(path)
+        place = path if path.exists() else filling_path(path)
         if not place.exists():
             raise StoreError(f"there is no slice store at {path}; make one with `landscape slice`")
         if not is_slice(place):
             if has_lost_root(place):
-                raise damage(place / ("zarr.json" if place == path else HEADER), "it does not say what it is of")
+                root = place if place.is_file() else place / (ROOT if place == path else HEADER)
+                raise damage(root, "it does not say what it is of")
             raise StoreError(f"{place} is no slice store of format {FORMAT}; move it away or write elsewhere")
         if place == path:
             return cls(*Chunks.open(path))
@@ -181,7 +189,7 @@ class SliceStore:
             store = cls.open(path)
         check_identity(store.path, wanted=full_identity(identity, plane, space, grad=grad), found=store.identity)
         if store.ascending and store.path:
-            remove(filling_path(store.path), FILLING_FILES)  # left by a process that was killed at its end
+            store._clear_others(store.path)  # left by a process that was killed at its end
         return store
 
     @classmethod
@@ -241,7 +249,7 @@ class SliceStore:
 
     def read_tile(self, tile: Tile) -> Arrays | None:
         """Return the arrays of a tile that is finished, None of one that is not."""
-        if self._chunks is not None:
+        if self._chunks is not None and tile not in self._tiles:
             values = self._chunks.read(tile)
             return values if values is not None and self._is_whole(tile, values) else None
         if tile not in self._tiles and self.parts is not None:
@@ -286,9 +294,6 @@ class SliceStore:
             if name in self._empty:
                 values = getattr(evaluation, name).detach().cpu().numpy()
                 arrays[name] = values.reshape(shape + values.shape[1:]).astype(self._empty[name].dtype)
-        if self._chunks is not None:
-            self._chunks.write(tile, arrays)
-            return
         if self.parts is not None:
             self.parts.save(tile.name, **arrays)
         self._tiles[tile] = arrays
@@ -317,17 +322,19 @@ class SliceStore:
     def finish(self, dataset: xr.Dataset) -> None:
         """Put the whole slice, which `dataset` returned, in the place of its tiles: ascending, in large chunks.
 
-        It appears at once, and only then the tiles go.
+        It appears at once, and only then the tiles go. Of a slice that was finished before, this is for chunks that
+        were computed again.
 
         Raises StoreError where the slice is not complete, or the store was replaced.
         """
-        if self.path is None or self.ascending or self._follow_finished():
+        if self.path is None or self._follow_finished() or (self.ascending and not self._tiles):
             return
         if bool((dataset["status"] == Status.MISSING).any()):
             raise StoreError(f"{self.path} is not complete; run the command that samples it again")
-        with contextlib.suppress(FileExistsError), placing(self.path, overwrite=False) as new:
+        archive = archive_path(self.path)
+        with replacing(archive) as new:
             write_finished(new, dataset)
-        self._move_on(self.path)
+        self._move_on(*Chunks.written(archive, dataset))
 
     def coarse(self) -> xr.Dataset | None:
         """Return the largest coarse picture of the whole that is complete, axes ascending; None before the first.
@@ -376,7 +383,7 @@ class SliceStore:
 
     def _dataset(self) -> xr.Dataset:
         found = self._collect([name for name in SAMPLES if name in self._empty])
-        return self._empty.assign({name: self._empty[name].copy(data=array) for name, array in found.items()})
+        return self._empty.assign({name: self._empty.variables[name].copy(data=one) for name, one in found.items()})
 
     def _read_steadily(self, read: Callable[[], T]) -> T:
         """Return what is read, once more where another process has finished the slice meanwhile."""
@@ -395,15 +402,28 @@ class SliceStore:
             if self.place.stat().st_ino == self._inode:
                 return False
         with contextlib.suppress(StoreError):
-            if not self.ascending and SliceStore.open(self.path).identity == self.identity:
-                self._move_on(self.path)
+            now = SliceStore.open(self.path)
+            if now.ascending and now.path and now.identity == self.identity:
+                self._move_on(*Chunks.open(now.path))
                 return True
         raise StoreError(f"{self.path} was replaced or removed while it was being filled; run the command again")
 
-    def _move_on(self, path: Path) -> None:
-        """Become the finished slice, and clear the tiles away."""
-        self._adopt(*Chunks.open(path))
+    def _move_on(self, empty: xr.Dataset, path: Path, chunks: Chunks) -> None:
+        """Become the finished slice, and clear away what it was made of."""
+        self._adopt(empty, path, chunks)
+        self._clear_others(path)
+
+    @staticmethod
+    def _clear_others(path: Path) -> None:
+        """Remove the tiles of a finished slice, and the folder that an earlier version left where it is a file."""
         remove(filling_path(path), FILLING_FILES)
+        if path != folder_path(path) and folder_path(path).is_dir():
+            remove(folder_path(path), FILES)
+
+
+def _resolve(path: str | Path) -> Path:
+    """Return where a slice is or will be once it is finished, given any of its names, without links."""
+    return resolve(finished_path(resolve(path)))
 
 
 def open_slice(path: str | Path) -> xr.Dataset:

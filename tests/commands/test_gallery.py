@@ -273,7 +273,7 @@ def test_without_a_checkout_s_data_results_go_to_the_folder_where_one_stands(
     monkeypatch.chdir(tmp_path)
     how = ["--part", "slices", "--device", "cpu", "--only", "branin", "--resolution", "4"]
     assert gallery("compute", *how) == 0
-    assert (tmp_path / "out/gallery-data/branin/slice.zarr").exists()
+    assert (tmp_path / "out/gallery-data/branin/slice.zarr.zip").exists()
     assert gallery("build") == 0
     assert (tmp_path / "out/gallery/branin/index.html").exists()
     assert sorted(path.name for path in installed.rglob("*")) == ["studies"]

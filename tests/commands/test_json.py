@@ -21,7 +21,7 @@ export cut --force
 compare cut cut
 plan slice branin --resolution 4
 check branin --power 20%
-gallery list
+gallery list .
 """.strip().splitlines()
 ELSEWHERE = {  # whose JSON other tests read
     *("bench", "bounce", "card", "census", "gallery compute", "league", "optimize", "overlay"),

@@ -44,7 +44,7 @@ def test_a_refined_slice_says_what_was_sampled_and_is_there_the_second_time(run:
     plain = run(*REFINED.replace("--refine 5%", "--force").split(), "made")
     assert plain.json["refinement"] is None
     assert sorted(path.name for path in (tmp_path / "made").iterdir()) == [
-        "landscape.png", "slice.zarr", "summary.json",
+        "landscape.png", "slice.zarr.zip", "summary.json",
     ]  # fmt: skip
 
 

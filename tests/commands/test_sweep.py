@@ -1,7 +1,6 @@
 """`landscape sweep`: what it leaves, continues from, and refuses."""
 
 import json
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -75,7 +74,7 @@ def test_gradients_may_be_at_some_of_the_samples(run: Run) -> None:
 def test_nothing_is_computed_twice(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     run(SWEEP)
     first = [open_slice(f"moved/frames/{number:03d}.zarr") for number in range(3)]
-    shutil.rmtree("moved/frames/001.zarr")
+    Path("moved/frames/001.zarr.zip").unlink()
     again = run(f"{SWEEP} --json")
     assert (again.json["episodes"], again.json["resumed"]) == (25, 50)
     assert "25 episodes with gradients of 3 slices to compute, 50 are there already" in again.stderr
@@ -97,7 +96,7 @@ def test_force_begins_anew_and_another_sweep_is_not_overwritten(run: Run) -> Non
     assert before == {path: path.read_bytes() for path in Path("moved").rglob("*") if path.is_file()}
     done = run(SWEEP.replace("--frames 3", "--frames 2") + " --force --json")
     assert done.json["episodes"] == 50
-    assert names(Path("moved/frames")) == ["000.zarr", "001.zarr"]
+    assert names(Path("moved/frames")) == ["000.zarr.zip", "001.zarr.zip"]
 
 
 @pytest.mark.drawn
@@ -108,7 +107,7 @@ def test_smoothing_averages_one_slice(run: Run) -> None:
     assert summary["episodes"] == 81
     for frame in summary["frames"]:
         assert frame["loss"]["lowest"] == float(smooth(dataset, frame["value"] / 100)["loss"].min())
-    assert names(Path("soft")) == ["slice.zarr", *FILES[1:]]
+    assert names(Path("soft")) == ["slice.zarr.zip", *FILES[1:]]
 
 
 def test_over_the_horizon_each_frame_is_a_shorter_episode(run: Run) -> None:
@@ -136,6 +135,6 @@ def test_without_out_each_sweep_has_a_folder_of_its_own(run: Run) -> None:
     for over in ("2", "x3", "smoothing"):
         run.ok(f"{short} {over}")
     assert len(names(Path("out"))) == 3
-    dataset = open_slice(next(Path("out").glob("*-over-3-*/frames/001.zarr")))
+    dataset = open_slice(next(Path("out").glob("*-over-3-*/frames/001.zarr.zip")))
     assert "grad" not in dataset
     assert float(plane_of(dataset).origin[3]) == float(gradscape.make("ackley", dim=4).space.upper[3])

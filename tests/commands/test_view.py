@@ -18,7 +18,7 @@ def desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder of what verbs leave, as far as `view` looks at it, on a machine without a display."""
     for name in view.DISPLAYS:
         monkeypatch.delenv(name, raising=False)
-    files = ("cut/landscape.png", "cut/slice.zarr/zarr.json", "run/progress.png", "empty/a.txt")
+    files = ("cut/landscape.png", "cut/slice.zarr.zip", "run/progress.png", "empty/a.txt")
     for file in (*files, "site/index.html", "my site/index.html"):
         (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / file).write_text("")
@@ -30,9 +30,9 @@ def desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     ("command", "said"),
     [
         ("view nothing.png", "there is no file nothing.png"),
-        ("view cut/slice.zarr/zarr.json", "view opens .png, .html, .mp4, .gif, .rrd and results folders"),
+        ("view empty/a.txt", "view opens .png, .html, .mp4, .gif, .rrd and results folders"),
         ("view cut/landscape.png", "there is no display here to open cut/landscape.png"),
-        ("view cut/slice.zarr", "there is no display here to open cut/landscape.png"),
+        ("view cut/slice.zarr.zip", "there is no display here to open cut/landscape.png"),
         ("view run", "there is no display here to open run/progress.png"),
         ("view empty", "empty holds none of index.html, overlay.rrd, race.png"),
         ("view cut --serve", "--serve shows recordings (.rrd)"),

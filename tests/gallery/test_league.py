@@ -223,7 +223,7 @@ def test_median_runs_are_laid_over_the_slice_through_the_best_point(
     assert "league-slices: 1 of 3 are there already" in slices()
     standings, files = read_standings(small / "league/branin.json"), LeagueFiles.of(small, "branin").slice
     assert {path.name for path in files.record.parent.iterdir()} == {
-        "slice.zarr", "medians.json", "medians.png", "medians-dark.png"
+        "slice.zarr.zip", "medians.json", "medians.png", "medians-dark.png"
     }  # fmt: skip
     dataset = open_slice(files.record.parent / "slice.zarr")
     assert standings.best is not None

@@ -131,7 +131,7 @@ def test_a_slice_that_was_stopped_has_the_same_floor(tmp_path: Path, after: int)
     few = [open_slice(tmp_path / name).attrs["floor"] for name in ("whole", "cut")]
     assert few[0] == few[1]
     assert sorted(path.name for path in (tmp_path / "cut").iterdir()) == [
-        FLOOR, "landscape.png", "slice.zarr", "summary.json",
+        FLOOR, "landscape.png", "slice.zarr.zip", "summary.json",
     ]  # fmt: skip
 
 

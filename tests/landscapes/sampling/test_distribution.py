@@ -180,7 +180,7 @@ def test_workers_that_are_gone_end_it_with_what_is_kept(tmp_path):
                 future.cancel()
                 future.set_running_or_notify_cancel()
 
-    said = r"the workers are gone.*; \d+ of 288 points are kept in .*s\.zarr.*continues"
+    said = r"the workers are gone.*; \d+ of 288 points are kept in .*s\.filling.*continues"
     with pytest.raises(WorkersLostError, match=said):
         sample(from_torch(wave, SPACE), PLANE, store, batch=32, executor=slow, progress=lose)
 

@@ -23,6 +23,7 @@ from gradscape.landscapes.verification import POINTS
 from gradscape.studies.stability import ask, is_stable
 
 from ...processes import FORK
+from ..storage.stores import break_chunk
 from .waves import PLANE, SPACE, same, store_at, wave
 
 MESSAGES = [
@@ -136,7 +137,7 @@ def test_a_damaged_tile_is_named_and_computed_again(tmp_path, kept, whole, damag
     sound, small = file.read_bytes(), Small(1000, MemoryError())
     torn = {"truncated": sound[: len(sound) // 2], "altered": sound.replace(b"NUMPY", b"numpy", 1), "empty": b""}
     file.write_bytes(torn[damage])
-    with pytest.warns(RuntimeWarning, match=r"s\.zarr: tile \(2, 3\) is damaged and computed again") as said:
+    with pytest.warns(RuntimeWarning, match=r"s\.filling: tile \(2, 3\) is damaged and computed again") as said:
         assert same(sample(small, PLANE, store_at(path)), whole)
     assert len(said) == 1
     assert small.asked == [POINTS, 16]  # those that are verified first
@@ -154,8 +155,7 @@ def test_a_tile_that_was_never_finished_is_no_damage(tmp_path, kept, whole):
 def test_a_damaged_finished_slice_is_named_and_computed_again(tmp_path, whole):
     path = tmp_path / "s.zarr"
     sample(from_torch(wave, SPACE), PLANE, store_at(path))
-    file = path / "loss" / "c" / "0" / "0"
-    file.write_bytes(file.read_bytes()[:-3])
+    break_chunk(path, "loss/c/0/0")
     with pytest.warns(RuntimeWarning, match=r"tile \(0, 0\) is damaged and computed again"):
         assert same(sample(from_torch(wave, SPACE), PLANE, store_at(path)), whole)
 
@@ -163,9 +163,8 @@ def test_a_damaged_finished_slice_is_named_and_computed_again(tmp_path, whole):
 def test_a_damaged_axis_is_said_with_what_to_do(tmp_path):
     path = tmp_path / "s.zarr"
     sample(from_torch(wave, SPACE), PLANE, store_at(path))
-    (file,) = (path / "u" / "c").iterdir()
-    file.write_bytes(b"")
-    with pytest.raises(StoreError, match=r"s\.zarr/u is damaged .*restore it, or sample the slice again"):
+    break_chunk(path, "u/c/0")
+    with pytest.raises(StoreError, match=r"s\.zarr\.zip/u is damaged .*restore it, or sample the slice again"):
         store_at(path)
 
 
@@ -180,7 +179,7 @@ def test_a_full_disk_ends_it_with_what_is_kept_and_the_slice_goes_on(tmp_path, w
         replace(source, target)
 
     monkeypatch.setattr(os, "replace", full)
-    said = r"the disk is full; 80 of 288 points are kept in .*s\.zarr: make room, and the same command continues"
+    said = r"the disk is full; 80 of 288 points are kept in .*s\.filling: make room, and the same command continues"
     with pytest.raises(OSError, match=said) as ended:
         sample(from_torch(wave, SPACE), PLANE, store)
     assert ended.value.errno == code

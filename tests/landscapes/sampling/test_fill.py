@@ -14,6 +14,7 @@ from gradscape.landscapes.identity import StoreError
 from gradscape.landscapes.objective import Evaluation, Objective, Status
 from gradscape.landscapes.plane import Plane
 from gradscape.landscapes.sampling.fill import sample
+from gradscape.landscapes.storage.paths import archive_path
 from gradscape.landscapes.storage.store import SliceStore
 from gradscape.landscapes.verification import POINTS
 
@@ -106,8 +107,7 @@ def sampling(path: Path) -> None:
 def test_sigkill_at_any_instant_changes_no_bit(tmp_path):
     undisturbed, found = tmp_path / "undisturbed.zarr", []
     instants, whole = alone(partial(sampling, undisturbed), tmp_path).changes, sample(Wave(), PLANE)
-    files = {file.relative_to(undisturbed): file for file in undisturbed.rglob("*") if file.is_file()}
-    for instant in range(1, instants + 1, 43):
+    for instant in range(1, instants + 1, 31):
         path = tmp_path / f"{instant}.zarr"
         assert alone(partial(sampling, path), tmp_path, Instant(instant)).returncode == -signal.SIGKILL
         left = store_at(path)
@@ -120,8 +120,7 @@ def test_sigkill_at_any_instant_changes_no_bit(tmp_path):
         xr.testing.assert_equal(resumed, whole)
         assert same(resumed, whole)
         assert resumed.attrs["error"] == SliceStore.open(path).dataset().attrs["error"] == SAID
-        for name, file in files.items():
-            assert (path / name).read_bytes() == file.read_bytes()
+        assert archive_path(path).read_bytes() == archive_path(undisturbed).read_bytes()
     assert found[0] == 0
     assert found == sorted(found)
     assert len(set(found)) > 3

@@ -11,6 +11,7 @@ import pytest
 import torch
 import xarray as xr
 from torch import Tensor
+from zarr.storage import ZipStore
 
 from gradscape import ParameterSpace, Plane, from_numpy, from_torch, sample
 from gradscape.landscapes.convert import to_json
@@ -24,6 +25,8 @@ from gradscape.landscapes.sampling.refine import Refined, Refinement, refine
 from gradscape.landscapes.slice import Slice
 from gradscape.landscapes.storage.paths import filling_path
 from gradscape.landscapes.storage.store import SliceStore, open_slice
+
+from ..storage.stores import break_chunk
 
 Function = Callable[[Tensor], Tensor]
 SPACE = ParameterSpace.box(("a", "b"), -1.0, 1.0)
@@ -214,10 +217,10 @@ def test_one_that_is_stopped_goes_on_and_has_the_same_bits(tmp_path: Path) -> No
     xr.testing.assert_identical(ended[first], whole)
     xr.testing.assert_identical(ended[-1], whole)  # which was finished
     assert len(stopping.seen) == len(set(stopping.seen)) == sampled(whole).sum()
-    assert sorted(path.name for path in (tmp_path / "two").iterdir()) == ["slice.zarr"]
+    assert sorted(path.name for path in (tmp_path / "two").iterdir()) == ["slice.zarr.zip"]
     stored = open_slice(tmp_path / "two" / "slice.zarr")
     xr.testing.assert_equal(stored, whole)
-    plain = xr.open_zarr(tmp_path / "two" / "slice.zarr").load()
+    plain = xr.open_zarr(ZipStore(tmp_path / "two" / "slice.zarr.zip")).load()
     assert "interpolated" in plain["status"].attrs["flag_meanings"]
     assert np.isfinite(plain["loss"].fillna(plain["interpolated"])).all()
 
@@ -245,10 +248,7 @@ def test_a_damaged_piece_is_evaluated_again(tmp_path: Path) -> None:
 def test_a_damaged_slice_is_refused_and_another_grid_too(tmp_path: Path) -> None:
     over, path = plane(65), tmp_path / "slice.zarr"
     next(runs(Stopping(jumping, 0), path, over))
-    chunk = next((path / "loss" / "c").rglob("*"))
-    while chunk.is_dir():
-        chunk = next(chunk.iterdir())
-    chunk.write_bytes(b"no chunk")
+    break_chunk(path, "loss/c/0/0")
     with pytest.raises(DamagedError, match="samples are lost"):
         next(runs(Stopping(jumping, 0), path, over))
     store = SliceStore.in_memory(plane(33), SPACE)

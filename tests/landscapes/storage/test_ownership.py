@@ -6,6 +6,7 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
+from zipfile import ZipFile
 
 import numpy as np
 import pytest
@@ -23,6 +24,7 @@ from gradscape.landscapes.storage.paths import filling_path
 from gradscape.landscapes.storage.store import SliceStore
 
 from ...processes import alone
+from .stores import unpacked
 
 SPACE = ParameterSpace.box(("x", "y"), -1.0, 1.0)
 PLANE = Plane.through(SPACE, SPACE.center, ("x", "y"), resolution=9)
@@ -38,8 +40,9 @@ def make(path: Path, *, overwrite: bool = False) -> SliceStore:
 
 
 def finished(path: Path) -> Path:
+    """Return the folder of a finished slice, as earlier versions left it."""
     sample(from_torch(bowl, SPACE), PLANE, make(path))
-    return path
+    return unpacked(path)
 
 
 def unfinished(path: Path) -> Path:
@@ -91,6 +94,26 @@ def test_a_slice_without_its_root_can_be_begun_anew_as_its_refusal_says(
     with pytest.raises(StoreError, match=rf"{root.name} is damaged .*; restore it, or sample the slice again"):
         SliceStore.open(tmp_path / "slice.zarr")
     assert make(tmp_path / "slice.zarr", overwrite=True).pending()
+
+
+@pytest.mark.parametrize("content", [b"", b"cut", b"my own file", None])
+def test_a_file_in_the_place_of_a_slice_is_replaced_only_if_it_was_one(tmp_path: Path, content: bytes | None) -> None:
+    sample(from_torch(bowl, SPACE), PLANE, make(tmp_path / "slice.zarr"))
+    archive = tmp_path / "slice.zarr.zip"
+    if content is None:
+        with ZipFile(archive, "w") as mine:
+            mine.writestr("thesis.tex", "five years")
+    else:
+        archive.write_bytes(archive.read_bytes()[:4000] if content == b"cut" else content)
+    if content in (b"", b"cut"):
+        with pytest.raises(StoreError, match=r"slice\.zarr\.zip is damaged .*; restore it, or sample the slice again"):
+            SliceStore.open(tmp_path / "slice.zarr")
+        assert make(tmp_path / "slice.zarr", overwrite=True).pending()
+        assert own(tmp_path) == ["slice.filling"]
+    else:
+        with pytest.raises(StoreError, match="no slice store, so it is not replaced"):
+            make(tmp_path / "slice.zarr", overwrite=True)
+        assert own(tmp_path) == ["slice.zarr.zip"]
 
 
 def test_another_zarr_store_of_our_names_is_not_replaced(tmp_path: Path) -> None:

@@ -14,26 +14,61 @@ import xarray as xr
 from gradscape.landscapes.identity import StoreError, StoreMismatchError
 from gradscape.landscapes.objective import Status
 from gradscape.landscapes.plane import Plane
-from gradscape.landscapes.storage.paths import filling_path
+from gradscape.landscapes.storage.paths import archive_path, filling_path, folder_path
 from gradscape.landscapes.storage.store import SliceStore, open_slice
 
 from ...processes import Instant, alone
-from .stores import IDENTITY, PLANE, SPACE, chunks, fill, finished, make
+from .stores import IDENTITY, PLANE, SPACE, break_chunk, chunks, fill, finished, make, unpacked
 
 
-def test_a_damaged_chunk_of_a_finished_slice_is_computed_again(tmp_path):
+@pytest.mark.parametrize("place", [archive_path, folder_path])
+def test_a_damaged_chunk_of_a_finished_slice_is_computed_again(tmp_path, place):
     path = tmp_path / "slice.zarr"
     finished(path)
-    whole = open_slice(path)
-    for file in chunks(path):
-        content = bytearray(file.read_bytes())
-        content[len(content) // 2] ^= 1
-        file.write_bytes(bytes(content))
+    whole, again = open_slice(path), archive_path(path).read_bytes()
+    for name in ("loss/c/0/0", "grad/c/0/0/0", "status/c/0/0", "checksum/c/0/0"):
+        if place is archive_path:
+            break_chunk(path, name)
+        else:
+            file = unpacked(path) / name
+            file.write_bytes(file.read_bytes()[:-1])
         assert (SliceStore.open(path).status() == Status.MISSING).all()
         assert make(path).coarse() is None
         finished(path)
-        assert SliceStore.open(path).pending() == []
+        assert os.listdir(tmp_path) == ["slice.zarr.zip"]
         assert open_slice(path).identical(whole)
+        assert archive_path(path).read_bytes() == again
+
+
+def test_no_byte_of_a_finished_slice_changes_it_unseen(tmp_path):
+    """A damaged byte costs the samples of its chunk, or the slice is refused."""
+    path = tmp_path / "s.zarr"
+    finished(path)
+    whole, file = open_slice(path), archive_path(path)
+    sound, lost = file.read_bytes(), 0
+    for at in range(0, len(sound), 7):
+        file.write_bytes(sound[:at] + bytes([sound[at] ^ 16]) + sound[at + 1 :])
+        try:
+            found = open_slice(path)
+        except StoreError:
+            lost += 1
+            continue
+        missing = bool((found["status"] == Status.MISSING).all())
+        assert missing or found.identical(whole)
+        lost += missing
+    assert lost > len(sound) / 7 / 2
+
+
+def test_two_processes_may_compute_a_damaged_chunk_again(tmp_path):
+    path = tmp_path / "s.zarr"
+    finished(path)
+    whole = open_slice(path)
+    break_chunk(path, "loss/c/0/0")
+    one, other = make(path), make(path)
+    for store in (fill(one), fill(other)):
+        store.finish(store.dataset())
+    assert one.pending() == other.pending() == []
+    assert open_slice(path).identical(whole)
 
 
 @pytest.mark.parametrize("damage", ["truncated", "removed", "altered"])
@@ -75,7 +110,7 @@ def test_no_byte_of_a_tile_changes_a_sample_unseen(tmp_path):
 def test_chunks_in_each_others_place_are_missing_and_not_taken_for_right(tmp_path, monkeypatch, place):
     monkeypatch.setattr("gradscape.landscapes.storage.arrays.SIDE", 4)  # so that a finished slice has several, too
     path = tmp_path / "s.zarr"
-    (fill(make(path)) if place is filling_path else finished(path))
+    fill(make(path)) if place is filling_path else unpacked(finished(path).path)
     whole, swapped = open_slice(path), 0
     for one, other in combinations(chunks(place(path)), 2):
         if one.relative_to(path.parent).parts[:2] == other.relative_to(path.parent).parts[:2]:
