@@ -17,18 +17,18 @@ SLICE, FOLDER, ARCHIVE, FILLING = "slice.zarr", ".zarr", ".zip", ".filling"
 
 def filling_path(path: Path) -> Path:
     """Return where the tiles of a slice are while it is being filled: slice.filling next to slice.zarr.zip."""
-    return path.with_name(folder_path(path).name.removesuffix(FOLDER) + FILLING)
+    return path.parent / (folder_path(path).name.removesuffix(FOLDER) + FILLING)
 
 
 def folder_path(path: Path) -> Path:
     """Return where earlier versions left a finished slice, slice.zarr, given any of its names."""
     name = path.name.removesuffix(ARCHIVE)
-    return path.with_name(name.removesuffix(FILLING) + FOLDER if name.endswith(FILLING) else name)
+    return path.parent / (name.removesuffix(FILLING) + FOLDER if name.endswith(FILLING) else name)
 
 
 def archive_path(path: Path) -> Path:
     """Return the one file that a slice is once it is finished, slice.zarr.zip, given any of its names."""
-    return path.with_name(folder_path(path).name + ARCHIVE)
+    return path.parent / (folder_path(path).name + ARCHIVE)
 
 
 def slice_places(path: Path) -> tuple[Path, Path, Path]:
