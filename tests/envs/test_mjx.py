@@ -163,9 +163,10 @@ def test_a_step_by_runge_and_kutta_is_that_of_mjx(monkeypatch):
     """Of what turns about one axis; about any axis it is MJX's own."""
     mjx = pytest.importorskip("mujoco.mjx")
     from gradscape.envs.engines.mjx import rollout
+    from gradscape.envs.engines.mjx.model import load
 
     with computing_in("float64"):
-        host = rollout.load(PENDULUM.format(joint="hinge"), "pendulum")
+        host = load(PENDULUM.format(joint="hinge"), "pendulum")
         model, state = mjx.put_model(host), mjx.make_data(host)
         state = state.replace(qpos=state.qpos + 0.4, qvel=state.qvel - 1.5)
 
@@ -176,7 +177,7 @@ def test_a_step_by_runge_and_kutta_is_that_of_mjx(monkeypatch):
         ours, theirs = (compiled(partial(moved, to), (1,), "float64") for to in (rollout.step, mjx.step))
         for got, wanted in zip(ours(state.qpos), theirs(state.qpos), strict=True):
             np.testing.assert_allclose(got, wanted, rtol=1e-14, atol=0)
-        ball = mjx.put_model(rollout.load(PENDULUM.format(joint="ball"), "ball"))
+        ball = mjx.put_model(load(PENDULUM.format(joint="ball"), "ball"))
         monkeypatch.setattr(mjx, "step", lambda model, state: "its own")
         assert rollout.step(ball, None) == "its own"
 
