@@ -54,7 +54,7 @@ def slice(
     budget: Annotated[int | None, at_least(1)] = None,
     floor: bool = False,
     policy: str | None = None,
-    picture: Annotated[bool, Parameter(negative_bool="no-", show_default=False)] = True,
+    picture: Annotated[bool, Parameter(negative="--no-picture", show_default=False)] = True,
     gradients: Gradients = True,
     scheduler: Scheduler = None,
     figure_width_mm: FigureWidth = (),

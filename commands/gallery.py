@@ -42,17 +42,15 @@ def show_figures(found: FigureList, console: Console) -> None:
 
 def show_slices(found: SliceTable, console: Console) -> None:
     """Print a row for each slice, and how many folders of slices have no summary."""
-    listed = table("slice", "environment", "dims", "resolution", "fidelity", "losses", "failed", "undersampled")
+    listed = table("slice", "of", "along", "samples", "losses", "failed")
     for _, row in found.rows.head(MAX_ROWS).iterrows():
         losses = "none" if row.isna()["lowest"] else f"{row['lowest']:.4g} to {row['highest']:.4g}"
-        hidden = "" if row.isna()["undersampled"] else f"{row['undersampled']:.0%}"
-        about = (row[name] or "" for name in ("env", "dims", "resolution", "fidelity"))
-        listed.add_row(
-            os.path.relpath(row["folder"], found.folder), *map(str, about), losses, str(row["failed"]), hidden
-        )
+        about = (str(row[name] or "") for name in ("env", "dims", "resolution"))
+        listed.add_row(os.path.relpath(row["folder"], found.folder), *about, losses, str(row["failed"]))
     console.print(listed)
     more = f", of which the first {MAX_ROWS} are shown; --json prints all" if len(found.rows) > MAX_ROWS else ""
-    console.print(f"{len(found.rows)} slices in {found.folder}{more}", soft_wrap=True)
+    count = len(found.rows)
+    console.print(f"{count} slice{'s' * (count != 1)} in {found.folder}{more}", soft_wrap=True)
     for count, what in ((found.damaged, "a damaged summary"), (found.bare, "no summary, as they are not finished")):
         if count:
             console.print(

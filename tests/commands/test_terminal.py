@@ -92,3 +92,13 @@ def test_lists_fit_eighty_columns(run: Run, command: str, names: list[str]) -> N
     assert "…" not in said
     assert max(map(len, said.splitlines())) <= 80 or command == "gallery list"  # whose title is a path
     assert [name for name in names if name not in said] == []
+
+
+def test_slices_without_pictures_are_listed_in_eighty_columns(run: Run, tmp_path: Path) -> None:
+    made = run.ok("slice branin --resolution 4 --no-picture --out made/a-slice")
+    assert "landscape.png" not in made.stderr
+    assert sorted(file.name for file in (tmp_path / "made/a-slice").iterdir()) == ["slice.zarr.zip", "summary.json"]
+    said = run("gallery list made", width=80).stdout
+    assert "1 slice in made" in said
+    assert all(word in said for word in ("a-slice", "branin", "x0, x1", "4 x 4"))
+    assert max(map(len, said.splitlines())) <= 80
