@@ -13,7 +13,7 @@ import torch
 
 from ..landscapes.capacity import Need, require
 from ..landscapes.convert import from_json
-from ..landscapes.cost import duration
+from ..landscapes.cost import PICTURE_SECONDS, duration
 from ..landscapes.objective import Evaluation, evaluate
 from ..landscapes.sampling.distribution import PortableObjective, run_tasks, workers_of
 from ..landscapes.sampling.memory import MemoryBound
@@ -36,6 +36,7 @@ RECORD, LOSSES, PICTURE = CENSUS.files
 SLICES, RESOLUTION = 64, 24
 NOISE_POINTS, REPEATS = 16, 4
 OWN, SAMPLES = "original", ("loss", "grad", "status")  # of what replicas are held against
+MEASURING_SECONDS = 0.05  # of a slice, next to what it simulates
 COPIES = 4  # of the losses and gradients of a slice
 
 
@@ -223,7 +224,7 @@ class CensusJob(CheckpointedJob["Census"]):
         if left:
             each = simulation_seconds(self.env, without, having, samples)
             lower = "--slices, --resolution and --gradients"
-            seconds = len(left) * each
+            seconds = len(left) * (each + MEASURING_SECONDS) + PICTURE_SECONDS
             watch.announce(f"about {duration(seconds)} here; {lower} change it", seconds)
 
     def _survey(self, deviation: float, numerics: float, watch: Watch) -> dict[str, SurveyedSlice]:
