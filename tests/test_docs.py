@@ -206,6 +206,8 @@ def test_every_command_runs(
     if "taichi" in command.split() and find_spec("taichi") is None:
         pytest.skip("Taichi has no wheels past Python 3.12")
     words = [request.getfixturevalue("address") if word == "ADDRESS" else word for word in small(command)]
+    if "--tolerance" in words:  # which needs a study
+        run.ok("study", "fidelity", "bounce", *TENTH, "--points", "4", "--out", "studied", cwd=desk)
     run.ok(*words, cwd=desk)
     assert bool(opened) == ("view" in command)
 
