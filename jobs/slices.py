@@ -85,7 +85,7 @@ class SliceTable:
 
 
 def find_slices(folder: Path, where: str | None = None) -> SliceTable:
-    """Return the slices in a folder and in those in it, as far as `where` holds of them.
+    """Return the slices at any depth in a folder for which `where` holds.
 
     `where` is a condition of SQLite over the columns of the table. Folders of results are not searched further, and
     links are not followed. Raises ValueError where there is no such folder, and for what is no condition.

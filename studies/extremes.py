@@ -12,7 +12,7 @@ from ..landscapes.identity import MODEL_VERSION
 from ..landscapes.sampling.memory import free_memory
 from .samples import Sample
 from .settings import BOX, DT, MAX_WORK, RESOLUTION, Pair, SceneSettings, Setting, Values, values_key
-from .stability import Cell, ask, bisect, bracket, evaluate_kept, islands, judge, refuse
+from .stability import Cell, ask, bisect, bracket, evaluate_bound, evaluate_kept, islands, judge, refuse
 from .variants import Expected, Study, StudyRecord, one_line, precision_cost
 
 if TYPE_CHECKING:
@@ -437,7 +437,7 @@ class ExtremesStudy(Study):
             env = self.settings.make(values, precision, fidelity)
         except (ValueError, RuntimeError) as refusal:  # RuntimeError: no memory for it
             return refuse(one_line(refusal))
-        return ask(env, self._beyond(values), **({"by": evaluate_kept} if fidelity else {}))
+        return ask(env, self._beyond(values), by=evaluate_kept if fidelity else evaluate_bound)
 
     def _points(self, points: int) -> Tensor:
         """Return the points, of the unit box."""

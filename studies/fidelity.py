@@ -234,7 +234,12 @@ class FidelityStudy(VariantStudy):
         """Compare a variant's sample with the reference's."""
         memory, points = variant.make(self.env).memory(), len(sample.loss)
         return MeasuredVariant(
-            **{name: getattr(variant, name) for name in ("name", "changed", "fidelity", "engine", "device", "options")},
+            name=variant.name,
+            changed=variant.changed,
+            fidelity=variant.fidelity,
+            engine=variant.engine,
+            device=variant.device,
+            options=variant.options,
             memory=memory,
             comparison=compare(sample, reference, seed=self.seed),
             given_up=points if points < len(self.x) else 0,

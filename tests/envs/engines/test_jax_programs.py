@@ -129,7 +129,7 @@ def test_a_damaged_file_is_made_again(folder, damage, kept):
 
 def test_where_nothing_can_be_written_it_is_traced(folder):
     folder.mkdir(parents=True)
-    (folder / "traced").write_text("in the place of a folder")
+    (folder / "traced").write_text("a file where a folder should be")
     wave = Wave()
     assert [wave.evaluate("wave")[1] for _ in range(2)] == [1, 1]
 
