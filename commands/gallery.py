@@ -48,7 +48,7 @@ def show_slices(found: SliceTable, console: Console) -> None:
         about = (str(row[name] or "") for name in ("env", "dims", "resolution"))
         listed.add_row(os.path.relpath(row["folder"], found.folder), *about, losses, str(row["failed"]))
     console.print(listed)
-    more = f", of which the first {MAX_ROWS} are shown; --json prints all" if len(found.rows) > MAX_ROWS else ""
+    more = f", the first {MAX_ROWS} of them here; --json prints all" if len(found.rows) > MAX_ROWS else ""
     count = len(found.rows)
     console.print(f"{count} slice{'s' * (count != 1)} in {found.folder}{more}", soft_wrap=True)
     for count, what in ((found.damaged, "a damaged summary"), (found.bare, "no summary, as they are not finished")):
