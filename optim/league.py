@@ -141,7 +141,7 @@ class SceneStandings:
 
     @property
     def moved_to(self) -> tuple[str, ...]:
-        """The methods that have or share the best mean rank at equal forward equivalents, and not after all episodes."""
+        """The methods that have or share the best mean rank at equal forward equivalents alone."""
         best = self.equal_cost.ranks[0].rank
         return tuple(one.method for one in self.equal_cost.ranks if one.rank == best and one.method != self.lead.method)
 

@@ -240,7 +240,7 @@ class MeanRank:
 
 @dataclass(frozen=True)
 class EqualCost:
-    """How methods come off within the same cost `forwards` [forward equivalents]: mean ranks, the best first, and pairs.
+    """How methods come off within the same cost `forwards` [forward equivalents]: ranks, the best first, and pairs.
 
     Pairs are those of `Superiority`, corrected among themselves.
     """
@@ -309,7 +309,7 @@ def rank_test(a: Array, b: Array) -> float:
 
 
 def seed_ranks(final: Array) -> Array:
-    """Return the rank of each method within each seed, 1 for the least loss, ties shared; without success it is last."""
+    """Return the rank of each method within each seed, 1 for the least loss, ties shared, the last without success."""
     from scipy.stats import rankdata
 
     found: Array = rankdata(_placed(final), method="average", axis=0)

@@ -149,7 +149,7 @@ def test_one_seed_has_no_interval_and_decides_nothing():
 
 
 def test_better_is_who_the_corrected_test_says_whatever_the_interval_of_the_difference():
-    """Its interval excludes zero here, and the rank test has p below 0.05 for the pair alone, which the correction for ten undoes."""
+    """Its interval excludes zero here, and p is below 0.05 for the pair alone, but not corrected for ten pairs."""
     noise = np.random.default_rng(0).normal(size=(5, 10))
     apart = difference("a", noise[0], "b", noise[1] + 5)
     assert apart.high < 0 < apart.reversed.low

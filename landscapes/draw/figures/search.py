@@ -111,8 +111,8 @@ def race_figure(dataset: xr.Dataset, *, width: float | None = None) -> page.Pict
     (method, step), and `hit`, shape (method, pair), the episodes after which each pair of seed and target was reached,
     NaN where never. `unsuccessful`, shape (method,), counts the seeds without a successful episode; their methods have
     no mean. Attributes: `title`, `budget`, `seeds`, `loss_unit`, `spacing` (log or linear), `targets` (count, hardest,
-    easiest), `lead` (who is first, in words), `identity`, `provenance`. A linear loss axis ends as far above the easiest target as the hardest is below
-    it, so that a few bad first losses do not flatten the rest.
+    easiest), `lead` (who is first, in words), `identity`, `provenance`. A linear loss axis ends as far above the
+    easiest target as the hardest is below it, so that a few bad first losses do not flatten the rest.
     """
     sheet = style.Sheet.of(width, pitch=RACE_PITCH, columns=2)
     picture = page.Picture(sheet, 2 / sheet.columns * sheet.pitch)
