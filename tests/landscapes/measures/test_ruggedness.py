@@ -1,8 +1,9 @@
 """Measures of losses on functions whose answers are known."""
 
+import itertools
 import math
-from collections import Counter
 import tracemalloc
+from collections import Counter
 
 import numpy as np
 import pytest
@@ -163,12 +164,12 @@ def published_information(points: np.ndarray, losses: np.ndarray) -> float:
         at = min(left, key=lambda one: (float(((points[one] - points[at]) ** 2).sum()), one))
         left.remove(at)
         walk.append(at)
-    pairs = list(zip(walk, walk[1:], strict=False))
+    pairs = list(itertools.pairwise(walk))
     slopes = [(losses[b] - losses[a]) / float(np.linalg.norm(points[b] - points[a])) for a, b in pairs]
     most = 0.0
     for size in [0.0, *np.logspace(-5, 15, 1000)]:
         symbols = [0 if abs(slope) <= size else math.copysign(1, slope) for slope in slopes]
-        counts = Counter(zip(symbols, symbols[1:], strict=False))
+        counts = Counter(itertools.pairwise(symbols))
         shares = [count / (len(symbols) - 1) for (a, b), count in counts.items() if a != b]
         most = max(most, -sum(share * math.log(share, 6) for share in shares))
     return most
