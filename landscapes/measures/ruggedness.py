@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from ..identity import plane_of
 from ..large import refuse_large
 from ..objective import Status
-from ..statistics import Estimate, Values, fit_line, jackknife, share
+from ..statistics import Estimate, Values, exact_share, fit_line, jackknife, share
 
 FLAT_SLOPE = 1e-3  # a slope below it is effectively zero [ranges of the losses per side of the box]
 NOTABLE = 0.01  # the least depth of a notable minimum, as a fraction of the range
@@ -213,6 +213,11 @@ def turns(loss: Values, floor: float = 0.0) -> float:
     return turned / steps if steps else math.nan
 
 
+def steps(loss: Values) -> int:
+    """Count the pairs of neighbours along axes that both have a loss."""
+    return sum(int(np.isfinite(np.diff(loss, axis=axis)).sum()) for axis in range(loss.ndim))
+
+
 def _reversals(walks: Values, floor: float) -> int:
     """Count how often walks from 0, shape (walk, step), go back from their last extreme by more than `floor`."""
     high, low = np.zeros(len(walks)), np.zeros(len(walks))
@@ -317,7 +322,12 @@ def ruggedness(
     notable = found.sample[found.depth > max(floor, NOTABLE * whole)]
     shares = basins(loss, notable) if len(notable) else np.full(1, math.nan)
     slopes = box_slopes(dataset) if "grad" in dataset else None
-    share_of = partial(estimate, least=0.0, most=1.0)
+
+    def share_of(statistic: Callable[[Values], float], samples: Values, tries: int) -> Estimate:
+        return exact_share(estimate(statistic, samples), tries)
+
+    def mean_of(flags: Values) -> Estimate:
+        return share_of(_mean, flags, int(np.isfinite(flags).sum()))
 
     def along_axes(measure: Callable[[Values, int], float], **bounds: float) -> tuple[Estimate, ...]:
         axes = range(loss.ndim)[::-1]  # u first
@@ -334,16 +344,16 @@ def ruggedness(
         curve={f"{part:g}": found.count(max(floor, part * whole)) for part in THRESHOLDS},
         largest_basin=float(shares.max()),
         lowest_basin=float(shares[0]),
-        zero=None if slopes is None else share_of(_mean, _below(slopes, 0.0)),
-        flat=None if slopes is None else share_of(_mean, _below(slopes, FLAT_SLOPE * whole)),
+        zero=None if slopes is None else mean_of(_below(slopes, 0.0)),
+        flat=None if slopes is None else mean_of(_below(slopes, FLAT_SLOPE * whole)),
         missing=missing_gradients(dataset),
-        level=share_of(_mean, level_samples(loss, floor if noise is None else noise)),
+        level=mean_of(level_samples(loss, floor if noise is None else noise)),
         correlation_length=along_axes(correlation_length, least=0.0, most=1.0),
         holder=along_axes(partial(holder_exponent, floor=floor), least=0.0),
         total_variation=along_axes(total_variation, least=1.0),
-        information=share_of(lambda part: information_content(part)[0], loss),
+        information=estimate(lambda part: information_content(part)[0], loss, least=0.0, most=1.0),
         settling=estimate(lambda part: information_content(part)[1], loss),
-        turns=share_of(partial(turns, floor=floor), loss),
+        turns=share_of(partial(turns, floor=floor), loss, steps(loss)),
         dispersion=estimate(dispersion, loss, least=0.0),
         fitness_distance=estimate(fitness_distance, loss, least=-1.0, most=1.0),
     )
