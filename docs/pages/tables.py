@@ -25,6 +25,8 @@ from gradscape.jobs.report import Report, environments_markdown
 from gradscape.landscapes.checks.causes import causes
 from gradscape.landscapes.storage.records import read_json
 from gradscape.optim.league import League, SceneStandings
+from gradscape.optim.options import OURS, PAPER, defaults
+from gradscape.optim.registry import methods, optimizer_class
 from gradscape.optim.statistics import Lead
 from gradscape.studies.claims import CLAIMS, Claim, Shortfall
 from gradscape.studies.extremes import ExtremesRecord, Limit
@@ -202,6 +204,19 @@ def _rivals(lead: Lead) -> str:
     return f"`{lead.method}`, not told from {', '.join(lead.rivals)} (p up to {lead.p:.2g})"
 
 
+def method_defaults() -> str:
+    """Whose choice each default of a method is."""
+    rows = []
+    for name in methods():
+        known: dict[str, list[str]] = {}
+        for one in defaults(optimizer_class(name).Options):
+            known.setdefault(one.source, []).append(f"`{one.option}` {one.value}")
+        said = [", ".join(known.pop(source, ())) for source in (PAPER, OURS)]
+        theirs = "; ".join(f"{source}: {', '.join(options)}" for source, options in known.items())
+        rows.append([f"`{name}`", said[0], theirs, said[1]])
+    return table(("method", "the paper's", "a library's or its authors'", "ours"), rows)
+
+
 def margins() -> str:
     """How near standard's step is to the longest that is stable, by precision."""
     rows = []
@@ -337,6 +352,7 @@ TABLES: dict[tuple[str, str], Callable[[], str]] = {  # by page and name
     ("README.md", "league"): short_league,
     ("docs/races.md", "league"): league,
     ("docs/races.md", "rivals"): rivals,
+    ("docs/races.md", "defaults"): method_defaults,
     ("BENCHMARKS.md", "accuracy"): accuracy,
     ("docs/measured.md", "measured"): measured,
     ("docs/measured.md", "censuses"): censuses,
