@@ -108,10 +108,13 @@ def show_method(kind: type[Optimizer], console: Console) -> None:
     import inspect
 
     from ..landscapes.options import in_full
+    from ..optim.options import defaults
     from ..optim.registry import find_method
 
     texts = [find_method(kind.name).summary, inspect.getdoc(kind) or ""]
     texts += [f"gradients: {'yes' if kind.needs_grad else 'no'}", in_full(kind.Options)]
+    if sources := defaults(kind.Options):
+        texts.append("whose defaults: " + ", ".join(f"{one.option} {one.source}" for one in sources))
     console.soft_wrap = True
     console.print(f"{kind.name}: " + "\n\n".join(texts))
 

@@ -24,7 +24,11 @@ def show(found: League, console: Console, *, claims: bool = False) -> int:
     """
     console.soft_wrap = True
     console.print(_ranks(found))
+    console.print(_cost_ranks(found))
     for scene in found.scenes:
+        console.print(f"{scene.env} ({scene.fidelity}): {scene.describe_lead()}")
+        if lost := scene.not_told_from_random:
+            console.print(f"{scene.env}: not distinguishable from random search: {', '.join(lost)}")
         if best := scene.best:
             unit = f" {scene.loss_unit}" if scene.loss_unit else ""
             console.print(f"{scene.env}: least loss {best.loss:.6g}{unit}, by {best.method}, seed {best.seed}")
@@ -35,11 +39,25 @@ def show(found: League, console: Console, *, claims: bool = False) -> int:
 
 
 def _ranks(found: League) -> Table:
-    shown = table("scene", *found.methods, title="mean ranks, 1 is best, with 95 % intervals over seeds")
+    title = "mean ranks after all episodes, 1 is best, with 95 % intervals over seeds"
+    shown = table("scene", *found.methods, title=title)
     for scene in found.scenes:
         by = {one.method: _format(one.rank, one.rank_low, one.rank_high) for one in scene.standings}
         shown.add_row(f"{scene.env} ({scene.fidelity})", *(by.get(method, "") for method in found.methods))
     shown.add_row("all scenes", *(_format(one.rank, one.low, one.high) for one in found.overall))
+    return shown
+
+
+def _cost_ranks(found: League) -> Table:
+    """Show ranks within the same cost, which a gradient takes more of than a loss."""
+    title = "mean ranks at equal forward equivalents, with 95 % intervals over seeds"
+    shown = table("scene", *found.methods, title=title)
+    for scene in found.scenes:
+        by = {one.method: _format(one.rank, one.low, one.high) for one in scene.equal_cost.ranks}
+        name = f"{scene.env} ({scene.fidelity}), {scene.equal_cost.forwards:.0f}"
+        shown.add_row(name, *(by.get(method, "") for method in found.methods))
+    by = {one.method: _format(one.rank, one.low, one.high) for one in found.overall_at_equal_cost}
+    shown.add_row("all scenes", *(by[method] for method in found.methods))
     return shown
 
 

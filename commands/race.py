@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from math import isfinite
 from typing import TYPE_CHECKING
 
@@ -11,6 +12,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from ..optim.race import Race
+    from ..optim.statistics import Superiority
 
 PAPER_SEEDS = 10  # as many as the paper has
 
@@ -38,9 +40,11 @@ def show(race: Race, console: Console, *, claims: bool = False) -> None:
 def _ranks(race: Race) -> Table:
     from ..optim.race import name_seeds
 
-    seeds = name_seeds(race.seeds)
+    seeds, at_cost = name_seeds(race.seeds), race.statistics.equal_cost
+    cost_ranks = {one.method: _format_interval(one.rank, one.low, one.high, 2) for one in at_cost.ranks}
     shown = table(
-        *("method", "mean rank", "wins", f"best loss{_unit(race)}", "failed", "forward equivalents", "seconds"),
+        *("method", "mean rank", "at equal cost", "wins"),
+        *(f"best loss{_unit(race)}", "failed", "forward equivalents", "seconds"),
         title=f"{race.identity['objective']} · {race.identity['fidelity']} · {race.budget} episodes · {seeds}",
     )
     for rank in race.statistics.ranks:
@@ -48,6 +52,7 @@ def _ranks(race: Race) -> Table:
         shown.add_row(
             rank.method,
             _format_interval(rank.rank, rank.rank_low, rank.rank_high, 2),
+            cost_ranks[rank.method],
             str(rank.wins),
             _format_interval(rank.mean, rank.low, rank.high, 3) + none,
             str(rank.failed),
@@ -70,16 +75,27 @@ def _running_times(race: Race) -> Table:
     return shown
 
 
-def _comparisons(race: Race) -> list[str]:
-    """Say of each method, by rank, which others it is better than, and how often it wins against each."""
-    figures, lines = race.statistics, list[str]()
-    pairs = list(zip(figures.differences, figures.superiorities, strict=True))
-    for better in (rank.method for rank in figures.ranks):
-        seen = [chance if chance.first == better else chance.reversed for one, chance in pairs if one.better == better]
-        if seen:
-            said = (f"{one.second} (wins {one.probability:.0%}, corrected p {one.corrected:.2g})" for one in seen)
-            lines.append(f"{better} is better than {', '.join(said)}")
-    return lines
+def _comparisons(race: Race) -> Iterator[str]:
+    """Say who leads, and of each method, by rank, which others it is better than, and which cannot be told from it."""
+    figures = race.statistics
+    seen = [one for pair in figures.superiorities for one in (pair, pair.reversed)]
+    if not seen:
+        return
+    count = len(figures.superiorities)
+    yield f"after {race.budget} episodes: {figures.lead.describe()}"
+    at_cost = figures.equal_cost
+    yield f"within {at_cost.forwards:.0f} forward equivalents each: {at_cost.lead.describe()}"
+    yield f"p is that of the rank test, corrected for {count} comparison{'s' if count > 1 else ''}"
+    for method in (rank.method for rank in figures.ranks):
+        own = [one for one in seen if one.first == method]
+        if said := [_pair(one) for one in own if one.better == method]:
+            yield f"{method} is better than {', '.join(said)}"
+        if said := [_pair(one) for one in own if one.better is None]:
+            yield f"{method} is not distinguishable from {', '.join(said)}"
+
+
+def _pair(one: Superiority) -> str:
+    return f"{one.second} (wins {one.probability:.0%}, corrected p {one.corrected:.2g})"
 
 
 def _doubt(seeds: int) -> str:
@@ -89,8 +105,7 @@ def _doubt(seeds: int) -> str:
         return "one seed: no intervals, so no method is better than another"
     return (
         f"{name_seeds(seeds)}: too few for intervals as wide as they should be "
-        "(with 3 they cover the true mean in 75 % of cases, with 10 in 91 %; "
-        "of two equal methods they call one better in 20 % and 7 %)"
+        "(with 3 they cover the true mean in 75 % of cases, with 10 in 91 %)"
     )
 
 

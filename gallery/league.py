@@ -92,9 +92,7 @@ class LeaguePart(FigurePart):
         keep_both(race.plot(), files.picture)
         KeptRuns.of(race).write(files.runs)
         write_record(files.record, to_json(found))
-        return (
-            f"{len(found.methods)} methods, {found.seeds} seeds, {found.budget} episodes: {found.methods[0]} is first"
-        )
+        return f"{len(found.methods)} methods, {found.seeds} seeds: {found.describe_lead()}"
 
     @property
     def _files(self) -> LeagueFiles:

@@ -262,7 +262,7 @@ def _rows(path: Path) -> int:
 
 
 def _outcome(found: SceneStandings) -> str:
-    best, first = found.best, f"{found.methods[0]} has the best mean rank"
+    best, first = found.best, found.lead.describe()
     if best is None:
         return f"{first}; no episode succeeded"
     return f"{first}; best loss {best.loss:.6g} by {best.method}, seed {best.seed}, episode {best.episode}"

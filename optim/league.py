@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from itertools import chain
@@ -14,8 +14,9 @@ import xarray as xr
 from ..landscapes.identity import current_identity
 from ..landscapes.plain import finite
 from .claims import ClaimFinding, Claims, check_claims
-from .statistics import Superiority, interval, times_record
+from .statistics import EqualCost, Lead, MeanRank, Superiority, interval, not_told_from, times_record
 
+RANDOM = "random"  # the method that another has to be told from to be of use
 OF_METHOD = ("method", "method_options", "method_version", "seed")  # of a run's identity, what is not of its scene
 
 if TYPE_CHECKING:
@@ -79,6 +80,7 @@ class Standing:
 class SceneStandings:
     """What a race in one scene says: `standings`, the best mean rank first, and how every two methods stand (`pairs`).
 
+    Both are at equal episodes; `equal_cost` has ranks and pairs at equal forward equivalents.
     `identity` decides the numbers: scene, its version, options, fidelity, device, engine. `goals` are some of the
     race's targets, the hardest first, `best` is the best point that any run found. `left_out` says why methods did
     not run.
@@ -94,9 +96,12 @@ class SceneStandings:
     goals: tuple[float, ...]
     standings: tuple[Standing, ...]
     pairs: tuple[Superiority, ...]
+    equal_cost: EqualCost
     best: BestPoint | None
     left_out: Mapping[str, str]
     command: str
+
+    derived = ("lead",)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "identity", current_identity(self.identity))
@@ -118,6 +123,7 @@ class SceneStandings:
             goals=tuple(map(float, figures.targets.loss[some])),
             standings=tuple(Standing.of(rank, times[rank.method]) for rank in figures.ranks),
             pairs=tuple(figures.superiorities),
+            equal_cost=figures.equal_cost,
             best=BestPoint.of(race),
             left_out=dict(left_out or {}),
             command=command,
@@ -127,6 +133,31 @@ class SceneStandings:
     def methods(self) -> list[str]:
         """The methods that raced, the best mean rank first."""
         return [one.method for one in self.standings]
+
+    @property
+    def lead(self) -> Lead:
+        """Who leads after the whole budget of episodes."""
+        return Lead.of(self.methods, self.pairs)
+
+    @property
+    def moved_to(self) -> tuple[str, ...]:
+        """The methods that have or share the best mean rank at equal forward equivalents alone."""
+        best = self.equal_cost.ranks[0].rank
+        return tuple(one.method for one in self.equal_cost.ranks if one.rank == best and one.method != self.lead.method)
+
+    @property
+    def not_told_from_random(self) -> tuple[str, ...]:
+        """The methods that are not distinguishable from random search after the whole budget of episodes."""
+        return not_told_from(RANDOM, self.methods, self.pairs)
+
+    def cost_rank(self, method: str) -> MeanRank:
+        """Return the mean rank of a method at equal forward equivalents."""
+        return next(one for one in self.equal_cost.ranks if one.method == method)
+
+    def describe_lead(self) -> str:
+        """Say in a sentence who leads, at equal episodes and at equal cost."""
+        at_cost = f"within {self.equal_cost.forwards:.0f} forward equivalents {self.equal_cost.lead.describe()}"
+        return f"after {self.budget} episodes {self.lead.describe()}; {at_cost}"
 
     def findings(self, claims: Claims) -> list[ClaimFinding]:
         """Return what the race makes of claims about its scene."""
@@ -145,12 +176,23 @@ class SceneStandings:
             {
                 **about,
                 **{name: value for name, value in asdict(one).items() if name != "times"},
+                **self._cost_columns(one.method),
                 "probability": {other: finite(p) for other, p in self.probabilities(one.method).items()},
                 "running_times": dict(zip(map("{:.6g}".format, self.goals), one.times, strict=True)),
                 "best_known": self.best.loss if self.best else None,
             }
             for one in self.standings
         ]
+
+    def _cost_columns(self, method: str) -> dict[str, float | bool]:
+        one = self.cost_rank(method)
+        return {
+            "first": self.lead.is_first and self.lead.method == method,
+            "equal_forwards": self.equal_cost.forwards,
+            "equal_forwards_rank": one.rank,
+            "equal_forwards_rank_low": one.low,
+            "equal_forwards_rank_high": one.high,
+        }
 
 
 @dataclass(frozen=True)
@@ -172,7 +214,7 @@ class League:
     failed: Mapping[str, str]
     command: str
 
-    derived = ("rows", "overall")
+    derived = ("rows", "overall", "overall_at_equal_cost")
 
     @property
     def rows(self) -> list[dict[str, Any]]:
@@ -181,15 +223,13 @@ class League:
 
     @cached_property
     def overall(self) -> list[OverallRank]:
-        """The methods over all scenes, the best first."""
-        ranks: dict[str, list[float]] = {}
-        for one in chain.from_iterable(scene.standings for scene in self.scenes):
-            ranks.setdefault(one.method, []).append(one.rank)
-        found = []
-        for method, values in ranks.items():
-            low, high = map(float, interval(np.array(values)))
-            found.append(OverallRank(method, float(np.mean(values)), low, high, len(values)))
-        return sorted(found, key=lambda one: (one.rank, one.method))
+        """The methods over all scenes after the whole budget of episodes, the best mean rank first."""
+        return _overall(chain.from_iterable(scene.standings for scene in self.scenes))
+
+    @cached_property
+    def overall_at_equal_cost(self) -> list[OverallRank]:
+        """The methods over all scenes at equal forward equivalents, the best mean rank first."""
+        return _overall(chain.from_iterable(scene.equal_cost.ranks for scene in self.scenes))
 
     @property
     def methods(self) -> list[str]:
@@ -228,12 +268,14 @@ class League:
             ]
             for name in ("rank", "rank_low", "rank_high")
         }
+        first = [[scene.lead.is_first and scene.lead.method == name for name in self.methods] for scene in self.scenes]
         fidelities = {scene.fidelity for scene in self.scenes}
         names = [scene.env if len(fidelities) == 1 else f"{scene.env} ({scene.fidelity})" for scene in self.scenes]
         seeds, budget = (_range(getattr(scene, name) for scene in self.scenes) for name in ("seeds", "budget"))
         said = [f"League of {len(self.methods)} methods", *(fidelities if len(fidelities) == 1 else ())]
         return xr.Dataset(
-            {name: (("scene", "method"), np.array(values, float)) for name, values in parts.items()},
+            {name: (("scene", "method"), np.array(values, float)) for name, values in parts.items()}
+            | {"first": (("scene", "method"), np.array([*first, [False] * len(self.methods)]))},
             {"scene": [*names, "all scenes"], "method": self.methods},
             {
                 "title": " · ".join([*said, f"{budget} episodes", f"{seeds} seeds" if seeds != "1" else "1 seed"]),
@@ -241,6 +283,18 @@ class League:
                 "command": self.command,
             },
         )
+
+
+def _overall(ranks: Iterable[Standing | MeanRank]) -> list[OverallRank]:
+    """Return the means over scenes of the ranks of methods, the best first."""
+    by: dict[str, list[float]] = {}
+    for one in ranks:
+        by.setdefault(one.method, []).append(one.rank)
+    found = [
+        OverallRank(method, float(np.mean(values)), *map(float, interval(np.array(values))), len(values))
+        for method, values in by.items()
+    ]
+    return sorted(found, key=lambda one: (one.rank, one.method))
 
 
 def _range(values: Any) -> str:

@@ -7,11 +7,34 @@ from numbers import Integral, Real
 from typing import Any, ClassVar
 
 MANY = 1_000_000_000  # of what no run comes near: as good as no limit
+OURS, PAPER, LIBRARY = "ours", "the paper's", "the library's ({})"  # whose choice a default is
 
 
-def number(default: float, least: float, most: float) -> Any:
-    """Return the field of an option that takes numbers from `least` to `most`, whole ones where it is an int."""
-    return field(default=default, metadata={"range": (least, most)})
+def number(default: float, least: float, most: float, source: str = OURS) -> Any:
+    """Return the field of an option that takes numbers from `least` to `most`, whole ones where it is an int.
+
+    `source` says whose choice the default is.
+    """
+    return field(default=default, metadata={"range": (least, most), "source": source})
+
+
+def choice(default: str, source: str = OURS) -> Any:
+    """Return the field of an option that is one of some words."""
+    return field(default=default, metadata={"source": source})
+
+
+@dataclass(frozen=True)
+class Default:
+    """Say what the default of an option is, and whose choice."""
+
+    option: str
+    value: str
+    source: str
+
+
+def defaults(options: type[MethodOptions]) -> tuple[Default, ...]:
+    """Return the defaults of a method, in the order of its options."""
+    return tuple(Default(one.name, f"{one.default}", one.metadata["source"]) for one in fields(options))
 
 
 @dataclass(frozen=True)

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from ..landscapes.draw.figures.page import Picture
 
 
+NOT_DISTINGUISHABLE = "not distinguishable"  # two methods, after the correction for all pairs of a race
 MAX_ABREAST = 200  # runs that advance in lockstep: the folder of each is open
 
 
@@ -132,12 +133,16 @@ class Race:
         import pandas as pd
 
         unit = f" [{self.loss_unit}]" if self.loss_unit else ""
+        at_cost = {one.method: one for one in self.statistics.equal_cost.ranks}
         rows = [
             {
                 "method": rank.method,
                 "mean rank": rank.rank,
                 "mean rank, low": rank.rank_low,
                 "mean rank, high": rank.rank_high,
+                "mean rank at equal forward equivalents": at_cost[rank.method].rank,
+                "mean rank at equal forward equivalents, low": at_cost[rank.method].low,
+                "mean rank at equal forward equivalents, high": at_cost[rank.method].high,
                 "wins": rank.wins,
                 f"best loss{unit}": rank.mean,
                 f"best loss, low{unit}": rank.low,
@@ -155,7 +160,7 @@ class Race:
         """Return a row for every two methods: the difference of their mean best losses, and who wins how often.
 
         The probability is that the first has the lesser best loss, a tie half; p is that of Mann and Whitney's rank
-        test, corrected for all pairs by Holm's rule in the last column.
+        test, corrected for all pairs by Holm's rule beside it; `better` is by that.
         """
         import pandas as pd
 
@@ -170,6 +175,7 @@ class Race:
                 "probability": chance.probability,
                 "p": chance.p,
                 "corrected p": chance.corrected,
+                "better": chance.better or NOT_DISTINGUISHABLE,
             }
             for one, chance in zip(figures.differences, figures.superiorities, strict=True)
         ]
@@ -218,6 +224,7 @@ class Race:
             seeds=self.seeds,
             loss_unit=self.loss_unit,
             spacing=goals.spacing,
+            lead=self.statistics.lead.summarise(),
             targets=(len(goals.loss), *(goals.loss[[0, -1]] if len(goals.loss) else (math.nan, math.nan))),
             identity=about["identity"],
             provenance=provenance,

@@ -1,12 +1,15 @@
-"""What a race's runs say: ranks, who beats whom, best loss against cost, targets reached, and what that took.
+"""What a race's runs say: ranks, who is ahead of whom, best loss against cost, targets reached, and what that took.
 
 Everything is over the seeds of a method. A failed episode costs what any other does and improves nothing. Before its
 first success a run has no best loss (NaN), so a mean over seeds begins where the last of them has had a success.
 
 Intervals are 95 % percentile intervals by the bootstrap: the percentiles 2.5 and 97.5 of the means of 10 000 resamples
 of the seeds (Efron & Tibshirani 1993, section 13.3). There is none for a single seed. They are too narrow where seeds
-are few: of normal samples of 3, 5, 10 and 30 they cover the true mean in about 75, 84, 91 and 93 % of cases; and of two
-equal methods with 3, 5 or 10 seeds each, one is called better in about 20, 10 and 7 % of cases.
+are few: of normal samples of 3, 5, 10 and 30 they cover the true mean in about 75, 84, 91 and 93 % of cases. So no
+interval decides who is better: that is for the rank test alone, corrected for all pairs of the race.
+
+A gradient costs more than a loss. So everything about ranks is there twice: after the same number of episodes, and
+within the same cost in forward equivalents, which is the least that a run of the race spent in all.
 
 Targets are 51 losses between the best that is known and the median of random points, spaced by their logarithms, as
 COCO spaces 51 precisions between 10^-8 and 10^2 (Hansen et al. 2021, section 3).
@@ -75,9 +78,19 @@ def best_so_far(loss: Array) -> Array:
     return np.fmin.accumulate(loss)
 
 
-def final_losses(tables: Tables) -> Array:
-    """Return the best loss of every run, shape (method, seed), NaN where no episode succeeded."""
-    return np.array([[best_so_far(run["loss"].to_numpy())[-1] for run in runs] for runs in tables.values()])
+def final_losses(tables: Tables, forwards: float = np.inf) -> Array:
+    """Return the best loss of every run within a cost [forward equivalents], shape (method, seed), NaN where none."""
+    return np.array([[_best_within(run, forwards) for run in runs] for runs in tables.values()])
+
+
+def _best_within(run: xr.Dataset, forwards: float) -> float:
+    loss = run["loss"].to_numpy()[~(run["forwards"].to_numpy() > forwards)]
+    return float(best_so_far(loss)[-1]) if len(loss) else np.nan
+
+
+def least_spent(tables: Tables) -> float:
+    """Return the least that a run spent in all [forward equivalents], which every run can be held to."""
+    return min(float(run["forwards"][-1]) for runs in tables.values() for run in runs)
 
 
 def curve(runs: Sequence[xr.Dataset], cost: str) -> Curve:
@@ -101,20 +114,16 @@ def _first(spent: Array, best: Array) -> float:
 
 @dataclass(frozen=True)
 class Difference:
-    """The mean final loss of `first` less that of `second`, with its interval: below zero, `first` is better."""
+    """The mean final loss of `first` less that of `second`, with its interval, which says how large it is.
+
+    Whether one of them is better is for `Superiority`.
+    """
 
     first: str
     second: str
     mean: float
     low: float
     high: float
-
-    derived = ("better",)
-
-    @property
-    def better(self) -> str | None:
-        """The method whose lead the interval leaves no doubt about, None where it includes zero or there is none."""
-        return self.first if self.high < 0 else self.second if self.low > 0 else None
 
     @property
     def reversed(self) -> Difference:
@@ -140,7 +149,7 @@ class Superiority:
 
     @property
     def better(self) -> str | None:
-        """The method that is ahead at a level of 5 % over all pairs of the race together, None where neither is."""
+        """The method that is ahead at a level of 5 % over all pairs of the race together; None: not distinguishable."""
         if not self.corrected < LEVEL:
             return None
         return self.first if self.probability > 0.5 else self.second
@@ -167,9 +176,106 @@ def difference(first: str, a: Array, second: str, b: Array) -> Difference:
     return Difference(first, second, float(a.mean() - b.mean()), float(low), float(high))
 
 
-def superiorities(tables: Tables) -> list[Superiority]:
-    """Return how every two methods stand to each other, in the order of `differences`."""
-    pairs = list(itertools.combinations(zip(tables, final_losses(tables), strict=True), 2))
+@dataclass(frozen=True)
+class Lead:
+    """Say who leads a race: the method of the best mean rank, and the others that it is not ahead of (`rivals`).
+
+    It is first only where there are none; `p` is the largest corrected p of its comparisons, NaN of one method alone.
+    """
+
+    method: str
+    rivals: tuple[str, ...]
+    p: float
+
+    derived = ("is_first",)
+
+    @classmethod
+    def of(cls, methods: Sequence[str], pairs: Sequence[Superiority]) -> Lead:
+        """Return the lead among methods, the best mean rank first."""
+        best, *others = methods
+        found = {one.second: one for pair in pairs for one in (pair, pair.reversed) if one.first == best}
+        rivals = tuple(other for other in others if found[other].better != best)
+        return cls(best, rivals, max((one.corrected for one in found.values()), default=np.nan))
+
+    @property
+    def is_first(self) -> bool:
+        """Whether the method is ahead of every other one after the correction for all pairs."""
+        return not self.rivals and not np.isnan(self.p)
+
+    def describe(self) -> str:
+        """Say who is first, or who cannot be told from the method of the best mean rank."""
+        if np.isnan(self.p):
+            return f"{self.method} raced alone"
+        if self.is_first:
+            return f"{self.method} is first: ahead of every other method (corrected p at most {self.p:.2g})"
+        return (
+            f"no method is first: {self.method} has the best mean rank, "
+            f"not distinguishable from {', '.join(self.rivals)} (corrected p up to {self.p:.2g})"
+        )
+
+    def summarise(self) -> str:
+        """Say the same in one line, for a picture."""
+        if self.is_first or not self.rivals:
+            return self.describe()
+        others = f"{len(self.rivals)} others" if len(self.rivals) > 1 else self.rivals[0]
+        return f"none is first: {self.method}, of the best mean rank, is not distinguishable from {others}"
+
+
+def not_told_from(method: str, methods: Sequence[str], pairs: Sequence[Superiority]) -> tuple[str, ...]:
+    """Return which of the methods are not distinguishable from one after the correction, in their order."""
+    seen = [one for pair in pairs for one in (pair, pair.reversed) if one.first == method]
+    undecided = {one.second for one in seen if one.better is None}
+    return tuple(other for other in methods if other in undecided)
+
+
+@dataclass(frozen=True)
+class MeanRank:
+    """The mean rank of a method over seeds, 1 for the best, with its interval."""
+
+    method: str
+    rank: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class EqualCost:
+    """How methods come off within the same cost `forwards` [forward equivalents]: ranks, the best first, and pairs.
+
+    Pairs are those of `Superiority`, corrected among themselves.
+    """
+
+    forwards: float
+    ranks: tuple[MeanRank, ...]
+    pairs: tuple[Superiority, ...]
+
+    derived = ("lead",)
+
+    @classmethod
+    def of(cls, tables: Tables) -> EqualCost:
+        """Compare runs within the least that one of them spent in all."""
+        forwards = least_spent(tables)
+        return cls.within(forwards, list(tables), final_losses(tables, forwards))
+
+    @classmethod
+    def within(cls, forwards: float, methods: Sequence[str], final: Array) -> EqualCost:
+        """Compare the best losses of methods within a cost, shape (method, seed)."""
+        ranks = [
+            MeanRank(method, float(places.mean()), *map(float, interval(places)))
+            for method, places in zip(methods, seed_ranks(final), strict=True)
+        ]
+        best_first = sorted(ranks, key=lambda one: (one.rank, one.method))
+        return cls(forwards, tuple(best_first), tuple(superiorities(dict(zip(methods, final, strict=True)))))
+
+    @property
+    def lead(self) -> Lead:
+        """Who leads at this cost."""
+        return Lead.of([one.method for one in self.ranks], self.pairs)
+
+
+def superiorities(final: Mapping[str, Array]) -> list[Superiority]:
+    """Return how every two methods stand to each other by their final losses, in the order of `differences`."""
+    pairs = list(itertools.combinations(final.items(), 2))
     ps = [rank_test(a, b) for (_, a), (_, b) in pairs]
     return [
         Superiority(first, second, win_probability(a, b), p, corrected)
@@ -200,6 +306,14 @@ def rank_test(a: Array, b: Array) -> float:
         return 1.0
     exact = distinct == len(both) and len(a) * len(b) <= EXACT
     return float(mannwhitneyu(a, b, alternative="two-sided", method="exact" if exact else "asymptotic").pvalue)
+
+
+def seed_ranks(final: Array) -> Array:
+    """Return the rank of each method within each seed, 1 for the least loss, ties shared, the last without success."""
+    from scipy.stats import rankdata
+
+    found: Array = rankdata(_placed(final), method="average", axis=0)
+    return found
 
 
 def holm(ps: Sequence[float]) -> list[float]:
@@ -336,6 +450,7 @@ class Rank:
 class RaceStatistics:
     """All figures of a race: ranks, the best first, how every two methods compare, targets, and by method curves.
 
+    `equal_cost` has ranks and comparisons at equal forward equivalents; all others are at equal episodes.
     `ecdf` is the share of pairs of target and seed reached, `running_times` the expected running time for each target
     [episodes], `curves` the mean best loss against each of `COSTS`.
     """
@@ -343,10 +458,13 @@ class RaceStatistics:
     ranks: list[Rank]
     differences: list[Difference]
     superiorities: list[Superiority]
+    equal_cost: EqualCost
     targets: Targets
     ecdf: dict[str, Shares]
     running_times: dict[str, Array]
     curves: dict[str, dict[str, Curve]]
+
+    derived = ("lead",)
 
     @classmethod
     def of(cls, tables: Tables, best_known: float | None = None) -> RaceStatistics:
@@ -355,21 +473,24 @@ class RaceStatistics:
         return cls(
             ranks=ranks(tables),
             differences=differences(tables),
-            superiorities=superiorities(tables),
+            superiorities=superiorities(dict(zip(tables, final_losses(tables), strict=True))),
+            equal_cost=EqualCost.of(tables),
             targets=goals,
             ecdf={method: Shares.of(hits(runs, goals)) for method, runs in tables.items()},
             running_times={method: running_times(runs, goals) for method, runs in tables.items()},
             curves={cost: {method: curve(runs, cost) for method, runs in tables.items()} for cost in COSTS},
         )
 
+    @property
+    def lead(self) -> Lead:
+        """Who leads after the whole budget of episodes."""
+        return Lead.of([one.method for one in self.ranks], self.superiorities)
+
 
 def ranks(tables: Tables) -> list[Rank]:
     """Return how every method came off, the best mean rank first; within a seed, runs without success are last."""
-    from scipy.stats import rankdata
-
     final = final_losses(tables)
-    comparable = np.where(np.isfinite(final), final, np.inf)
-    places = rankdata(comparable, method="average", axis=0)
+    comparable, places = _placed(final), seed_ranks(final)
     won = np.isfinite(final) & (comparable == comparable.min(axis=0))
     found = [
         _rank(method, runs, places[row], won[row], final[row]) for row, (method, runs) in enumerate(tables.items())

@@ -19,10 +19,15 @@ from typing import Any, cast
 from gradscape.envs.registry import entries, environment_class
 from gradscape.gallery.figures import read_figures
 from gradscape.gallery.files import DATA, DEVICES
+from gradscape.gallery.league import read_league
 from gradscape.gallery.paper import read_paper
 from gradscape.jobs.report import Report, environments_markdown
 from gradscape.landscapes.checks.causes import causes
 from gradscape.landscapes.storage.records import read_json
+from gradscape.optim.league import League, SceneStandings
+from gradscape.optim.options import OURS, PAPER, defaults
+from gradscape.optim.registry import methods, optimizer_class
+from gradscape.optim.statistics import Lead
 from gradscape.studies.claims import CLAIMS, Claim, Shortfall
 from gradscape.studies.extremes import ExtremesRecord, Limit
 from gradscape.studies.fidelity import FidelityRecord
@@ -121,6 +126,95 @@ def _paper_words(scene: str) -> tuple[str, ...]:
 def _interval(share: Record) -> str:
     ends = f" ({100 * share['low']:.0f} to {100 * share['high']:.0f})" if share["low"] < share["high"] else ""
     return f"{100 * share['value']:.0f} %{ends}"
+
+
+def kept_league() -> League:
+    """Return the league of the gallery's data."""
+    found = read_league(DATA)
+    assert found is not None  # it is a part of every checkout
+    return found
+
+
+def short_league() -> str:
+    """README's: who has the best mean rank, and how many of the others it is ahead of."""
+    scenes = kept_league().scenes
+    rows = [
+        [
+            f"`{scene.env}`",
+            scene.fidelity,
+            *_lead(scene.lead, {one.method: one.rank for one in scene.standings}),
+            *_lead(scene.equal_cost.lead, {one.method: one.rank for one in scene.equal_cost.ranks}),
+            f"{len(scene.not_told_from_random)} of {len(scene.methods) - 1}",
+        ]
+        for scene in scenes
+    ]
+    (budget,), (forwards,) = {one.budget for one in scenes}, {f"{one.equal_cost.forwards:.0f}" for one in scenes}
+    ahead = "is ahead of"
+    costs = (f"best mean rank, {budget} episodes", ahead, f"best mean rank, {forwards} forward equivalents", ahead)
+    return table(("environment", "fidelity", *costs, "not told from random search"), rows)
+
+
+def _lead(lead: Lead, ranks: Mapping[str, float]) -> list[str]:
+    """Return the cells of the methods of the best mean rank: in bold only where there is one, and it is first."""
+    others, best = len(ranks) - 1, min(ranks.values())
+    name = f"{', '.join(f'`{method}`' for method, rank in ranks.items() if rank == best)} {best:.2f}"
+    if lead.is_first:
+        return [f"**{name}, first**", f"all {others} (p at most {lead.p:.2g})"]
+    return [name, f"{others - len(lead.rivals)} of {others}"]
+
+
+def league() -> str:
+    """Mean ranks of all methods in all scenes, at equal episodes and at equal forward equivalents."""
+    found = kept_league()
+    rows = [
+        [f"`{scene.env}`", scene.fidelity, *(_ranks(scene, name) for name in found.methods)] for scene in found.scenes
+    ]
+    cost = {one.method: one.rank for one in found.overall_at_equal_cost}
+    rows.append(["all scenes", "", *(f"{one.rank:.2f} / {cost[one.method]:.2f}" for one in found.overall)])
+    return table(("environment", "fidelity", *found.methods), rows)
+
+
+def _ranks(scene: SceneStandings, method: str) -> str:
+    """Return a method's mean ranks at equal episodes and at equal forward equivalents, in bold where it is first."""
+    (rank,) = (one.rank for one in scene.standings if one.method == method)
+    both = ((rank, scene.lead), (scene.cost_rank(method).rank, scene.equal_cost.lead))
+    marked = ("**" if lead.is_first and lead.method == method else "" for _, lead in both)
+    return " / ".join(f"{mark}{one:.1f}{mark}" for mark, (one, _) in zip(marked, both, strict=True))
+
+
+def rivals() -> str:
+    """Which methods the one of the best mean rank is not ahead of, and which cannot be told from random search."""
+    rows = [
+        [
+            f"`{scene.env}`",
+            scene.fidelity,
+            _rivals(scene.lead),
+            _rivals(scene.equal_cost.lead),
+            ", ".join(scene.not_told_from_random) or "none",
+        ]
+        for scene in kept_league().scenes
+    ]
+    costs = ("best mean rank at equal episodes", "best mean rank at equal forward equivalents")
+    return table(("environment", "fidelity", *costs, "not told from random search"), rows)
+
+
+def _rivals(lead: Lead) -> str:
+    if lead.is_first:
+        return f"**`{lead.method}`**, first: p at most {lead.p:.2g}"
+    return f"`{lead.method}`, not told from {', '.join(lead.rivals)} (p up to {lead.p:.2g})"
+
+
+def method_defaults() -> str:
+    """Whose choice each default of a method is."""
+    rows = []
+    for name in methods():
+        known: dict[str, list[str]] = {}
+        for one in defaults(optimizer_class(name).Options):
+            known.setdefault(one.source, []).append(f"`{one.option}` {one.value}")
+        said = [", ".join(known.pop(source, ())) for source in (PAPER, OURS)]
+        theirs = "; ".join(f"{source}: {', '.join(options)}" for source, options in known.items())
+        rows.append([f"`{name}`", said[0], theirs, said[1]])
+    return table(("method", "the paper's", "a library's or its authors'", "ours"), rows)
 
 
 def margins() -> str:
@@ -255,6 +349,10 @@ def known_causes() -> str:
 
 TABLES: dict[tuple[str, str], Callable[[], str]] = {  # by page and name
     ("README.md", "censuses"): short_censuses,
+    ("README.md", "league"): short_league,
+    ("docs/races.md", "league"): league,
+    ("docs/races.md", "rivals"): rivals,
+    ("docs/races.md", "defaults"): method_defaults,
     ("BENCHMARKS.md", "accuracy"): accuracy,
     ("docs/measured.md", "measured"): measured,
     ("docs/measured.md", "censuses"): censuses,

@@ -15,13 +15,15 @@ from ...landscapes.storage.paths import is_finished
 from ...landscapes.storage.records import read_json, reading, write_record
 from ...landscapes.storage.store import open_slice
 from ...optim.claims import ClaimFinding, ClaimVerdict
-from ...optim.league import League, SceneStandings, Standing
+from ...optim.league import League, OverallRank, SceneStandings, Standing
+from ...optim.statistics import MeanRank
 from ..files import LEAGUE, LEAGUE_PICTURE, LEAGUE_RECORD, REMAKE, STORE, LeagueFiles
 from ..league import read_league, save_both
 from ..paper import Paper
 from .downloads import save_slice, save_table
 
 LEAGUE_TABLE = "league.csv"
+AT_COST = "mean rank at equal forward equivalents"
 VERDICTS = {
     ClaimVerdict.HOLDS: "confirmed",
     ClaimVerdict.FAILS: "refuted",
@@ -57,6 +59,26 @@ class LeaguePage:
         return ", ".join(f"{found[word]} {word}" for word in VERDICTS.values() if found[word])
 
     @property
+    def fidelities(self) -> str:
+        """In how many scenes races ran at which fidelity, in words."""
+        found = Counter(scene.fidelity for scene in self.league.scenes)
+        return ", ".join(f"{count} at {fidelity}" for fidelity, count in sorted(found.items()))
+
+    @property
+    def first(self) -> Sequence[str]:
+        """The scenes in which a method is ahead of every other after the correction, with its name."""
+        return [f"{scene.env} ({scene.lead.method})" for scene in self.league.scenes if scene.lead.is_first]
+
+    @property
+    def moves(self) -> Sequence[str]:
+        """The scenes in which the best mean rank moves, or is shared, at equal forward equivalents, and with whom."""
+        return [
+            f"{scene.env} ({scene.lead.method} after all episodes, {', '.join(scene.moved_to)} within the same cost)"
+            for scene in self.league.scenes
+            if scene.moved_to
+        ]
+
+    @property
     def size(self) -> str:
         """How many methods, seeds and episodes it has, by its first scene."""
         first = self.league.scenes[0]
@@ -77,7 +99,7 @@ class LeaguePage:
         best = self.league.overall[0]
         return (
             f"Mean ranks of {len(self.league.methods)} methods in {len(self.league.scenes)} scenes; over all scenes "
-            f"{best.method} is first with {best.rank:.2f}"
+            f"{best.method} has the best, {best.rank:.2f} (95 % interval {best.low:.2f} to {best.high:.2f})"
         )
 
 
@@ -93,7 +115,11 @@ def place_league(data: Path, out: Path, paper: Paper) -> LeaguePage | None:
             shutil.copyfile(file, folder / file.name)
     write_record(folder / LEAGUE_RECORD, to_json(league))
     save_both(league.plot(), folder / LEAGUE_PICTURE)
-    ranks = [{"method": one.method, "mean rank": one.rank, "low": one.low, "high": one.high} for one in league.overall]
+    at_cost = {one.method: one for one in league.overall_at_equal_cost}
+    ranks = [
+        {"method": one.method, **_ends("mean rank", one), **_ends(AT_COST, at_cost[one.method])}
+        for one in league.overall
+    ]
     save_table(ranks, folder / LEAGUE_TABLE)
     for scene in league.scenes:
         save_table([_came_off(scene, one) for one in scene.standings], folder / f"{scene.env}.csv")
@@ -131,4 +157,9 @@ def _came_off(scene: SceneStandings, one: Standing) -> Mapping[str, Any]:
     times = {f"episodes to {goal:.6g}": time for goal, time in zip(scene.goals, one.times, strict=True)}
     best = {"mean best loss": one.mean, "low": one.low, "high": one.high, "unsuccessful seeds": one.unsuccessful}
     rank = {"mean rank": one.rank, "rank low": one.rank_low, "rank high": one.rank_high}
+    rank |= _ends(AT_COST, scene.cost_rank(one.method))
     return {"method": one.method, **best, **rank, **times, "failed episodes": one.failed}
+
+
+def _ends(name: str, one: MeanRank | OverallRank) -> dict[str, float]:
+    return {name: one.rank, f"{name}, low": one.low, f"{name}, high": one.high}

@@ -1,20 +1,35 @@
-"""Growth of gradients with the length of an episode: the largest Lyapunov exponent of a motion, or its power of time.
+"""Growth of gradients with the length of an episode: exponential, by a power of time, bounded, or not to be told.
 
 How far a motion's end moves for a change of a parameter, |dx(t)/dp|, grows by the largest Lyapunov exponent: like
-exp(rate x t) where neighbours part for good. What only flies on grows like a power of time, which is no divergence.
+exp(rate x t) where neighbours part for good. What only flies on grows like a power of time, and what swings stays
+bounded: neither is divergence. Points of a slice swing together, so that many points do not tell these apart, and only
+the lengths of episodes do: shapes are judged by the medians over points, one for each length.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from enum import StrEnum
 
 import numpy as np
 
-from ..statistics import Estimate, Values, fit_line, mean
+from ..statistics import Estimate, Line, Values, fit_line, mean, student
 
 MIN_HORIZONS = 4  # horizons that a rate is fitted to
 MIN_KNOWN_SHARE = 0.5  # share of the points whose gradients must be known at all horizons
+EVIDENCE = 4.0  # of AICc, by which one shape has to beat the others (Burnham & Anderson 2002, section 2.6)
+TIMES = np.geomspace(0.02, 1.0, 60)  # after which growth has ended, in lengths of the longest episode
+EXACT = 1e-20  # squared errors of a logarithm that are rounding
+
+
+class Shape(StrEnum):
+    """Say how gradients grow with the length of episodes."""
+
+    EXPONENTIAL = "exponential"
+    POWER = "power"
+    BOUNDED = "bounded"
+    UNDECIDED = "cannot tell"
 
 
 @dataclass(frozen=True)
@@ -35,26 +50,55 @@ class GradientGrowth:
     points: int
 
     @property
+    def shape(self) -> Shape:
+        """How the medians grow.
+
+        Where a straight line rises beyond chance (Student's 95 % interval of its slope), the shape is the one of
+        exponential, power and saturation that has the least AICc, by `EVIDENCE` or more. Where none rises, it is
+        bounded if the interval leaves out a growth in proportion to time.
+        """
+        if not math.isfinite(self.rate.value):
+            return Shape.UNDECIDED
+        time, logs = np.array(self.time), np.log(self.norm)
+        exponential, power = fit_line(time, logs), fit_line(np.log(time), logs)
+        if max(_low(exponential, len(time)), _low(power, len(time))) <= 0:
+            return Shape.BOUNDED if power.slope + _reach(power, len(time)) < 1 else Shape.UNDECIDED
+        left = {
+            Shape.EXPONENTIAL: _squares(logs - exponential.slope * time),
+            Shape.POWER: _squares(logs - power.slope * np.log(time)),
+            Shape.BOUNDED: min(_squares(logs - np.log(-np.expm1(-time / (at * time[-1])))) for at in TIMES),
+        }
+        best, second = sorted(left, key=lambda shape: left[shape])[:2]
+        told = len(time) * math.log(left[second] / left[best])  # AICc of shapes that have as many parameters
+        return best if told > EVIDENCE else Shape.UNDECIDED
+
+    @property
     def is_exponential(self) -> bool:
-        """Whether gradients grow like an exponential: nearer to it than to a power, and beyond chance."""
-        return bool(self.rate.low > 0 and self.misfit[0] < self.misfit[1])
+        """Whether gradients grow like an exponential, and neither like a power of time nor to a bound."""
+        return self.shape is Shape.EXPONENTIAL
 
     def describe(self) -> str:
         """Say in a line how gradients grow."""
         if not math.isfinite(self.rate.value):
             return f"how gradients grow is not known: at {self.known} of {self.points} points they are at every horizon"
-        if self.is_exponential:
+        rate, power = (f"{one.value:z.2g} ({one.low:z.2g} to {one.high:z.2g})" for one in (self.rate, self.power))
+        if self.shape is Shape.EXPONENTIAL:
             low, high = self.rate.low, self.rate.high
             return f"gradients grow like exp({self.rate.value:z.3g} t), t in s ({low:z.3g} to {high:z.3g}/s)"
-        low, high = self.power.low, self.power.high
-        return f"gradients grow like t^{self.power.value:z.2g} ({low:z.2g} to {high:z.2g}), not exponentially"
+        if self.shape is Shape.POWER:
+            low, high = self.power.low, self.power.high
+            return f"gradients grow like t^{self.power.value:z.2g} ({low:z.2g} to {high:z.2g}), not exponentially"
+        if self.shape is Shape.BOUNDED:
+            return f"gradients stay bounded; as a power of time their exponent is {power}"
+        return f"cannot tell how gradients grow: as an exponential by {rate}/s, as a power of time by {power}"
 
 
 def measure_growth(time: Values, norm: Values) -> GradientGrowth:
     """Fit how |gradients|, shape (horizon, point), grow with the ascending lengths of episodes `time` [s].
 
     Each point is fitted by itself, an exponential and a power of time; points whose gradient is zero or failed at some
-    horizon are left out. Raises ValueError where lengths do not ascend from above zero.
+    horizon are left out. Intervals are those of the mean over points and of the fit to the medians, added in squares.
+    Raises ValueError where lengths do not ascend from above zero.
     """
     if not (time > 0).all() or not (np.diff(time) > 0).all():
         raise ValueError(f"lengths of episodes ascend from above 0; got {time.tolist()}")
@@ -68,9 +112,12 @@ def measure_growth(time: Values, norm: Values) -> GradientGrowth:
         return GradientGrowth(
             nothing, nothing, (math.nan, math.nan), tuple(time.tolist()), tuple(medians.tolist()), known, points
         )
-    logs = np.log(norm[:, there])
-    fits = [[_fit(axis, column) for column in logs.T] for axis in (time, np.log(time))]
-    rate, power = (mean(np.array([slope for slope, _ in fit])) for fit in fits)
+    logs, axes = np.log(norm[:, there]), (time, np.log(time))
+    fits = [[_fit(axis, column) for column in logs.T] for axis in axes]
+    rate, power = (
+        _widened(mean(np.array([slope for slope, _ in fit])), fit_line(axis, np.log(medians)), len(time))
+        for fit, axis in zip(fits, axes, strict=True)
+    )
     first, second = (math.sqrt(float(np.mean([left**2 for _, left in fit]))) for fit in fits)
     return GradientGrowth(rate, power, (first, second), tuple(time.tolist()), tuple(medians.tolist()), known, points)
 
@@ -79,3 +126,23 @@ def _fit(axis: Values, values: Values) -> tuple[float, float]:
     """Return the slope of a line through values, and the standard deviation of what it leaves."""
     found = fit_line(axis, values)
     return found.slope, float(np.std(values - found.intercept - found.slope * axis))
+
+
+def _widened(found: Estimate, line: Line, count: int) -> Estimate:
+    """Return the interval of a mean over points that depend on each other, by the line through `count` medians."""
+    reach = math.hypot(found.high - found.value, _reach(line, count))
+    return Estimate(found.value, found.value - reach, found.value + reach)
+
+
+def _reach(line: Line, count: int) -> float:
+    """Return half the width of the 95 % interval of the slope of a line through so many points."""
+    return float(line.standard_error * student(count - 2))
+
+
+def _low(line: Line, count: int) -> float:
+    return line.slope - _reach(line, count)
+
+
+def _squares(left: Values) -> float:
+    """Return the sum of squares about the mean, as large as rounding at least."""
+    return float(((left - left.mean()) ** 2).sum()) + EXACT

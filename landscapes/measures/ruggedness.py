@@ -20,13 +20,15 @@ from numpy.typing import NDArray
 from ..identity import plane_of
 from ..large import refuse_large
 from ..objective import Status
-from ..statistics import Estimate, Values, fit_line, jackknife, share
+from ..statistics import Estimate, Values, exact_share, fit_line, jackknife, share
 
 FLAT_SLOPE = 1e-3  # a slope below it is effectively zero [ranges of the losses per side of the box]
 NOTABLE = 0.01  # the least depth of a notable minimum, as a fraction of the range
 THRESHOLDS = (1e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1, 0.3)  # depths that minima are counted by, as fractions of the range
 BEST_SHARE = 0.05  # share of the samples that dispersion calls the best
 LAGS, WIDEST = 3, 4  # fewest that an exponent is fitted to; the widest is this part of the side
+DISTANCES = sorted({1} | {part * 2**power for power in range(20) for part in (2, 3)})  # in steps
+WALKED, SETTLED = 500, 0.05  # points of a walk, and the information content under which it has settled
 PAIRED = 4096  # most samples whose pairs are gone through one by one, 8 million of them
 
 
@@ -133,18 +135,19 @@ def correlation_length(loss: Values, axis: int) -> float:
 def holder_exponent(loss: Values, axis: int, floor: float) -> float:
     """Return the exponent by which losses along an axis differ with distance: |f(x + h) - f(x)| ~ h^exponent.
 
-    The slope of the logarithm of the root mean square of differences over 1, 2, 4, ... steps, up to a quarter of the
-    side, against that of the distance: Wang et al. 2023, *Fractal landscapes in policy optimization* (NeurIPS), section
-    5, with differences of samples instead of a Gaussian's. Differences no larger than `floor` are left out; NaN
-    where fewer than three distances are left.
+    The slope of the logarithm of the root mean square of differences over 1, 2, 3, 4, 6, 8, ... steps, up to a quarter
+    of the side, against that of the distance: Wang et al. 2023, *Fractal landscapes in policy optimization* (NeurIPS),
+    section 5, with differences of samples instead of a Gaussian's. Beyond the correlation length differences grow no
+    more, whatever the landscape is like within it, so longer distances are left out. So are differences no larger than
+    `floor`. NaN where fewer than three distances are left: such a landscape varies within the samples' distance.
     """
     lines, known = _lines(loss, axis), list[tuple[float, float]]()
-    lag = 1
-    while WIDEST * lag < lines.shape[1]:
+    sides = lines.shape[1] - 1
+    longest = sides * min(1 / WIDEST, np.nan_to_num(correlation_length(loss, axis)))
+    for lag in (lag for lag in DISTANCES if lag <= longest):
         apart = math.sqrt(_mean((lines[:, lag:] - lines[:, :-lag]) ** 2))
         if apart > floor:
             known.append((math.log(lag), math.log(apart)))
-        lag *= 2
     return fit_line(*zip(*known, strict=True)).slope if len(known) >= LAGS else math.nan
 
 
@@ -156,18 +159,42 @@ def total_variation(loss: Values, axis: int) -> float:
 
 
 def information_content(loss: Values) -> tuple[float, float]:
-    """Return the information content h_max and log10 of the settling sensitivity eps_s, of walks along the axes.
+    """Return the information content h_max and log10 of the settling sensitivity eps_s, of a walk over a slice.
 
-    Munoz, Kirley & Halgamuge 2015, IEEE Trans. Evol. Comput. 19(1), eqs. 6 to 9. Slopes are in ranges of the losses per
-    side of the box, so that slices compare.
+    Munoz, Kirley & Halgamuge 2015, IEEE Trans. Evol. Comput. 19(1), eqs. 6 to 9: the walk goes from each point of a
+    sample of the box to the nearest that is left. The sample is up to `WALKED` points of the slice, drawn at random, so
+    that what comes out hardly depends on how fine the slice is. Slopes are in ranges of the losses per side of the box,
+    so that slices compare.
     """
-    walks = [_slopes(loss, axis) for axis in range(loss.ndim)]
-    sizes = np.concatenate([[0.0], np.logspace(-6.05, 3.95, 101)])  # none is 1, the slope of every ramp
-    entropy = np.array([_entropy(counts) for counts in _pair_counts(walks, sizes)])
-    if not np.isfinite(entropy).any():
+    places, whole = np.argwhere(np.isfinite(loss)), span(loss)
+    if len(places) < 3 or not whole > 0:
         return math.nan, math.nan
-    settled = sizes[(entropy < 0.05) & (sizes > 0)]
-    return float(entropy.max()), math.log10(settled[0]) if len(settled) else math.nan
+    some = np.random.default_rng(0).permutation(len(places))[:WALKED]
+    walk = _nearest_walk(places[some] / _sides(loss.shape))
+    losses = loss[tuple(places[some[walk.order]].T)]
+    sizes = np.concatenate([[0.0], np.logspace(-5.0, 15.0, 1000)])
+    entropy = np.array([_entropy(counts) for counts in _pair_counts(np.diff(losses) / whole / walk.length, sizes)])
+    settled = sizes[(entropy < SETTLED) & (sizes > 0)]
+    return float(entropy.max()), math.log10(settled[0])
+
+
+@dataclass(frozen=True)
+class Walk:
+    """Hold in which order points are visited, shape (point,), and how far the steps are, shape (point - 1,)."""
+
+    order: NDArray[np.intp]
+    length: Values
+
+
+def _nearest_walk(points: Values) -> Walk:
+    """Go from the first point to the nearest that was not visited, and so on, shape (point, rank)."""
+    order, lengths, left = [0], list[float](), np.ones(len(points), bool)
+    for _ in range(len(points) - 1):
+        left[order[-1]] = False
+        apart = np.where(left, np.linalg.norm(points - points[order[-1]], axis=1), np.inf)
+        order.append(int(apart.argmin()))
+        lengths.append(float(apart.min()))
+    return Walk(np.array(order), np.array(lengths))
 
 
 def turns(loss: Values, floor: float = 0.0) -> float:
@@ -184,6 +211,11 @@ def turns(loss: Values, floor: float = 0.0) -> float:
         steps += int(np.isfinite(difference).sum())
         turned += _reversals(np.where(np.abs(difference) > small, difference, 0.0).cumsum(axis=1), floor)
     return turned / steps if steps else math.nan
+
+
+def steps(loss: Values) -> int:
+    """Count the pairs of neighbours along axes that both have a loss."""
+    return sum(int(np.isfinite(np.diff(loss, axis=axis)).sum()) for axis in range(loss.ndim))
 
 
 def _reversals(walks: Values, floor: float) -> int:
@@ -290,7 +322,12 @@ def ruggedness(
     notable = found.sample[found.depth > max(floor, NOTABLE * whole)]
     shares = basins(loss, notable) if len(notable) else np.full(1, math.nan)
     slopes = box_slopes(dataset) if "grad" in dataset else None
-    share_of = partial(estimate, least=0.0, most=1.0)
+
+    def share_of(statistic: Callable[[Values], float], samples: Values, tries: int) -> Estimate:
+        return exact_share(estimate(statistic, samples), tries)
+
+    def mean_of(flags: Values) -> Estimate:
+        return share_of(_mean, flags, int(np.isfinite(flags).sum()))
 
     def along_axes(measure: Callable[[Values, int], float], **bounds: float) -> tuple[Estimate, ...]:
         axes = range(loss.ndim)[::-1]  # u first
@@ -307,16 +344,16 @@ def ruggedness(
         curve={f"{part:g}": found.count(max(floor, part * whole)) for part in THRESHOLDS},
         largest_basin=float(shares.max()),
         lowest_basin=float(shares[0]),
-        zero=None if slopes is None else share_of(_mean, _below(slopes, 0.0)),
-        flat=None if slopes is None else share_of(_mean, _below(slopes, FLAT_SLOPE * whole)),
+        zero=None if slopes is None else mean_of(_below(slopes, 0.0)),
+        flat=None if slopes is None else mean_of(_below(slopes, FLAT_SLOPE * whole)),
         missing=missing_gradients(dataset),
-        level=share_of(_mean, level_samples(loss, floor if noise is None else noise)),
+        level=mean_of(level_samples(loss, floor if noise is None else noise)),
         correlation_length=along_axes(correlation_length, least=0.0, most=1.0),
         holder=along_axes(partial(holder_exponent, floor=floor), least=0.0),
         total_variation=along_axes(total_variation, least=1.0),
-        information=share_of(lambda part: information_content(part)[0], loss),
+        information=estimate(lambda part: information_content(part)[0], loss, least=0.0, most=1.0),
         settling=estimate(lambda part: information_content(part)[1], loss),
-        turns=share_of(partial(turns, floor=floor), loss),
+        turns=share_of(partial(turns, floor=floor), loss, steps(loss)),
         dispersion=estimate(dispersion, loss, least=0.0),
         fitness_distance=estimate(fitness_distance, loss, least=-1.0, most=1.0),
     )
@@ -354,31 +391,14 @@ def _mean(values: Values) -> float:
         return float(np.nanmean(values))
 
 
-def _slopes(loss: Values, axis: int) -> Values:
-    whole = span(loss)
-    slopes: Values = np.diff(_lines(loss, axis), axis=1) * (loss.shape[axis] - 1)
-    return slopes / whole if whole > 0 else slopes
+def _pair_counts(steps: Values, sizes: Values) -> Values:
+    """Count pairs of successive slopes of a walk by their symbols at each size, shape (size, symbol, symbol).
 
-
-def _pair_counts(walks: list[Values], sizes: Values) -> Values:
-    """Count pairs of successive steps by their symbols at each of ascending sizes, shape (size, symbol, symbol).
-
-    A step's symbol is its sign, but 0 at every size that it does not exceed (Munoz et al. 2015, eq. 6). One pass over
-    the steps does for all sizes: the symbols of a pair change where one of them becomes 0, and where the other does.
+    A slope's symbol is its sign, but 0 at every size that it does not exceed (Munoz et al. 2015, eq. 6).
     """
-    counts = np.zeros((len(sizes) + 1) * 9)
-    for walk in walks:
-        known = np.isfinite(walk[:, :-1]) & np.isfinite(walk[:, 1:])
-        steps = walk[:, :-1][known], walk[:, 1:][known]
-        first, second = (np.searchsorted(sizes, np.abs(step)) for step in steps)  # the symbols are 0 from there on
-        both = [np.sign(step).astype(int) for step in steps]
-        sooner, later = np.minimum(first, second), np.maximum(first, second)
-        one, none = [both[0] * (first == later), both[1] * (second == later)], [0, 0]
-        for start, end, symbols in ((0, sooner, both), (sooner, later, one), (later, len(sizes), none)):
-            for at, change in ((start, 1), (end, -1)):
-                place = np.broadcast_to(9 * at + 3 * (symbols[0] + 1) + symbols[1] + 1, later.shape)
-                counts += change * np.bincount(place, minlength=counts.size)
-    return counts.reshape(-1, 3, 3).cumsum(axis=0)[:-1]
+    symbols = 1 + np.where(np.abs(steps) > sizes[:, None], np.sign(steps), 0).astype(int)
+    pairs = 3 * symbols[:, :-1] + symbols[:, 1:]
+    return np.array([np.bincount(one, minlength=9) for one in pairs], float).reshape(-1, 3, 3)
 
 
 def _entropy(counts: Values) -> float:

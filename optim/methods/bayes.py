@@ -45,6 +45,7 @@ FIT_ROWS = 400  # of them that hyper-parameters are fitted to
 STEEPEST = 1e3  # deviations of the losses per width of the box, that a slope counts as at most
 LONGEST, PERTURBED = 1.6, 20  # of a region's side, in widths of the box; parameters of a candidate that differ
 IMPROVEMENT = 1e-3  # of the best loss, that a success lowers it by at least
+TURBO = "its authors' (Eriksson et al. 2019)"  # whose choice a default is
 MODELLED = SurrogateOptions(kernel="matern", initial=1)
 
 
@@ -228,7 +229,7 @@ def standardised(loss: Points, grad: Points) -> Points:
 
 @dataclass(frozen=True)
 class TuRBOOptions(MethodOptions):
-    """How the trust region changes; the defaults are those of Eriksson et al. 2019.
+    """How the trust region changes; lengths and successes are those of Eriksson et al. 2019.
 
     A region's side is `length` widths of the box at first. It doubles after `successes` batches in a row that improve
     the best loss, and halves after as many in a row that do not as hold a point for each parameter, or four points;
@@ -239,9 +240,9 @@ class TuRBOOptions(MethodOptions):
 
     method = "turbo"
 
-    length: float = number(0.8, 1e-6, LONGEST)
-    shortest: float = number(0.5**7, 1e-12, 1)
-    successes: int = number(3, 1, MANY)
+    length: float = number(0.8, 1e-6, LONGEST, TURBO)
+    shortest: float = number(0.5**7, 1e-12, 1, TURBO)
+    successes: int = number(3, 1, MANY, TURBO)
     batch_size: int = number(4, 1, 1000)
     candidates: int = number(0, 0, 100_000)
 

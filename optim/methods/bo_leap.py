@@ -14,7 +14,7 @@ from cma.sigma_adaptation import CMAAdaptSigmaCSA
 from ..base import Kind, Optimizer, Points, Proposal
 from ..lockstep import Asking
 from ..memory import SearchSize
-from ..options import MANY, number
+from ..options import MANY, PAPER, number
 from .cmaes import population_memory, quiet_options
 from .descent import Descent, DescentOptions
 from .surrogate import Surrogate, SurrogateOptions, surrogate_memory
@@ -33,10 +33,10 @@ class BOLeapOptions(SurrogateOptions, DescentOptions):
 
     method = "bo-leap"
 
-    population: int = number(10, 2, 10_000)
+    population: int = number(10, 2, 10_000, PAPER)
     best: int = number(5, 1, 9_999)
-    sigma: float = number(1.0, 1e-9, 1000)
-    local_budget: int = number(100, 1, MANY)
+    sigma: float = number(1.0, 1e-9, 1000, PAPER)
+    local_budget: int = number(100, 1, MANY, PAPER)
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -14,7 +14,7 @@ from cma.sigma_adaptation import CMAAdaptSigmaCSA
 
 from ..base import Kind, Optimizer, Points, Proposal
 from ..memory import FLOAT, SearchSize
-from ..options import MethodOptions, number
+from ..options import LIBRARY, MethodOptions, number
 
 MATRICES = 8  # of dim x dim, that CMA-ES holds while it is written to disk: C, its eigenvectors, a pickle of both
 POPULATION = 7000  # bytes for each member of a population, in addition to its numbers (measured with pycma 4)
@@ -35,8 +35,8 @@ class CMAESOptions(MethodOptions):
 
     method = "cma-es"
 
-    sigma: float = number(0.5, 1e-9, 1000)
-    population: int = number(0, 0, 10_000)
+    sigma: float = number(0.5, 1e-9, 1000, LIBRARY.format("cma"))
+    population: int = number(0, 0, 10_000, LIBRARY.format("cma"))
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -13,7 +13,7 @@ import torch
 
 from ..base import Kind, Optimizer, Part, Points, Proposal
 from ..memory import FLOAT, SearchSize
-from ..options import MANY, MethodOptions, number
+from ..options import LIBRARY, MANY, PAPER, MethodOptions, number
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class DescentOptions(MethodOptions):
     max_step: float = number(0.2, 1e-12, 1000)
     shrink: float = number(0.5, 1e-12, 1)
     steps: int = number(20, 1, MANY)
-    patience: int = number(3, 0, MANY)
+    patience: int = number(3, 0, MANY, PAPER)
     tolerance: float = number(1e-4, 0, 1)
 
 
@@ -160,8 +160,8 @@ class AdamOptions(MethodOptions):
     method = "adam"
 
     rate: float = number(0.05, 1e-12, 1000)
-    beta1: float = number(0.9, 0, 0.999999)
-    beta2: float = number(0.999, 0, 0.999999)
+    beta1: float = number(0.9, 0, 0.999999, LIBRARY.format("torch"))
+    beta2: float = number(0.999, 0, 0.999999, LIBRARY.format("torch"))
     steps: int = number(100, 1, MANY)
     patience: int = number(20, 0, MANY)
     tolerance: float = number(1e-4, 0, 1)

@@ -35,7 +35,7 @@ from ...landscapes.objective import Objective
 from ..base import LARGE, Kind, Optimizer, Points, Proposal
 from ..lockstep import Asking, Observe, answer_alone
 from ..memory import SearchSize
-from ..options import MethodOptions, number
+from ..options import LIBRARY, MethodOptions, number
 
 
 def read_weights(model: Any) -> dict[str, Any]:
@@ -78,6 +78,7 @@ def _tensors(arrays: Mapping[str, Any]) -> dict[str, Tensor]:
     return {name: torch.from_numpy(array) for name, array in arrays.items()}
 
 
+SB3 = LIBRARY.format("Stable-Baselines3")
 LAYERS = (64, 64, 64)  # CoRL 2022, appendix C
 _GENERATORS = threading.Lock()  # held while the process's generators are an optimiser's own
 
@@ -102,9 +103,9 @@ class PPOOptions(MethodOptions):
 
     episodes: int = number(20, 2, 10_000)
     minibatches: int = number(4, 1, 5_000)
-    epochs: int = number(10, 1, 10_000)
+    epochs: int = number(10, 1, 10_000, SB3)
     learning_rate: float = number(1e-3, 1e-12, 1)
-    discount: float = number(0.99, 0, 1)
+    discount: float = number(0.99, 0, 1, SB3)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -127,9 +128,9 @@ class SACOptions(MethodOptions):
     method = "sac"
 
     warmup: int = number(20, 1, 10_000)
-    batch: int = number(256, 1, 100_000)
+    batch: int = number(256, 1, 100_000, SB3)
     learning_rate: float = number(1e-3, 1e-12, 1)
-    discount: float = number(0.99, 0, 1)
+    discount: float = number(0.99, 0, 1, SB3)
     memory: int = number(100_000, 1, 1_000_000)
 
 

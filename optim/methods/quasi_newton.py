@@ -13,7 +13,7 @@ from scipy.optimize import minimize
 
 from ..base import Kind, Optimizer, Part, Points, Proposal
 from ..memory import FLOAT, SearchSize
-from ..options import MANY, MethodOptions, number
+from ..options import LIBRARY, MANY, MethodOptions, number
 from .descent import lacks
 
 MEMORY = 10  # pairs of steps and gradients that the Hessian is made of, as scipy's default has it
@@ -123,7 +123,7 @@ class LBFGSB(Optimizer):
 
 @dataclass(frozen=True)
 class BasinHoppingOptions(LBFGSBOptions):
-    """How the search goes from minimum to minimum; the defaults are scipy's.
+    """How the search goes from minimum to minimum; the defaults of hops are scipy's.
 
     A hop is uniform, up to `step` along each parameter of the box scaled to [-1, 1]; its length is adapted every 50
     hops so that half of them are accepted. A minimum that is worse by `temperature` [loss unit] is accepted with
@@ -132,8 +132,8 @@ class BasinHoppingOptions(LBFGSBOptions):
 
     method = "basin-hopping"
 
-    step: float = number(0.5, 1e-12, 1000)
-    temperature: float = number(1.0, 1e-300, 1e300)
+    step: float = number(0.5, 1e-12, 1000, LIBRARY.format("scipy"))
+    temperature: float = number(1.0, 1e-300, 1e300, LIBRARY.format("scipy"))
 
 
 class BasinHopping(LBFGSB):

@@ -51,7 +51,7 @@ from ...landscapes.threads import one_torch_thread
 from ..base import Part, Points, tame
 from ..lockstep import Asking, compute_drawing
 from ..memory import FLOAT, SearchSize
-from ..options import MANY, MethodOptions, number
+from ..options import MANY, PAPER, MethodOptions, choice, number
 from .process import GROWTH, KERNELS, Covariance, Matrix, Process, fitted, with_parameters
 
 STEPS = 30  # of L-BFGS on the bound, from each start
@@ -152,8 +152,8 @@ class SurrogateOptions(MethodOptions):
 
     method = "bo"
 
-    coefficient: float = number(1.0, 0, 1e6)
-    kernel: Literal["rbf", "matern"] = "rbf"
+    coefficient: float = number(1.0, 0, 1e6, PAPER)
+    kernel: Literal["rbf", "matern"] = choice("rbf", PAPER)
     initial: int = number(10, 1, MANY)
     max_points: int = number(1000, 2, MANY)
 

@@ -63,7 +63,7 @@ def test_a_scene_is_raced_once_for_all_its_figures_and_kept(small: Path, capsys:
     assert compute(small, "--only", "branin") == 0
     said = capsys.readouterr().err
     assert "league: 0 of 2 are there already" in said
-    assert said.count("2 methods, 3 seeds, 12 episodes: ") == 1
+    assert said.count("2 methods, 3 seeds: after 12 episodes ") == 1
     assert {path.name for path in (small / "league").iterdir()} == {
         "branin.json", "branin.npz", "branin.png", "branin-dark.png"
     }  # fmt: skip

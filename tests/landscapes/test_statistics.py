@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from gradscape.landscapes.statistics import fit_line, jackknife, mean, share, student
+from gradscape.landscapes.statistics import Estimate, exact_share, fit_line, jackknife, mean, share, student
 
 RNG = np.random.default_rng(0)
 
@@ -25,6 +25,42 @@ def test_the_interval_of_a_share_is_that_of_clopper_and_pearson(hits, tries):
     if 0 < hits < tries:  # what the interval is: either end would leave 2.5 % for what was seen and beyond
         assert stats.binom.sf(hits - 1, tries, found.low) == pytest.approx(0.025, rel=1e-9)
         assert stats.binom.cdf(hits, tries, found.high) == pytest.approx(0.025, rel=1e-9)
+
+
+def test_a_share_of_dependent_samples_has_the_interval_of_as_many_independent_ones():
+    """Of 64 x 64 samples in 4 x 4 blocks that are alike within, 16 count; of independent ones nearly all do."""
+    blocks = np.kron(RNG.permutation([1.0] * 4 + [0.0] * 12).reshape(4, 4), np.ones((16, 16)))
+    found = exact_share(jackknife(lambda at: float(np.nanmean(at)), blocks), blocks.size)
+    assert found.value == 0.25
+    wider = share(4, 16)  # Student's factor for 16 blocks comes on top
+    assert wider.low - 0.04 < found.low < wider.low
+    assert wider.high < found.high < wider.high + 0.06
+    free = (RNG.uniform(size=(64, 64)) < 0.1).astype(float)
+    known, whole = (
+        exact_share(jackknife(lambda at: float(np.nanmean(at)), free), free.size),
+        share(int(free.sum()), 4096),
+    )
+    assert 0.5 < (known.high - known.low) / (whole.high - whole.low) < 2
+
+
+@pytest.mark.parametrize("value", [0.0, 1.0])
+def test_a_share_of_none_or_all_has_an_interval(value):
+    flags = np.full((12, 12), value)
+    found, wanted = exact_share(jackknife(lambda at: float(np.nanmean(at)), flags), 144), share(int(144 * value), 144)
+    assert (found.value, found.low, found.high) == (value, wanted.low, wanted.high)
+    assert 0.02 < found.high - found.low < 0.03
+    alone = exact_share(Estimate(value, np.nan, np.nan), 144)
+    assert np.isnan([alone.low, alone.high]).all()
+
+
+def test_the_interval_of_a_share_of_blocks_holds_it_as_often_as_it_says():
+    """In blocks that are alike within, of whose sixteen a known share is hit on the mean."""
+    held = 0
+    for _ in range(400):
+        blocks = np.kron((RNG.uniform(size=(4, 4)) < 0.3).astype(float), np.ones((3, 3)))
+        found = exact_share(jackknife(lambda at: float(np.nanmean(at)), blocks), 16)
+        held += found.low <= 0.3 <= found.high
+    assert held / 400 > 0.93
 
 
 def test_nothing_tried_has_no_share():

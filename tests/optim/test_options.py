@@ -1,17 +1,21 @@
 """Every option of every method: a value is refused by the names of method and option, or a search works with it."""
 
 import dataclasses
+import inspect
 import math
 from collections.abc import Sequence
 from typing import Any
 
+import cma
 import numpy as np
 import pytest
+import scipy.optimize
 import torch
 
 from gradscape import ParameterSpace, from_torch
 from gradscape.landscapes.objective import Status
 from gradscape.landscapes.options import read_options
+from gradscape.optim.options import OURS, PAPER, defaults
 from gradscape.optim.registry import methods, optimizer_class
 from gradscape.optim.search import search
 
@@ -88,3 +92,35 @@ def test_a_method_searches_losses_of_any_size(method: str) -> None:
         assert run.count == 8, name
         assert np.isfinite(table["x"]).all(), name
         assert np.isfinite(table["loss"]).equals(table["status"] == Status.OK), name
+
+
+@pytest.mark.parametrize("method", methods())
+def test_every_default_says_whose_choice_it_is(method: str) -> None:
+    kind = optimizer_class(method)
+    found = defaults(kind.Options)
+    assert [one.option for one in found] == [one.name for one in options(method)]
+    assert all(one.source in (OURS, PAPER) or "(" in one.source for one in found)
+
+
+def test_a_default_that_is_called_a_librarys_is_that_of_the_library() -> None:
+    """But for the first step size of CMA-ES, which its author advises and the library has no default of."""
+    hop = inspect.signature(scipy.optimize.basinhopping).parameters
+    (beta1, beta2), theirs = inspect.signature(torch.optim.Adam).parameters["betas"].default, {}
+    theirs["basin-hopping"] = {"step": hop["stepsize"].default, "temperature": hop["T"].default}
+    theirs["adam"] = {"beta1": beta1, "beta2": beta2}
+    for name, named in (("ppo", {"epochs": "n_epochs"}), ("sac", {"batch": "batch_size"})):
+        if name in methods():
+            known = inspect.signature(getattr(pytest.importorskip("stable_baselines3"), name.upper())).parameters
+            theirs[name] = {ours: known[one].default for ours, one in (named | {"discount": "gamma"}).items()}
+    for method, wanted in theirs.items():
+        said = {one.option: one.value for one in defaults(optimizer_class(method).Options) if "library" in one.source}
+        assert said == {name: str(value) for name, value in wanted.items()}, method
+    assert "population" in {one.option for one in defaults(optimizer_class("cma-es").Options) if "cma" in one.source}
+    assert cma.CMAOptions().eval("popsize", loc={"N": 10}) == pytest.approx(4 + 3 * math.log(10))
+
+
+def test_what_the_paper_states_of_bo_leap_is_its_default() -> None:
+    """Its sections 2, 4 and 5 with the supplement's C."""
+    said = {one.option: one.value for one in defaults(optimizer_class("bo-leap").Options) if one.source == PAPER}
+    search = {"population": "10", "sigma": "1.0", "local_budget": "100", "patience": "3"}
+    assert said == search | {"coefficient": "1.0", "kernel": "rbf"}

@@ -142,17 +142,23 @@ def test_an_interval_is_that_of_scipys_bootstrap():
 
 def test_one_seed_has_no_interval_and_decides_nothing():
     assert np.isnan(statistics.interval(np.array([[1.0, 2.0]]))).all()
-    assert difference("a", np.array([0.0]), "b", np.array([9.0])).better is None
+    alone = difference("a", np.array([0.0]), "b", np.array([9.0]))
+    assert (alone.mean, math.isnan(alone.low), math.isnan(alone.high)) == (-9.0, True, True)
+    (pair,) = superiorities({"a": np.array([0.0]), "b": np.array([9.0])})
+    assert (pair.probability, pair.p, pair.better) == (1.0, 1.0, None)
 
 
-def test_better_is_who_the_interval_of_the_difference_leaves_no_doubt_about():
-    noise = np.random.default_rng(0).normal(size=(2, 10))
+def test_better_is_who_the_corrected_test_says_whatever_the_interval_of_the_difference():
+    """Its interval excludes zero here, and p is below 0.05 for the pair alone, but not corrected for ten pairs."""
+    noise = np.random.default_rng(0).normal(size=(5, 10))
     apart = difference("a", noise[0], "b", noise[1] + 5)
-    assert apart.better == "a"
-    assert apart.reversed.better == "a"
-    assert difference("a", noise[0] + 9, "b", noise[1]).better == "b"
-    assert difference("a", noise[0], "b", noise[1]).better is None
-    assert difference("a", np.array([NAN, 1.0]), "b", noise[1] + 5).better is None
+    assert apart.high < 0 < apart.reversed.low
+    final = {"a": noise[0], "b": noise[1] + 1.4} | {f"c{number}": noise[number] + 100 for number in (2, 3, 4)}
+    close = difference("a", final["a"], "b", final["b"])
+    pair = next(one for one in superiorities(final) if {one.first, one.second} == {"a", "b"})
+    assert close.high < 0
+    assert pair.p < 0.05 < pair.corrected
+    assert pair.better is None
 
 
 def test_a_win_is_counted_over_all_pairs_of_seeds_with_ties_as_half():
@@ -197,9 +203,10 @@ def test_who_is_ahead_is_decided_over_all_pairs_together():
     assert one.reversed.probability == pytest.approx(0.1)
     assert Superiority("a", "b", 0.9, 0.01, 0.06).better is None
     runs = synthetic(a=0, b=1, c=9)
-    for pair in superiorities(runs):
+    pairs = compare(runs)
+    for pair in pairs:
         assert pair.p <= pair.corrected <= 3 * pair.p
-    assert {pair.better for pair in superiorities(runs) if "c" in (pair.first, pair.second)} == {"a", "b"}
+    assert {pair.better for pair in pairs if "c" in (pair.first, pair.second)} == {"a", "b"}
 
 
 def synthetic(**centers: float) -> dict[str, list[xr.Dataset]]:
@@ -207,9 +214,59 @@ def synthetic(**centers: float) -> dict[str, list[xr.Dataset]]:
     return {name.replace("_", "-"): [table([c + random.normal()]) for _ in range(10)] for name, c in centers.items()}
 
 
+def compare(runs) -> list[Superiority]:
+    return superiorities(dict(zip(runs, statistics.final_losses(runs), strict=True)))
+
+
+def test_a_method_is_first_only_where_it_is_ahead_of_every_other_one():
+    found = statistics.RaceStatistics.of(synthetic(a=0, b=9, c=12))
+    assert (found.lead.method, found.lead.rivals, found.lead.is_first) == ("a", (), True)
+    assert found.lead.describe() == "a is first: ahead of every other method (corrected p at most 3.2e-05)"
+    level = statistics.RaceStatistics.of(synthetic(a=0, b=0.9, c=12)).lead
+    assert (level.method, level.rivals, level.is_first) == ("a", ("b",), False)
+    assert level.describe().startswith("no method is first: a has the best mean rank, not distinguishable from b (")
+    alone = Superiority("a", "b", 0.8, 0.02, 0.04)  # by itself b is behind
+    assert statistics.Lead.of(["a", "b"], [alone]).is_first
+    assert not statistics.Lead.of(["a", "b"], [Superiority("a", "b", 0.8, 0.02, 0.06)]).is_first
+    assert not statistics.Lead.of(["a", "b"], [Superiority("a", "b", 0.4, 0.02, 0.04)]).is_first  # it is behind
+    assert not statistics.Lead.of(["a"], []).is_first
+
+
+def test_of_equal_methods_none_is_better_in_more_than_a_twentieth_of_races():
+    random, races = np.random.default_rng(5), 400
+    told = sum(
+        any(pair.better for pair in superiorities({name: random.normal(size=10) for name in "abcd"}))
+        for _ in range(races)
+    )
+    assert told / races < 0.05 + 2 * math.sqrt(0.05 * 0.95 / races)
+
+
+def test_what_is_not_told_from_another_method_is_what_the_corrected_test_leaves_open():
+    pairs = [
+        Superiority("a", "b", 0.9, 0.01, 0.03),
+        Superiority("a", "c", 0.7, 0.1, 0.2),
+        Superiority("b", "c", 0.5, 1, 1),
+    ]
+    assert statistics.not_told_from("c", ["a", "b", "c"], pairs) == ("a", "b")
+    assert statistics.not_told_from("a", ["a", "b", "c"], pairs) == ("c",)
+
+
+def test_at_equal_cost_each_run_counts_up_to_the_least_that_one_spent():
+    """Episodes of `b` cost twice as much, so that of four of them two count; of the second race's, one."""
+    cost = statistics.EqualCost.of(RACE)
+    assert cost.forwards == 4.0
+    np.testing.assert_array_equal(statistics.final_losses(RACE, 4.0), [[1, 2], [8, 4]])
+    assert [(one.method, one.rank) for one in cost.ranks] == [("a", 1.0), ("b", 2.0)]
+    quick = {"a": [table([5, 4, 3, 2])] * 2, "b": [table([9, 8, 1, 1], forward=3.0)] * 2}
+    assert [rank.method for rank in statistics.ranks(quick)] == ["b", "a"]
+    assert [one.method for one in statistics.EqualCost.of(quick).ranks] == ["a", "b"]  # of b one episode counts
+    dear = {"a": [table([5, 4])], "b": [table([9, 1], forward=9.0)]}
+    assert np.isnan(statistics.final_losses(dear, 2.0)[1, 0])  # its first episode costs more than all of a's
+
+
 def verdicts(env: str, **centers: float) -> dict[str, ClaimVerdict]:
     runs = synthetic(**centers)
-    found = check_claims(read_paper().claims_about(env).claims, differences(runs), superiorities(runs))
+    found = check_claims(read_paper().claims_about(env).claims, differences(runs), compare(runs))
     return {str(finding.claim): finding.verdict for finding in found}
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from typing import Any
 
 import numpy as np
@@ -99,6 +100,7 @@ def _draw_failures(ax: Axes, table: xr.Dataset) -> list[Artist]:
 
 RACE_PITCH, RACE_SHAPE = 4.9, 0.95  # room of a panel on a screen [inch]; its height, against its width
 DECADE = 10.0  # an axis is logarithmic where targets are, and span at least this factor
+LEAD_WIDTH = 52  # characters of a line that says who leads
 MARK_SPACING = 0.3  # between two markers of a line, as a share of the panel's diagonal
 
 
@@ -109,8 +111,8 @@ def race_figure(dataset: xr.Dataset, *, width: float | None = None) -> page.Pict
     (method, step), and `hit`, shape (method, pair), the episodes after which each pair of seed and target was reached,
     NaN where never. `unsuccessful`, shape (method,), counts the seeds without a successful episode; their methods have
     no mean. Attributes: `title`, `budget`, `seeds`, `loss_unit`, `spacing` (log or linear), `targets` (count, hardest,
-    easiest), `identity`, `provenance`. A linear loss axis ends as far above the easiest target as the hardest is below
-    it, so that a few bad first losses do not flatten the rest.
+    easiest), `lead` (who is first, in words), `identity`, `provenance`. A linear loss axis ends as far above the
+    easiest target as the hardest is below it, so that a few bad first losses do not flatten the rest.
     """
     sheet = style.Sheet.of(width, pitch=RACE_PITCH, columns=2)
     picture = page.Picture(sheet, 2 / sheet.columns * sheet.pitch)
@@ -169,6 +171,7 @@ def _frame_losses(ax: Axes, dataset: xr.Dataset) -> None:
     elif count > 1:
         ax.set_ylim(top=min(ax.get_ylim()[1], 2 * easiest - hardest))
     look: dict[str, Any] = {"size": page.sheet_of(ax).small, "color": style.QUIET, "ha": "right", "va": "top"}
+    said = "\n".join([said, *textwrap.wrap(dataset.attrs["lead"], LEAD_WIDTH)])
     ax.text(0.98, 0.98, said, transform=ax.transAxes, **look)
 
 
@@ -194,7 +197,8 @@ def league_figure(dataset: xr.Dataset, *, width: float | None = None) -> page.Pi
     """Draw a league: the mean rank of each method in each scene, with its interval, and over all scenes last.
 
     `dataset` holds `rank`, `rank_low` and `rank_high`, shape (scene, method), NaN where a method did not run or there
-    is no interval; the last scene stands for all. Attributes: `title`, `seeds` and `command`, as text. Columns stand
+    is no interval; `first` says where a method is ahead of every other after the correction for all pairs, which is
+    written in bold. The last scene stands for all. Attributes: `title`, `seeds` and `command`, as text. Columns stand
     in the order of the methods. In a picture for print that is too narrow for them, intervals are left out, which the
     legend says.
     """
@@ -233,7 +237,8 @@ def _write_cells(ax: Axes, dataset: xr.Dataset, most: float, *, told: bool) -> N
         look: dict[str, Any] = {"ha": "center", "color": ink, "parse_math": False}
         within = told and np.isfinite(low)
         form, size = (".2f", sheet.tick) if told else (".2g", sheet.small)
-        ax.text(column, row - 0.16 * within, style.number(rank, form), va="center", size=size, **look)
+        weight = "bold" if dataset["first"].to_numpy()[row, column] else "normal"
+        ax.text(column, row - 0.16 * within, style.number(rank, form), va="center", size=size, weight=weight, **look)
         if within:
             said = f"{style.number(low, '.1f')} to {style.number(high, '.1f')}"
             ax.text(column, row + 0.24, said, va="center", size=sheet.small, **look)
@@ -262,7 +267,10 @@ def _legend(dataset: xr.Dataset, *, told: bool) -> list[Patch]:
         if told
         else "intervals are in league.json"
     )
-    known = [Patch(**blank, label=f"mean rank over {_seeds(dataset)}; {below}")]
+    known = [
+        Patch(**blank, label=f"mean rank over {_seeds(dataset)}; {below}"),
+        Patch(**blank, label="bold: first, ahead of every other method by the rank test, corrected for all pairs"),
+    ]
     if not np.isfinite(dataset["rank"]).all():
         known.append(Patch(**style.NOT_RUN, label="did not run here"))
     return [*known, Patch(**blank, label=dataset.attrs["command"])]

@@ -2,13 +2,15 @@
 
 import json
 import math
+from collections import Counter
+from collections.abc import Callable
 
 import numpy as np
 import pytest
 import torch
 
 from gradscape.landscapes.convert import from_json, to_json
-from gradscape.landscapes.measures.lyapunov import GradientGrowth, measure_growth
+from gradscape.landscapes.measures.lyapunov import GradientGrowth, Shape, measure_growth
 
 TIME = np.array([0.4, 0.8, 1.2, 1.6, 2.0])
 
@@ -51,9 +53,60 @@ def test_a_flight_grows_by_a_power_of_time_and_does_not_diverge(power: float) ->
 
 def test_what_stays_or_shrinks_does_not_diverge() -> None:
     rng = np.random.default_rng(1)
-    level = measure_growth(TIME, np.exp(rng.standard_normal((5, 16))))
-    assert not level.is_exponential
-    assert not measure_growth(TIME, np.exp(-2 * TIME)[:, None] * np.ones(16)).is_exponential
+    level = measure_growth(TIME, np.exp(0.3 * rng.standard_normal((5, 16))))
+    shrinking = measure_growth(TIME, np.exp(-2 * TIME)[:, None] * np.ones(16))
+    assert (level.shape, shrinking.shape) == (Shape.BOUNDED, Shape.BOUNDED)
+    assert level.describe().startswith("gradients stay bounded")
+
+
+def shapes(draw: Callable[[np.random.Generator], np.ndarray], count: int = 300) -> Counter[Shape]:
+    """Count what is said of so many curves, shape (horizon,), with 16 points that share it and are a third apart."""
+    rng = np.random.default_rng(2)
+    apart = (np.exp(0.3 * rng.standard_normal((5, 16))) for _ in range(count))
+    return Counter(measure_growth(TIME, draw(rng)[:, None] * one).shape for one in apart)
+
+
+def test_a_linear_oscillation_is_not_called_exponential_however_many_points_swing_together() -> None:
+    """Its gradient is |cos(w t + phase)| at every point: each has the same rising stretch, and none diverges."""
+
+    def swing(rng: np.random.Generator) -> np.ndarray:
+        return np.abs(np.cos(rng.uniform(1.5, 20) * TIME + rng.uniform(0, 2 * np.pi))) + 1e-6
+
+    def stiffness(rng: np.random.Generator) -> np.ndarray:  # cos(w t) by w
+        return np.abs(TIME * np.sin(rng.uniform(1.5, 20) * TIME)) + 1e-6
+
+    for draw in (swing, stiffness):
+        found = shapes(draw)
+        assert found[Shape.EXPONENTIAL] <= 0.05 * 300
+        assert found[Shape.UNDECIDED] + found[Shape.BOUNDED] > 150
+    whole = np.abs(np.cos(np.array([1.47, 1.3, 1.1, 0.9, 0.6])))[:, None] * np.ones(16)  # a quarter of a swing, rising
+    assert not measure_growth(TIME, whole).is_exponential
+
+
+def test_growth_that_ends_is_bounded() -> None:
+    found = measure_growth(TIME, (1 - np.exp(-TIME / 0.4))[:, None] * np.linspace(1, 2, 16))
+    assert found.shape is Shape.BOUNDED
+    noisy = shapes(lambda rng: (1 - np.exp(-TIME / 0.3)) * np.exp(0.05 * rng.standard_normal(5)))
+    assert noisy[Shape.EXPONENTIAL] <= 0.05 * 300
+
+
+@pytest.mark.parametrize("noise", [0.05, 0.2, 1.0])
+def test_shapes_are_told_as_far_as_noise_that_all_points_share_lets_them(noise: float) -> None:
+    """The wrong one of exponential and power is rare at any noise, and 'cannot tell' takes over as it rises."""
+    exponential = shapes(lambda rng: np.exp(3 * TIME + noise * rng.standard_normal(5)))
+    power = shapes(lambda rng: TIME**2 * np.exp(noise * rng.standard_normal(5)))
+    assert exponential[Shape.POWER] + power[Shape.EXPONENTIAL] <= 0.1 * 600
+    if noise == 0.05:
+        assert min(exponential[Shape.EXPONENTIAL], power[Shape.POWER]) > 280
+    if noise == 1.0:
+        assert min(exponential[Shape.UNDECIDED], power[Shape.UNDECIDED]) > 120
+
+
+def test_it_says_that_it_cannot_tell() -> None:
+    found = measure_growth(TIME, np.array([1.0, 6.0, 2.0, 9.0, 5.0])[:, None] * np.linspace(1, 2, 16))
+    assert found.shape is Shape.UNDECIDED
+    assert found.rate.low < 0 < found.rate.high  # sixteen points are not sixteen measurements
+    assert found.describe().startswith("cannot tell how gradients grow: as an exponential by ")
 
 
 def test_points_without_a_gradient_are_left_out_and_too_few_say_nothing() -> None:

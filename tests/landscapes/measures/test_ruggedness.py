@@ -1,7 +1,9 @@
 """Measures of losses on functions whose answers are known."""
 
+import itertools
 import math
 import tracemalloc
+from collections import Counter
 
 import numpy as np
 import pytest
@@ -68,18 +70,45 @@ def test_the_exponent_of_weierstrass_function_is_its_own(a: float, b: float, sca
     assert ruggedness.holder_exponent(plane, 0, 0.0) == pytest.approx(wanted, abs=0.1)
 
 
-def test_the_exponent_of_what_is_smooth_is_one_of_a_jump_a_half_and_of_noise_none() -> None:
+def test_the_exponent_of_what_is_smooth_is_one_and_of_a_jump_a_half() -> None:
     u = np.linspace(-1, 1, 513)
     assert ruggedness.holder_exponent(3 * u, 0, 0.0) == pytest.approx(1.0)
     assert ruggedness.holder_exponent(u**2, 0, 0.0) == pytest.approx(1.0, abs=0.1)
     assert ruggedness.holder_exponent((u > 0.1).astype(float), 0, 0.0) == pytest.approx(0.5, abs=0.03)
-    noise = np.random.default_rng(0).standard_normal(513)
-    assert ruggedness.holder_exponent(noise, 0, 0.0) == pytest.approx(0.0, abs=0.05)
+
+
+@pytest.mark.parametrize("exponent", [0.3, 0.5, 0.8])
+def test_the_exponent_of_an_exact_fractional_surface_is_its_own(exponent: float) -> None:
+    """Isotropic fractional Brownian motion, by its covariance (|x|^2H + |y|^2H - |x - y|^2H) / 2."""
+    points = np.stack(np.meshgrid(*[np.arange(1, 41)] * 2, indexing="ij"), axis=-1).reshape(-1, 2) / 40
+    apart = np.linalg.norm(points[:, None] - points, axis=-1) ** (2 * exponent)
+    size = np.linalg.norm(points, axis=1) ** (2 * exponent)
+    root = np.linalg.cholesky((size[:, None] + size - apart) / 2 + 1e-12 * np.eye(1600))
+    rng = np.random.default_rng(0)
+    found = [
+        ruggedness.holder_exponent((root @ rng.standard_normal(1600)).reshape(40, 40), axis, 0.0)
+        for axis in (0, 1) * 10
+    ]
+    assert np.nanmean(found) == pytest.approx(exponent, abs=0.06)
+    assert np.nanstd(found) < 0.1
+    assert np.isfinite(found).mean() > 0.6  # the roughest have correlations that end within three samples
+
+
+def test_beyond_the_correlation_length_differences_grow_no_more_and_say_nothing() -> None:
+    """Rastrigin's function and a sine are smooth: it is 1 where samples resolve them, and unknown where they do not."""
+    for points, known in ((24, False), (48, False), (192, True), (384, True)):
+        u = rastrigin(np.linspace(-5.12, 5.12, points))
+        waves = np.sin(50 * np.linspace(0, 1, points))
+        for loss in (u[:, None] + u, waves):
+            found = ruggedness.holder_exponent(loss, 0, 0.0)
+            assert found == pytest.approx(1.0, abs=0.06) if known else math.isnan(found)
+    noise = np.random.default_rng(0).standard_normal((64, 64))
+    assert math.isnan(ruggedness.holder_exponent(noise, 0, 0.0))
 
 
 def test_no_exponent_comes_from_too_few_distances_failures_or_noise() -> None:
     u = np.linspace(-1, 1, 513)
-    assert math.isnan(ruggedness.holder_exponent(u[:16], 0, 0.0))  # 1 and 2 steps
+    assert math.isnan(ruggedness.holder_exponent(u[:12], 0, 0.0))  # 1 and 2 steps
     assert math.isnan(ruggedness.holder_exponent(np.zeros(99), 0, 0.0))
     assert math.isnan(ruggedness.holder_exponent(np.full(99, np.nan), 0, 0.0))
     torn = u.copy()
@@ -128,12 +157,52 @@ def test_turns_are_seen_however_finely_a_line_is_sampled() -> None:
         assert ruggedness.turns(waves) == pytest.approx(6 / (points - 1))
 
 
-def test_information_content_of_a_zigzag_and_of_a_ramp() -> None:
-    zigzag = np.array([0.0, 1.0] * 30)  # up-down and down-up, half each
-    most, settled = ruggedness.information_content(zigzag)
-    assert most == pytest.approx(math.log(2) / math.log(6), abs=1e-3)
-    assert 59 <= 10**settled < 59 * 10**0.1  # steps of one range over 1/59 of the box
-    assert ruggedness.information_content(np.linspace(0, 1, 60))[0] == pytest.approx(0)
+def published_information(points: np.ndarray, losses: np.ndarray) -> float:
+    """Return h_max as Munoz et al. 2015 write it, by loops over a walk from the first point to the nearest left."""
+    left, at, walk = set(range(1, len(points))), 0, [0]
+    while left:
+        at = min(left, key=lambda one: (float(((points[one] - points[at]) ** 2).sum()), one))
+        left.remove(at)
+        walk.append(at)
+    pairs = list(itertools.pairwise(walk))
+    slopes = [(losses[b] - losses[a]) / float(np.linalg.norm(points[b] - points[a])) for a, b in pairs]
+    most = 0.0
+    for size in [0.0, *np.logspace(-5, 15, 1000)]:
+        symbols = [0 if abs(slope) <= size else math.copysign(1, slope) for slope in slopes]
+        counts = Counter(itertools.pairwise(symbols))
+        shares = [count / (len(symbols) - 1) for (a, b), count in counts.items() if a != b]
+        most = max(most, -sum(share * math.log(share, 6) for share in shares))
+    return most
+
+
+def branin(u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    x, y = 15 * u - 5, 15 * v
+    bent = y - 5.1 * x**2 / (4 * np.pi**2) + 5 * x / np.pi - 6
+    return bent**2 + 10 * (1 - 1 / (8 * np.pi)) * np.cos(x) + 10
+
+
+def test_information_content_is_the_published_one_however_fine_the_slice_is() -> None:
+    u, v = grid(17, 0, 1)  # so that distances are exact, and equal where they are
+    loss = branin(u, v)
+    sample = np.random.default_rng(0).permutation(289)
+    points = np.argwhere(np.isfinite(loss))[sample] / 16
+    wanted = published_information(points, loss.ravel()[sample])
+    assert ruggedness.information_content(loss)[0] == pytest.approx(wanted, rel=1e-12)
+    free = np.random.default_rng(1).uniform(size=(8, 400, 2))
+    drawn = [published_information(points, branin(*points.T)) for points in free]
+    assert np.mean(drawn) == pytest.approx(0.68, abs=0.03)  # not of a slice at all
+    for size in (12, 24, 48, 96, 192):
+        assert ruggedness.information_content(branin(*grid(size, 0, 1)))[0] == pytest.approx(np.mean(drawn), abs=0.1)
+
+
+def test_information_content_of_a_line_of_noise_of_a_ramp_and_of_what_is_level() -> None:
+    """Of independent values two of three slopes turn, and a ramp turns where the walk has reached its first end."""
+    line = np.random.default_rng(0).standard_normal(400)
+    assert ruggedness.information_content(line)[0] > 0.75
+    assert ruggedness.information_content(np.linspace(0, 1, 400))[0] < 0.03
+    assert np.isnan(ruggedness.information_content(np.ones(60))).all()
+    assert np.isnan(ruggedness.information_content(np.full(60, np.nan))).all()
+    assert ruggedness.information_content(line)[1] > ruggedness.information_content(np.linspace(0, 1, 400))[1]
 
 
 def test_dispersion_tells_one_valley_from_two() -> None:
@@ -192,26 +261,6 @@ def test_a_mean_distance_without_pairs_is_that_of_all_pairs(
         with monkeypatch.context() as patch:
             patch.setattr(ruggedness, "PAIRED", 0)
             assert ruggedness.mean_distance(places, shape) == pytest.approx(by_pairs, rel=1e-13)
-
-
-def entropy(walks: list[np.ndarray], size: float) -> float:
-    """Munoz et al. 2015, eqs. 6 and 7, for one size."""
-    counts = np.zeros(9)
-    for walk in walks:
-        symbol = np.where(np.abs(walk) <= size, 0.0, np.sign(walk))
-        both = np.isfinite(walk[:, :-1]) & np.isfinite(walk[:, 1:])
-        counts += np.bincount((3 * (symbol[:, :-1] + 1) + symbol[:, 1:] + 1)[both].astype(int), minlength=9)
-    shares = counts.reshape(3, 3)[~np.eye(3, dtype=bool)] / counts.sum()
-    return float(-(shares[shares > 0] * np.log(shares[shares > 0])).sum() / math.log(6))
-
-
-def test_the_entropies_of_all_sizes_in_one_pass_are_those_of_each_to_the_bit() -> None:
-    random = np.random.default_rng(0)
-    walks = [random.normal(size=(5, 30)), np.round(random.normal(size=(30, 4)), 1)]
-    walks[0][1, 7] = np.nan
-    sizes = np.array([0.0, 0.1, 0.2, 0.7, 1.5, 9.0])
-    found = [ruggedness._entropy(counts) for counts in ruggedness._pair_counts(walks, sizes)]
-    assert found == [entropy(walks, size) for size in sizes]
 
 
 def test_a_slice_of_many_samples_is_measured_in_the_memory_that_is_foretold() -> None:

@@ -50,7 +50,7 @@ def league() -> xr.Dataset:
     rank[0, -1] = np.nan
     parts = {"rank": rank, "rank_low": rank - 0.5, "rank_high": rank + 0.5}
     return xr.Dataset(
-        {name: (("scene", "method"), value) for name, value in parts.items()},
+        {name: (("scene", "method"), value) for name, value in (parts | {"first": rank == 1.0}).items()},
         {"scene": scenes, "method": list(racers)},
         {"title": "League of all methods · 1000 episodes · 10 seeds", "seeds": "10", "command": COMMAND},
     )

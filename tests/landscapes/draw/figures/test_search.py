@@ -99,6 +99,7 @@ def race(methods=("cma-es", "bo-leap"), **attributes) -> xr.Dataset:
             "loss_unit": "m",
             "spacing": "log",
             "targets": (2, 1.0, 100.0),
+            "lead": "none is first: bo-leap, of the best mean rank, is not distinguishable from cma-es",
             "identity": json.dumps({"gradscape": "0.1.0", "device": "cpu"}),
             "provenance": json.dumps({"created": "2026-11-21", "command": "landscape race fluid"}),
         }
@@ -143,8 +144,10 @@ def test_the_figure_says_what_was_raced_and_how_much_of_it_is_sure():
     figure = race_figure(race())
     assert figure.get_suptitle() == "fluid · draft · 20 episodes · 2 seeds"
     assert "cpu · 2026-11-21 · landscape race fluid" in figure.axes[0].get_title()
-    assert figure.axes[0].texts[0].get_text() == "mean of 2 seeds and 95 % bootstrap interval"
-    assert race_figure(race(seeds=1)).axes[0].texts[0].get_text() == "one seed: no interval"
+    sure, *leads = figure.axes[0].texts[0].get_text().split("\n")
+    assert sure == "mean of 2 seeds and 95 % bootstrap interval"
+    assert " ".join(leads) == "none is first: bo-leap, of the best mean rank, is not distinguishable from cma-es"
+    assert race_figure(race(seeds=1)).axes[0].texts[0].get_text().startswith("one seed: no interval\n")
 
 
 def test_a_method_without_a_mean_says_so_and_keeps_its_share_of_targets():
@@ -164,7 +167,7 @@ def test_a_race_without_any_success_is_drawn_as_that():
     for name in ("mean", "low", "high", "hit"):
         dataset[name][:] = NAN
     losses, shares = race_figure(dataset).axes
-    assert losses.texts[0].get_text() == "no method succeeded with every seed: no mean"
+    assert losses.texts[0].get_text().startswith("no method succeeded with every seed: no mean\n")
     assert "no targets" in shares.get_title()
     assert all((line.get_ydata() == 0).all() for line in shares.lines)
 
@@ -195,7 +198,7 @@ RANK = np.array([[1.0, 2.25, 3.0, 3.75], [1.5, np.nan, 1.5, 3.0], [1.25, 2.25, 2
 
 
 def ranked() -> xr.Dataset:
-    parts = {"rank": RANK, "rank_low": RANK - 0.2, "rank_high": RANK + 0.3}
+    parts = {"rank": RANK, "rank_low": RANK - 0.2, "rank_high": RANK + 0.3, "first": RANK == 1.0}
     return xr.Dataset(
         {name: (("scene", "method"), values) for name, values in parts.items()},
         {"scene": ["fluid", "swing-stiffness", "all scenes"], "method": METHODS},
@@ -217,6 +220,9 @@ def test_each_cell_has_its_rank_and_a_method_that_did_not_run_a_hatch(width: flo
     assert hatched == [(0.5, 0.5)]
     assert len(said) == np.isfinite(RANK).sum()
     first = [one.get_text() for one in ax.texts if round(one.get_position()[1]) == 0]
+    bold = {one.get_text() for one in ax.texts if one.get_weight() == "bold"}
+    assert len(bold) == 1
+    assert float(bold.pop()) == 1.0
     assert {"1.00", "2.25", "3.75"} <= set(first) or {"1", "2.2", "3.8"} <= set(first)
     assert [one.get_text() for one in ax.get_yticklabels()] == ["fluid", "swing-stiffness", "all scenes"]
 
