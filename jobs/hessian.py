@@ -164,9 +164,7 @@ class HessianJob(CheckpointedJob[Hessian]):
 
     def _announce(self, watch: Watch) -> None:
         env, (work,) = self.env, self.work()
-        watch.note(
-            f"{env.name} \N{MIDDLE DOT} {env.fidelity.name} \N{MIDDLE DOT} {env.device} \N{MIDDLE DOT} {self.folder}"
-        )
+        watch.note(f"{env.name} · {env.fidelity.name} · {env.device} · {self.folder}")
         with watch.busy(f"{env.name}: {PREPARING}"):
             each = simulation_seconds(env, work.losses, work.gradients, env.preferred_batch)
         dim, seconds = env.space.dim, each + PICTURE_SECONDS

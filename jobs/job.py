@@ -23,7 +23,6 @@ from .folder import Results
 from .watch import PREPARING, Watch, Work, resumable
 
 if TYPE_CHECKING:
-    from ..envs.base import Environment
     from ..optim.runs.store import RunStore
 
 Found = TypeVar("Found")

@@ -103,7 +103,7 @@ class Curvature:
         enough parameters for differences of losses.
         """
         found = self._part("centre", self._centre)
-        self.episodes += 1
+        self.count(1)
         if not np.isfinite(found["loss"]) or not np.isfinite(found["grad"]).all():
             raise FailedPointsError(f"{self.objective.name} has no finite loss and gradient at this point: {self._bad}")
         return found
@@ -141,10 +141,14 @@ class Curvature:
         for number, start in enumerate(range(0, len(directions), size)):
             rows = directions[start : start + size]
             parts.append(self._part(f"{name}-{number}", lambda rows=rows: self._differences(rows, steps, grad)))  # type: ignore[misc]
-            self.episodes += 2 * len(steps) * len(rows)
-            self.follow(self.episodes)
+            self.count(2 * len(steps) * len(rows))
         product, curvature = (np.concatenate([part[key] for part in parts], axis=1) for key in ("product", "curvature"))
         return Differences(product, curvature)
+
+    def count(self, episodes: int) -> None:
+        """Count episodes, and tell whoever follows."""
+        self.episodes += episodes
+        self.follow(self.episodes)
 
     def refuse_failed(self, values: Array) -> Array:
         """Return values that are all finite. Raises FailedPointsError where some are not."""
@@ -435,9 +439,9 @@ def _extremes(curvature: Curvature, step: float, known: _Krylov, count: int, noi
 def _examine(
     curvature: Curvature, step: float, vectors: Array, values: Array | None = None
 ) -> tuple[Array, Array, Array, Array]:
-    """Return |Hv - value v|, the change of Hv to a quarter of the step, curvatures by losses, and values: by default v'Hv.
+    """Return |Hv - value v|, how much Hv changes to a quarter of the step, curvatures by losses, and the values.
 
-    Without gradients the first two are those of v'Hv alone.
+    The values are v'Hv where none are given. Without gradients the first two are those of v'Hv alone.
     """
     found = curvature.differences(vectors, (step, step / QUARTER), f"pairs-{step:g}")
     curvature.refuse_failed(found.known)
@@ -461,7 +465,7 @@ def _loss_error(curvature: Curvature, step: float) -> float:
         x = torch.from_numpy(curvature.lower + curvature.z * curvature.width)[None]
         return {"deviation": np.array(noise(curvature.objective, x, rounding=rounding, repeats=REPEATS).deviation)}
 
-    curvature.episodes += NOISE
+    curvature.count(NOISE)
     deviation = float(np.nan_to_num(curvature.keep("noise", measure)["deviation"]))
     deviation = max(deviation, rounding * abs(float(curvature.centre["loss"])))
     return DEVIATIONS * np.sqrt(6) * deviation / step**2

@@ -141,9 +141,9 @@ class Hessian:
         said = []
         if not self.symmetric:
             said.append(
-                f"the matrix is not symmetric: its antisymmetric part is {self.asymmetry:.2g} of the symmetric one, and "
-                f"differences explain {self.asymmetry_explained:.1g}, so these gradients are of no loss; `landscape "
-                f"check {self.env}` says where"
+                f"the matrix is not symmetric: its antisymmetric part is {self.asymmetry:.2g} of the symmetric one, "
+                f"and differences explain {self.asymmetry_explained:.1g}; so these gradients are of no loss, or they "
+                f"jump: `landscape check {self.env}` says where"
             )
         if wrong := [pair for pair in self.pairs if pair.disputed]:
             first = "; ".join(f"{one.value:.3g}, and {one.by_losses:.3g} by losses" for one in wrong[:NAMED])
