@@ -33,8 +33,6 @@ def show(found: Hessian, console: Console) -> None:
     console.print(f"asymmetry: {found.asymmetry:.1g}, of which differences explain {found.asymmetry_explained:.1g}")
     for warning in found.warnings:
         console.print(f"warning: {warning}")
-    if found.dim > 1 and any(pair.sign != "cannot tell" for pair in found.pairs):
-        console.print(f"landscape slice {found.env} --along hessian --through {found.through}")
 
 
 def _number(value: float) -> str:

@@ -88,7 +88,7 @@ class HessianJob(CheckpointedJob[Hessian]):
         require("probes", probes, lambda count: Need(8.0 * COPIES * dim * (LANCZOS + 2) * count))
         identity = {**env.identity(), "point": x.tolist(), "eigenpairs": pairs, "probes": probes, "seed": seed}
         folder = out or folder_named(["hessian", env.name, env.fidelity.name], identity, root)
-        checkpoint = Checkpoint.open(folder, identity, what="hessian", force=force)
+        checkpoint = Checkpoint.open(folder, identity, what="Hessian", force=force)
         said = through if isinstance(through, str) else "a point"
         return cls(
             env=env, x=x, through=said, pairs=pairs, probes=probes, seed=seed, identity=identity, folder=folder,

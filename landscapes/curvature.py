@@ -13,7 +13,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from .objective import Evaluation, Objective, Status
+from .objective import Evaluation, Objective, Status, in_box
 from .sampling.memory import MemoryBound
 from .statistics import Estimate, mean
 from .verification import LAST_PLACE
@@ -24,7 +24,8 @@ Keep = Callable[[str, Callable[[], Arrays]], Arrays]  # keep(name, compute): wha
 
 QUARTER = 4.0  # the ratio of neighbouring steps: a power of two, so that steps are exact
 STEPS = tuple(QUARTER**-k for k in range(2, 11))  # of the box, 0.06 to 1e-6
-SAFETY = QUARTER**2 / (QUARTER**2 - 1)  # an error that goes with the step squared, by its change to a quarter of it
+SAFETY = 2.0  # an error by its change to a quarter of the step: 16/15 where it goes with the step squared, and a margin
+SURPRISE, SMALL = 10.0, 1e-6  # changes, by those along the tried directions and by the largest eigenvalue: look again
 EDGE = QUARTER**-5  # the least distance from the bounds: a point that is nearer is moved inwards
 FINE = 64  # roundings of a parameter that are the least step
 TRIED = {"gradients": 2, "losses": 4}  # directions along which steps are tried
@@ -34,7 +35,7 @@ RESTARTS, VECTORS, LEAST_TOLERANCE = 12, 40, 1e-6  # of ARPACK: at most, kept at
 REPEATS, NOISE = 8, 18  # that tell the noise of the loss at the point, and the episodes which that takes
 DEVIATIONS = 5.0  # of that noise, by which losses may seem to curve otherwise
 ROUNDING = float(np.finfo(np.float64).eps)
-SAID = 3  # points that an error names
+SAID = 3  # points that an error names, and parameters of each
 
 
 class FailedPointsError(ValueError):
@@ -76,6 +77,7 @@ class Curvature:
 
     Differences are of gradients, or of losses where the objective has none. A point within `EDGE` of a bound is moved
     inwards, by `moved` at most, unless the objective allows points beyond. `keep` stores what is computed by name.
+    Raises ValueError for a point beyond the bounds.
     """
 
     def __init__(self, objective: Objective, x: Float[Tensor, " dim"], *, keep: Keep | None = None) -> None:
@@ -83,6 +85,8 @@ class Curvature:
         self.objective, self.names = MemoryBound(objective), space.names
         self.lower, self.width = space.lower.numpy(), (space.upper - space.lower).numpy()
         given = (x.numpy() - self.lower) / self.width
+        if not objective.beyond_box and not bool(in_box(space, x[None]).all()):
+            raise ValueError(f"{objective.name} has no Hessian at a point beyond its bounds; got {x.tolist()}")
         self.z = given if objective.beyond_box else np.clip(given, EDGE, 1 - EDGE)
         self.moved = float(np.abs(self.z - given).max())
         self.keep: Keep = keep or (lambda name, compute: compute())
@@ -216,8 +220,9 @@ class Curvature:
     def _describe_failed(self, found: Evaluation, offsets: Array) -> list[str]:
         said = []
         for row in torch.nonzero(found.status != Status.OK).ravel().tolist():
-            far = int(np.abs(offsets[row]).argmax())
-            where = f"{offsets[row, far]:+.2g} of the box along {self.names[far]}" if offsets[row, far] else "there"
+            largest = np.argsort(-np.abs(offsets[row]), kind="stable")[:SAID]
+            moved = ", ".join(f"{self.names[at]} {offsets[row, at]:+.2g}" for at in largest if offsets[row, at])
+            where = f"at {moved} of the box from there" if moved else "there"
             why = f" ({found.error})" if found.error and found.status[row] == Status.ERROR else ""
             said.append(f"{Status(int(found.status[row])).name} {where}{why}")
         return said
@@ -277,20 +282,30 @@ class Spectrum:
 def measure_spectrum(curvature: Curvature, *, pairs: int, probes: int, seed: int = 0) -> Spectrum:
     """Return the Hessian's spectrum, with that step of the ladder at which differences change least.
 
-    Where points fail at this step, the next best is taken. Raises FailedPointsError where points fail at all of them,
+    Where points fail at this step, or differences change far more than along the directions that were tried, as at a
+    kink that these miss, the next best step is tried, too. Raises FailedPointsError where points fail at all of them,
     ValueError where the objective has no gradients and too many parameters.
     """
     ladder = tuple(curvature.ladder(seed=seed))
-    left = sorted(ladder, key=lambda one: one.change)
-    while True:
-        step = left.pop(0).step
+    best: Spectrum | None = None
+    for number, tried in enumerate(sorted(ladder, key=lambda one: one.change)):
         try:
             if curvature.whole:
-                return _whole_spectrum(curvature, step, ladder, pairs)
-            return _partial_spectrum(curvature, step, ladder, pairs, probes, seed)
+                found = _whole_spectrum(curvature, tried.step, ladder, pairs)
+            else:
+                found = _partial_spectrum(curvature, tried.step, ladder, pairs, probes, seed)
         except FailedPointsError:
-            if not left:
+            if best is None and number + 1 == len(ladder):
                 raise
+            continue
+        if best is None or found.error.max() < best.error.max():
+            best = found
+        change, expected = found.difference.max(), SURPRISE * curvature.dim * tried.change
+        if change <= max(expected, SMALL * np.abs(found.values).max()):
+            break
+    if best is None:
+        raise FailedPointsError(f"{curvature.objective.name} failed near this point at every step")
+    return best
 
 
 def _whole_spectrum(curvature: Curvature, step: float, ladder: tuple[StepChange, ...], pairs: int) -> Spectrum:
@@ -301,11 +316,11 @@ def _whole_spectrum(curvature: Curvature, step: float, ladder: tuple[StepChange,
     values, columns = np.linalg.eigh(symmetric)
     values, vectors = values[::-1], _oriented(columns.T[::-1])
     residual, difference = (np.linalg.norm(vectors @ one.T, axis=1) for one in (skew, change))
-    ends = _ends(len(values), pairs)
-    seen = _examine(curvature, step, vectors[ends], values[ends])
-    residual[ends], difference[ends] = np.maximum(residual[ends], seen[0]), np.maximum(difference[ends], seen[1])
+    shown = ends(len(values), pairs)
+    seen = _examine(curvature, step, vectors[shown], values[shown])
+    residual[shown], difference[shown] = np.maximum(residual[shown], seen[0]), np.maximum(difference[shown], seen[1])
     by_losses = np.full(len(values), np.nan)
-    by_losses[ends] = seen[2]
+    by_losses[shown] = seen[2]
     off = SAFETY * max(abs(float(np.trace(change))), float(np.linalg.norm(np.diag(change))))
     off += ROUNDING * float(np.abs(values).sum())
     trace = float(np.trace(raw))
@@ -340,7 +355,7 @@ def _partial_spectrum(
     """Return the ends of the spectrum by ARPACK, and the whole by Lanczos' method from random probes."""
     dim, signs = curvature.dim, np.random.default_rng(seed).choice([-1.0, 1.0], (probes, curvature.dim))
     starts = signs / np.sqrt(dim)
-    both = curvature.differences(starts, (step, step / QUARTER), f"probes-{step:g}").product
+    both = curvature.differences(starts, (step, step / QUARTER), f"starts-{step:g}").product
     first, change = curvature.refuse_failed(both[0]), curvature.refuse_failed(both[0] - both[1])
     found = _lanczos(curvature, step, starts, first)
     noise = float(np.linalg.norm(change, axis=1).max())
@@ -374,8 +389,8 @@ class _Krylov:
 
     def vectors(self, count: int) -> Array:
         """Return the Ritz vectors at both ends that the first start has, shape (2 count, dim)."""
-        ends = _ends(self.nodes.shape[1], count)
-        return _unit(self.ritz[0][:, ends].T @ self.basis[:, 0])
+        shown = ends(self.nodes.shape[1], count)
+        return _unit(self.ritz[0][:, shown].T @ self.basis[:, 0])
 
 
 def _lanczos(curvature: Curvature, step: float, starts: Array, first: Array) -> _Krylov:
@@ -471,7 +486,7 @@ def _loss_error(curvature: Curvature, step: float) -> float:
     return DEVIATIONS * np.sqrt(6) * deviation / step**2
 
 
-def _ends(size: int, count: int) -> NDArray[np.int64]:
+def ends(size: int, count: int) -> NDArray[np.int64]:
     """Return the places of `count` at the beginning and as many at the end, all where they meet."""
     return np.arange(size) if size <= 2 * count else np.r_[:count, size - count : size]
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 import numpy as np
 
 from ..convert import NOT_JSON
-from ..curvature import Array, Curvature, Spectrum, StepChange
+from ..curvature import Array, Curvature, Spectrum, StepChange, ends
 from ..statistics import Estimate, mean
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from ..draw.figure import Picture
 
 Sign = Literal["positive", "negative", "cannot tell"]
-SIGNS: tuple[Sign, ...] = ("positive", "negative", "cannot tell")
+Kind = Literal["convex", "concave", "saddle", "convexity cannot be told"]
 UNTOLD: Sign = "cannot tell"
 BOX_UNITS = "box units: every parameter runs from 0 to 1 between its bounds"
 SYMMETRIC, ROUNDED = 3.0, 1e-9  # asymmetry, by what differences explain and beyond rounding, that no loss has
@@ -115,20 +115,14 @@ class Hessian:
         return BOX_UNITS
 
     @property
-    def kind(self) -> str:
-        """What the point's surroundings are by the signs of all eigenvalues, where these can be told."""
+    def kind(self) -> Kind:
+        """What the landscape is like at the point, by the signs of all eigenvalues."""
         signs = {pair.sign for pair in self.pairs}
         if {"positive", "negative"} <= signs:
             return "saddle"
-        if UNTOLD in signs or not self.definite:
-            return UNTOLD
+        if UNTOLD in signs or not self.pairs:
+            return "convexity cannot be told"
         return "convex" if signs == {"positive"} else "concave"
-
-    @property
-    def definite(self) -> bool:
-        """Whether all eigenvalues surely have one sign."""
-        sign = self.pairs[0].sign if self.pairs else UNTOLD
-        return sign != UNTOLD and all(pair.sign == sign for pair in self.pairs)
 
     @property
     def symmetric(self) -> bool:
@@ -153,7 +147,7 @@ class Hessian:
             )
         if untold := sum(pair.sign == UNTOLD for pair in self.pairs):
             said.append(
-                f"{untold} of {len(self.pairs)} eigenvalues cannot be told from 0: their errors are larger than they "
+                f"{untold} of {len(self.pairs)} eigenvalues cannot be told from 0: their errors are as large as they "
                 "are, as where gradients are noisy or jump within the step"
             )
         if self.moved:
@@ -183,7 +177,6 @@ class Hessian:
 def conclude(curvature: Curvature, found: Spectrum, *, pairs: int, **about: Any) -> Hessian:
     """Return the record of a spectrum; `about` are the fields that say what it is of."""
     whole, dim = curvature.whole, curvature.dim
-    shown = range(len(found.values)) if len(found.values) <= 2 * pairs else [*range(pairs), *range(-pairs, 0)]
     negative, undecided = _signs(found)
     return Hessian(
         **about,
@@ -195,7 +188,7 @@ def conclude(curvature: Curvature, found: Spectrum, *, pairs: int, **about: Any)
         whole=whole,
         step=found.step,
         steps=found.ladder,
-        pairs=tuple(_pair(found, at, dim, curvature.names) for at in shown),
+        pairs=tuple(_pair(found, at, dim, curvature.names) for at in ends(len(found.values), pairs).tolist()),
         trace=found.trace,
         condition=_condition(found, whole),
         negative=negative,
@@ -216,7 +209,7 @@ def _pair(found: Spectrum, at: int, dim: int, names: Sequence[str]) -> Eigenpair
     largest = [part for part in np.argsort(-np.abs(vector), kind="stable")[:PARTS] if abs(vector[part]) >= LEAST_PART]
     known = ("residual", "difference", "by_losses")
     return Eigenpair(
-        place=at + 1 if at >= 0 else dim + at + 1,
+        place=at + 1 if at < len(found.values) / 2 else dim - len(found.values) + at + 1,
         value=float(found.values[at]),
         error=float(found.error[at]),
         disputed=bool(found.disputed[at]),

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from ...measures.hessian import Hessian
 
 PITCH = 7.2  # width on a screen [inch]
-ROW, LEAST_ROWS, MOST_ROWS = 0.045, 5, 24  # height of an eigenvalue's row, by the width; rows that a panel has room for
+ROW, LEAST_ROWS, MOST_ROWS = 0.045, 5, 18  # height of an eigenvalue's row, by the width; rows that a panel has room for
 DENSITY = 0.28  # height of the density's panel, by the width
 BINS = 48  # of the density
 DECADES = 12  # that the axis spans on each side, at most
@@ -63,9 +63,8 @@ def hessian_figure(found: Hessian, *, width: float | None = None) -> page.Pictur
 def _drawn(found: Hessian) -> NDArray[np.int64]:
     """Return the places of the eigenvalues that are known, from 1."""
     known, dim = len(found.values), found.dim
-    return (
-        np.arange(1, dim + 1) if known == dim else np.r_[1 : known // 2 + 1, dim - (known - known // 2) + 1 : dim + 1]
-    )
+    ends = np.r_[1 : known // 2 + 1, dim - (known - known // 2) + 1 : dim + 1]
+    return np.arange(1, dim + 1) if known == dim else ends
 
 
 def _scale(found: Hessian) -> tuple[float, float]:
