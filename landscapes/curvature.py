@@ -396,7 +396,7 @@ class _Krylov:
 def _lanczos(curvature: Curvature, step: float, starts: Array, first: Array) -> _Krylov:
     """Run Lanczos' method from all starts abreast, orthogonalising twice; `first` are the first products.
 
-    Ritz values weigh the squares of the first components of their vectors (Golub & Welsch 1969; Ubaru et al. 2017).
+    Ritz values weigh the squares of the first components of their vectors (Ubaru, Chen & Saad 2017).
     """
     basis, product, count = [starts], first, min(LANCZOS, curvature.dim)
     projected = np.zeros((len(starts), count, count))

@@ -148,7 +148,7 @@ class Hessian:
         if untold := sum(pair.sign == UNTOLD for pair in self.pairs):
             said.append(
                 f"{untold} of {len(self.pairs)} eigenvalues cannot be told from 0: their errors are as large as they "
-                "are, as where gradients are noisy or jump within the step"
+                "are, as where gradients are noisy, jump within the step, or do not change"
             )
         if self.moved:
             said.append(f"the point was moved off the bounds, by {self.moved:.2g} of the box at most")
