@@ -224,7 +224,7 @@ def hessian(
     through: Point = "center",
     *,
     eigenpairs: Count = 5,
-    probes: Count = 8,
+    probes: Annotated[int, at_least(2)] = 8,
     seed: Seed = 0,
     figure_width_mm: FigureWidth = (),
     out: Out = None,

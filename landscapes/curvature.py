@@ -101,7 +101,7 @@ class Curvature:
 
     @cached_property
     def centre(self) -> Arrays:
-        """The `loss` and the gradient `grad` at the point, the latter of shape (0,) where the objective has none.
+        """The `loss` and the gradient `grad` at the point, the latter of shape (0,) where there is none, and `why`.
 
         Raises FailedPointsError where the point itself fails, and ValueError where it has neither gradients nor few
         enough parameters for differences of losses.
@@ -191,18 +191,18 @@ class Curvature:
         return found
 
     def _centre(self) -> Arrays:
-        zero = np.zeros((1, self.dim))
+        zero, why = np.zeros((1, self.dim)), ""
         try:
             found = self._at(zero, grad=True)
         except ValueError as error:  # it has none
-            found = self._at(zero, grad=False)
+            found, why = self._at(zero, grad=False), str(error)
             if self.dim > LOSSES:
                 raise ValueError(
                     f"{self.objective.name} has no gradients ({error}); differences of losses alone are for {LOSSES} "
                     f"parameters at most, and it has {self.dim}: give it gradients (gs.from_torch, gs.from_jax, or "
                     "gs.from_numpy of a function that returns them, too)"
                 ) from None
-        known = {"loss": found["loss"][0], "grad": found["grad"][0], "failed": found["failed"]}
+        known = {"loss": found["loss"][0], "grad": found["grad"][0], "failed": found["failed"], "why": np.array(why)}
         return {**known, "precision": np.array(self.objective.precision)}  # which losses tell, of some
 
     def _differences(self, directions: Array, steps: Sequence[float], grad: bool) -> Arrays:

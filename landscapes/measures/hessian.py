@@ -65,7 +65,7 @@ class Hessian:
 
     `pairs` are its largest and smallest eigenvalues, descending, each with its error [`loss_unit`]; `whole` says
     whether all `dim` were computed. `point` are the parameters' own values; it was `moved` [box] off a bound.
-    Differences are of `source`, gradients or losses, over `step` [box], which was chosen among `steps`.
+    Differences are of `source`, gradients or losses (and `why` these), over `step` [box], chosen among `steps`.
 
     `trace`, `condition` (the largest eigenvalue by the smallest, by magnitude) and `negative` (share of eigenvalues
     that are surely negative) have 95 % intervals or bounds; NaN is not known, and `undecided` the share whose sign
@@ -87,6 +87,7 @@ class Hessian:
     gradient: float
     dim: int
     source: str
+    why: str
     whole: bool
     step: float
     steps: tuple[StepChange, ...]
@@ -132,7 +133,7 @@ class Hessian:
     @property
     def warnings(self) -> tuple[str, ...]:
         """What makes these numbers doubtful, a sentence each."""
-        said = []
+        said = [f"differences are of losses, not of gradients: {self.why}"] if self.why else []
         if not self.symmetric:
             said.append(
                 f"the matrix is not symmetric: its antisymmetric part is {self.asymmetry:.2g} of the symmetric one, "
@@ -185,6 +186,7 @@ def conclude(curvature: Curvature, found: Spectrum, *, pairs: int, **about: Any)
         gradient=float(np.linalg.norm(curvature.centre["grad"])) if curvature.source == "gradients" else math.nan,
         dim=dim,
         source=curvature.source,
+        why=str(curvature.centre["why"]),
         whole=whole,
         step=found.step,
         steps=found.ladder,

@@ -153,6 +153,7 @@ def test_a_function_without_gradients_is_measured_by_losses_and_goes_on(here: Pa
     said = run.json("hessian own.py:bare --through random:1 --out made")
     assert said["source"] == "losses"
     assert said["gradient"] is None
+    assert said["warnings"][0].startswith("differences are of losses, not of gradients: bare returned losses without")
     assert [pair["value"] for pair in said["pairs"]] == pytest.approx([16, 2, -4])
     assert run.json("hessian own.py:bare --through random:1 --out made")["pairs"] == said["pairs"]
 
