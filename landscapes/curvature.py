@@ -64,7 +64,7 @@ class Differences:
     @property
     def by_gradients(self) -> bool:
         """Whether there are gradients."""
-        return self.product.shape[-1] > 0
+        return bool(self.product.shape[-1])
 
     @property
     def known(self) -> Array:
@@ -241,7 +241,7 @@ class Spectrum:
     `values`, shape (pair,), with unit `vectors`, shape (pair, dim): all, or the ends. `residual` |Hv - value v| and
     `difference`, by how much Hv changes with the step, shapes (pair,). `by_losses`, the curvature that losses have
     along a vector, and `loss_error` of that; NaN where it was not measured. `nodes` and `weights` are Ritz values by
-    probe and their shares of the spectrum, shape (probe, step), None of a whole matrix. `ladder` says by how much
+    probe and their shares of the spectrum, shape (probe, step), none of a whole matrix. `ladder` says by how much
     second derivatives change at each step, of which `step` is the one taken.
     """
 
@@ -256,8 +256,8 @@ class Spectrum:
     trace: Estimate
     asymmetry: float
     asymmetry_explained: float
-    nodes: Array | None = None
-    weights: Array | None = None
+    nodes: Array
+    weights: Array
 
     @property
     def disputed(self) -> NDArray[np.bool_]:
@@ -275,7 +275,7 @@ class Spectrum:
 
     @property
     def _own_error(self) -> Array:
-        rounded = ROUNDING * self.vectors.shape[1] * np.abs(self.values).max()
+        rounded = ROUNDING * self.vectors.shape[1] * float(np.abs(self.values).max())
         return self.residual + SAFETY * self.difference + rounded
 
 
@@ -326,9 +326,11 @@ def _whole_spectrum(curvature: Curvature, step: float, ladder: tuple[StepChange,
     trace = float(np.trace(raw))
     size = float(np.linalg.norm(symmetric))
     return Spectrum(
-        step, ladder, values, vectors, residual, difference, by_losses, _loss_error(curvature, step),
-        Estimate(trace, trace - off, trace + off), _ratio(float(np.linalg.norm(skew)), size),
-        _ratio(SAFETY * float(np.linalg.norm(change)), size),
+        step=step, ladder=ladder, values=values, vectors=vectors, residual=residual, difference=difference,
+        by_losses=by_losses, loss_error=_loss_error(curvature, step), trace=Estimate(trace, trace - off, trace + off),
+        asymmetry=_ratio(float(np.linalg.norm(skew)), size),
+        asymmetry_explained=_ratio(SAFETY * float(np.linalg.norm(change)), size),
+        nodes=np.zeros((0, 0)), weights=np.zeros((0, 0)),
     )  # fmt: skip
 
 
@@ -368,10 +370,11 @@ def _partial_spectrum(
     off = SAFETY * dim * float(np.abs((starts * change).sum(axis=1)).max())
     trace = mean(dim * (starts * first).sum(axis=1))  # Hutchinson 1990
     return Spectrum(
-        step, ladder, seen[3][order], _oriented(vectors[order]), seen[0][order], seen[1][order], seen[2][order],
-        _loss_error(curvature, step), Estimate(trace.value, trace.low - off, trace.high + off),
-        _ratio(skewness, size), _ratio(SAFETY * float(np.sqrt(dim * np.square(change).sum(axis=1).mean())), size),
-        found.nodes, found.weights,
+        step=step, ladder=ladder, values=seen[3][order], vectors=_oriented(vectors[order]), residual=seen[0][order],
+        difference=seen[1][order], by_losses=seen[2][order], loss_error=_loss_error(curvature, step),
+        trace=Estimate(trace.value, trace.low - off, trace.high + off), asymmetry=_ratio(skewness, size),
+        asymmetry_explained=_ratio(SAFETY * float(np.sqrt(dim * np.square(change).sum(axis=1).mean())), size),
+        nodes=found.nodes, weights=found.weights,
     )  # fmt: skip
 
 
@@ -442,10 +445,10 @@ def _extremes(curvature: Curvature, step: float, known: _Krylov, count: int, noi
         return shifted
 
     operator = LinearOperator((curvature.dim,) * 2, matvec=product, dtype=np.float64)
-    how = {"k": 2 * count, "which": "BE", "v0": vectors.sum(axis=0), "maxiter": RESTARTS}
-    how |= {"tol": max(LEAST_TOLERANCE, noise / half), "ncv": min(curvature.dim, max(VECTORS, 4 * count + 1))}
+    tolerance, kept = max(LEAST_TOLERANCE, noise / half), min(curvature.dim, max(VECTORS, 4 * count + 1))
+    begin = vectors.sum(axis=0)
     try:
-        _, columns = eigsh(operator, **how)
+        _, columns = eigsh(operator, 2 * count, which="BE", v0=begin, ncv=kept, maxiter=RESTARTS, tol=tolerance)
     except ArpackError:
         return vectors
     return _unit(columns.T)
@@ -483,7 +486,7 @@ def _loss_error(curvature: Curvature, step: float) -> float:
     curvature.count(NOISE)
     deviation = float(np.nan_to_num(curvature.keep("noise", measure)["deviation"]))
     deviation = max(deviation, rounding * abs(float(curvature.centre["loss"])))
-    return DEVIATIONS * np.sqrt(6) * deviation / step**2
+    return float(DEVIATIONS * np.sqrt(6) * deviation / step**2)
 
 
 def ends(size: int, count: int) -> NDArray[np.int64]:
@@ -493,13 +496,15 @@ def ends(size: int, count: int) -> NDArray[np.int64]:
 
 def _unit(rows: Array) -> Array:
     length = np.linalg.norm(rows, axis=1, keepdims=True)
-    return np.divide(rows, length, out=np.zeros_like(rows), where=length > 0)
+    unit: Array = np.divide(rows, length, out=np.zeros_like(rows), where=length > 0)
+    return unit
 
 
 def _oriented(rows: Array) -> Array:
     """Return rows with the largest component of each positive."""
     largest = np.take_along_axis(rows, np.abs(rows).argmax(axis=1)[:, None], axis=1)
-    return rows * np.where(largest < 0, -1.0, 1.0)
+    oriented: Array = rows * np.where(largest < 0, -1.0, 1.0)
+    return oriented
 
 
 def _ratio(part: float, whole: float) -> float:

@@ -175,12 +175,32 @@ class Hessian:
         return figure_of(self, width)
 
 
-def conclude(curvature: Curvature, found: Spectrum, *, pairs: int, **about: Any) -> Hessian:
-    """Return the record of a spectrum; `about` are the fields that say what it is of."""
+def conclude(
+    curvature: Curvature,
+    found: Spectrum,
+    *,
+    pairs: int,
+    identity: dict[str, Any],
+    env: str,
+    fidelity: str,
+    through: str,
+    point: dict[str, float],
+    loss_unit: str,
+    provenance: dict[str, Any],
+    command: str,
+) -> Hessian:
+    """Return the record of a spectrum, with so many `pairs` at either end; the other keywords are fields of it."""
     whole, dim = curvature.whole, curvature.dim
     negative, undecided = _signs(found)
     return Hessian(
-        **about,
+        identity=identity,
+        env=env,
+        fidelity=fidelity,
+        through=through,
+        point=point,
+        loss_unit=loss_unit,
+        provenance=provenance,
+        command=command,
         moved=curvature.moved,
         loss=float(curvature.centre["loss"]),
         gradient=float(np.linalg.norm(curvature.centre["grad"])) if curvature.source == "gradients" else math.nan,
@@ -202,21 +222,23 @@ def conclude(curvature: Curvature, found: Spectrum, *, pairs: int, **about: Any)
         values=found.values,
         errors=found.error,
         vectors=found.vectors,
-        **({} if found.nodes is None or found.weights is None else {"nodes": found.nodes, "weights": found.weights}),
+        nodes=found.nodes,
+        weights=found.weights,
     )
 
 
 def _pair(found: Spectrum, at: int, dim: int, names: Sequence[str]) -> Eigenpair:
     vector = found.vectors[at]
     largest = [part for part in np.argsort(-np.abs(vector), kind="stable")[:PARTS] if abs(vector[part]) >= LEAST_PART]
-    known = ("residual", "difference", "by_losses")
     return Eigenpair(
         place=at + 1 if at < len(found.values) / 2 else dim - len(found.values) + at + 1,
         value=float(found.values[at]),
         error=float(found.error[at]),
         disputed=bool(found.disputed[at]),
         along={names[part]: float(vector[part]) for part in largest},
-        **{name: float(getattr(found, name)[at]) for name in known},
+        residual=float(found.residual[at]),
+        difference=float(found.difference[at]),
+        by_losses=float(found.by_losses[at]),
     )
 
 
@@ -237,7 +259,7 @@ def _condition(found: Spectrum, whole: bool) -> Estimate:
 
 def _signs(found: Spectrum) -> tuple[Estimate, float]:
     """Return the share of eigenvalues that are surely negative, with its bounds, and of those that may be either."""
-    if found.nodes is None or found.weights is None:
+    if not found.nodes.size:
         below, either = float((found.values < -found.error).mean()), float((np.abs(found.values) <= found.error).mean())
         return Estimate(below, below, below + either), either
     error = float(np.median(found.error))

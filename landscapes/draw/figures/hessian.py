@@ -40,7 +40,7 @@ def hessian_figure(found: Hessian, *, width: float | None = None) -> page.Pictur
     rows = ROW * min(MOST_ROWS, max(LEAST_ROWS, len(_drawn(found)))) + 0.08
     sampled = found.nodes.size > 0
     parts = picture.add_gridspec(1 + sampled, 1, height_ratios=(rows, DENSITY)[: 1 + sampled])
-    axes = [picture.add_subplot(part) for part in parts]
+    axes = [picture.add_subplot(parts[row]) for row in range(1 + sampled)]
     linear, end = _scale(found)
     for ax, height in zip(axes, (rows, DENSITY), strict=False):
         page.dress(ax)
