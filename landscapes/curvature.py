@@ -276,7 +276,8 @@ class Spectrum:
     @property
     def _own_error(self) -> Array:
         rounded = ROUNDING * self.vectors.shape[1] * float(np.abs(self.values).max())
-        return self.residual + SAFETY * self.difference + rounded
+        error: Array = self.residual + SAFETY * self.difference + rounded
+        return error
 
 
 def measure_spectrum(curvature: Curvature, *, pairs: int, probes: int, seed: int = 0) -> Spectrum:

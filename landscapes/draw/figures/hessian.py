@@ -139,8 +139,8 @@ def _remark(found: Hessian) -> str:
     """Say trace, condition number and share of negative curvature."""
     trace, condition, negative = found.trace, found.condition, found.negative
     bounds = f"trace {trace.value:.3g} ({trace.low:.3g} to {trace.high:.3g})"
-    known = math.isfinite(condition.value)
-    size = f"condition {condition.value:.4g}" if known else f"condition at least {condition.low:.2g}"
+    at_least = f"at least {condition.low:.2g}" if math.isfinite(condition.low) else "cannot be told"
+    size = "condition " + (f"{condition.value:.4g}" if math.isfinite(condition.value) else at_least)
     said = [bounds, size, f"negative {negative.value:.0%} ({negative.low:.0%} to {negative.high:.0%})"]
     doubt = "" if found.symmetric else f"not symmetric: {found.asymmetry:.2g}"
     return " · ".join(filter(None, (*said, doubt, f"step {found.step:.2g} of the box, differences of {found.source}")))
