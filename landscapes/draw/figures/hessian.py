@@ -24,6 +24,7 @@ ROW, LEAST_ROWS, MOST_ROWS = 0.045, 5, 18  # height of an eigenvalue's row, by t
 DENSITY = 0.28  # height of the density's panel, by the width
 BINS = 48  # of the density
 DECADES = 12  # that the axis spans on each side, at most
+NARROWEST = 0.09  # half the linear part, by all decades: its ends have names
 TICKS = 4  # on each side
 REACH = 3.0  # what the axis reaches beyond the marks, as a ratio
 
@@ -45,8 +46,10 @@ def hessian_figure(found: Hessian, *, width: float | None = None) -> page.Pictur
     for ax, height in zip(axes, (rows, DENSITY), strict=False):
         page.dress(ax)
         ax.set_box_aspect(height)
-        ax.set_xscale("symlog", linthresh=linear, linscale=0.6)
-        ax.set_xlim(-end if _reaches_below(found, linear) else -linear, end)
+        below = end if _reaches_below(found, linear) else linear
+        decades = math.log10(end / linear) + math.log10(below / linear)
+        ax.set_xscale("symlog", linthresh=linear, linscale=max(0.6, NARROWEST * decades))
+        ax.set_xlim(-below, end)
         _mark(ax, linear, end)
     entries = _draw_eigenvalues(axes[0], found)
     if sampled:
