@@ -38,6 +38,7 @@ GROUPS = {  # of the help: heading -> verbs, each with the module of `api` that 
         "report": "report",
         "census": "measure",
         "pairs": "measure",
+        "hessian": "measure",
         "study": "study",
         "card": "measure",
         "bench": "measure",

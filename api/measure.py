@@ -1,4 +1,4 @@
-"""`gs.check`, `gs.card`, `gs.pairs`, `gs.census` and `gs.bench`: what a scene is like, and what it costs."""
+"""`gs.check`, `gs.card`, `gs.pairs`, `gs.hessian`, `gs.census`, `gs.bench`: what a scene is like and costs."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from .options import (
     FigureWidth,
     Force,
     Out,
+    Point,
     Scene,
     SceneKeywords,
     Scheduler,
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
     from ..jobs.pairs import PairRanking
     from ..landscapes.measures.card import Card
     from ..landscapes.measures.census import Census
+    from ..landscapes.measures.hessian import Hessian
 
 OtherScenes = Annotated[
     Any,
@@ -213,6 +215,54 @@ def pairs(
     job = PairsJob.open(
         spec.resolve(call.watch), samples=samples, seed=seed, out=as_path(out), force=force, command=call.command
     )
+    return job.run(call.watch)
+
+
+@verb
+def hessian(
+    scene: Scene,
+    through: Point = "center",
+    *,
+    eigenpairs: Count = 5,
+    probes: Annotated[int, at_least(2)] = 8,
+    seed: Seed = 0,
+    figure_width_mm: FigureWidth = (),
+    out: Out = None,
+    force: Force = False,
+    **keywords: Unpack[SceneKeywords],
+) -> Hessian:
+    """Measure the Hessian of an environment at a point: eigenvalues with errors, trace, condition, negative curvature.
+
+    All is in box units: every parameter runs from 0 to 1 between its bounds. The Hessian is of central differences of
+    gradients, whose step is chosen, or of losses where there are no gradients, of up to 30 parameters. Of up to 100
+    parameters the whole matrix is computed; of more, the ends of the spectrum by ARPACK, and trace and density by
+    Lanczos' method from random probes. An eigenvalue whose error is larger than itself "cannot be told". The folder
+    then holds hessian.json, hessian.npz (eigenvalues, eigenvectors, density) and hessian.png. Stop at any time: the
+    same command continues from there.
+
+    Raises ValueError for what the scene does not have, and where points fail that the Hessian needs; StoreMismatchError
+    where the folder holds another Hessian; Stopped where it is interrupted.
+
+    Example: landscape hessian rosenbrock --through center
+
+    Parameters
+    ----------
+    through
+        Point to measure at: center, random:SEED, example:NAME, best, best:RUN, a file of numbers, or a row of a table,
+        TABLE.csv:ROW. In Python also its numbers.
+    eigenpairs
+        Number of eigenvalues to examine at each end of the spectrum, with their directions.
+    probes
+        Number of random directions by which the spectrum of more than 100 parameters is sampled.
+    """
+    spec = spec_of(scene, keywords)
+    from ..jobs.hessian import HessianJob
+
+    call = current()
+    job = HessianJob.open(
+        spec.resolve(call.watch), through, pairs=eigenpairs, probes=probes, seed=seed, out=as_path(out), force=force,
+        prints=as_widths(figure_width_mm), command=call.command,
+    )  # fmt: skip
     return job.run(call.watch)
 
 

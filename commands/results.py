@@ -18,6 +18,7 @@ SHOWN = {
     "Computed": "gallery:show_computed",
     "Environment": "environments:show_environment",
     "FigureList": "gallery:show_figures",
+    "Hessian": "hessian:show",
     "Info": "environments:show_info",
     "League": "league:show",
     "list[Entry]": "environments:show_entries",

@@ -66,6 +66,7 @@ STUDIES = {kind: Results(f"{kind} study", (f"{kind}.json", f"{kind}.png"), f"{ki
 CARD = Results("report card", ("card.json", "card.html", "card.npz", "card.png"), "card.png")
 PAIRS = Results("study of pairs", ("pairs.json",))
 CHECK = Results("check", ("check.json", "check.png"), "check.png")
+HESSIAN = Results("Hessian", ("hessian.json", "hessian.npz", "hessian.png"), "hessian.png")
 CENSUS = Results("census", ("census.json", "census.npz", "census.png"), "census.png")
 
 

@@ -23,7 +23,6 @@ from .folder import Results
 from .watch import PREPARING, Watch, Work, resumable
 
 if TYPE_CHECKING:
-    from ..envs.base import Environment
     from ..optim.runs.store import RunStore
 
 Found = TypeVar("Found")
@@ -134,16 +133,16 @@ class CheckpointedJob(Job[Found]):
         """Hold the folder, and verify what simulates against what the checkpoint began with."""
         return going_on(self.checkpoint, self.verified, self.kept, watch)
 
-    def verified(self) -> Environment | None:
-        """Return the environment that the checkpoint is verified with; None verifies parts as they are read."""
+    def verified(self) -> Objective | None:
+        """Return the objective that the checkpoint is verified with; None verifies parts as they are read."""
         return None
 
 
 @contextmanager
 def going_on(
-    pieces: Checkpoint, make: Callable[[], Environment | None], kept: Callable[[], str], watch: Watch
+    pieces: Checkpoint, make: Callable[[], Objective | None], kept: Callable[[], str], watch: Watch
 ) -> Iterator[None]:
-    """Hold a study's folder, after another process that fills it, and verify the environment that `make` returns.
+    """Hold a study's folder, after another process that fills it, and verify the objective that `make` returns.
 
     Raises StoreMismatchError where it gives other numbers than when the study began, and as `resumable` does.
     """
@@ -152,8 +151,8 @@ def going_on(
         yield
 
 
-def _verify(pieces: Checkpoint, make: Callable[[], Environment | None], watch: Watch) -> None:
-    """Verify the environment that `make` returns, which is gone afterwards with the memory it has taken."""
+def _verify(pieces: Checkpoint, make: Callable[[], Objective | None], watch: Watch) -> None:
+    """Verify the objective that `make` returns, which is gone afterwards with the memory it has taken."""
     if (env := make()) is not None:
         with watch.busy(PREPARING):
             pieces.verify(env)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -10,12 +10,12 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from .objective import Objective, evaluate
+from .curvature import Curvature, measure_spectrum
+from .objective import Objective
 from .plane import Plane
 from .space import ParameterSpace
 
 Array = NDArray[np.float64]
-STEP = 1e-4  # of the box: differences of float64 gradients lose eps / STEP = 2e-12 to rounding, STEP**2 to truncation
 BEYOND = 0.1  # of a line's samples, past each of its ends
 SHARES = "shares of the box"
 
@@ -41,12 +41,15 @@ def gradient_directions(objective: Objective, x: Float[Tensor, " dim"]) -> tuple
     change has no part orthogonal to it.
     """
     _two(objective.space)
-    curvature = _Curvature(objective, x)
-    g = curvature.gradient(np.zeros(objective.space.dim))
+    curvature = Curvature(objective, x)
+    g = curvature.centre["grad"]
+    if not len(g):
+        raise ValueError(f"{objective.name} has no gradients to cut along; cut along random:SEED instead")
     if not (size := float(np.linalg.norm(g))):
         raise ValueError(f"{objective.name} has a gradient of zero at this point; cut it through another")
     first = g / size
-    change = curvature(first)
+    step = min(curvature.ladder(), key=lambda one: one.change).step
+    change = curvature.refuse_failed(curvature.differences(first[None], (step,), "gradient").product[0, 0])
     second = change - (change @ first) * first
     if not np.linalg.norm(second) > 1e-6 * np.linalg.norm(change):  # what differences of gradients can tell from none
         raise ValueError(
@@ -59,64 +62,20 @@ def gradient_directions(objective: Objective, x: Float[Tensor, " dim"]) -> tuple
 def hessian_directions(objective: Objective, x: Float[Tensor, " dim"]) -> tuple[Array, list[str]]:
     """Return the two eigenvectors of the Hessian with the largest curvatures, by magnitude, in widths of the box.
 
-    Products with the Hessian are central differences of gradients; the largest component of each direction is
-    positive. Raises ValueError where gradients are not known or all zero, and where Lanczos' method does not converge.
+    They are those that `landscape hessian` measures; the largest component of each is positive. Raises ValueError where
+    points fail, where there is no curvature, and where there are no gradients and too many parameters.
     """
-    dim = objective.space.dim
     _two(objective.space)
-    curvature = _Curvature(objective, x)
-    values, vectors = _eigen(curvature, dim, objective.name)
-    if not np.abs(values).max():
+    found = measure_spectrum(Curvature(objective, x), pairs=2, probes=1)
+    if not np.abs(found.values).max():
         raise ValueError(f"{objective.name} has no curvature at this point; cut it through another")
-    order = np.argsort(-np.abs(values), kind="stable")[:2]
-    frame = vectors[:, order].T
-    frame = frame * np.sign(np.take_along_axis(frame, np.abs(frame).argmax(axis=1)[:, None], axis=1))
-    labels = [f"Hessian's direction {axis + 1}, curvature {values[at]:.3g} [{SHARES}]" for axis, at in enumerate(order)]
-    return frame, labels
-
-
-def _eigen(curvature: Callable[[Array], Array], dim: int, name: str) -> tuple[Array, Array]:
-    """Return leading eigenvalues and eigenvectors; of up to three parameters all, which Lanczos' method cannot."""
-    from scipy.sparse.linalg import ArpackError, LinearOperator, eigsh
-
-    if dim <= 3:
-        whole = np.stack([curvature(row) for row in np.eye(dim)])
-        values, vectors = np.linalg.eigh((whole + whole.T) / 2)
-        return values, vectors
-    start = np.random.default_rng(0).standard_normal(dim)
-    try:
-        operator = LinearOperator((dim, dim), matvec=lambda v: curvature(np.ravel(v)), dtype=np.float64)
-        values, vectors = eigsh(operator, k=2, which="LM", v0=start, tol=1e-6)
-    except ArpackError as error:
-        raise ValueError(
-            f"the Hessian of {name} has no clear leading directions at this point ({error}); cut through another"
-        ) from None
-    return values, vectors
-
-
-class _Curvature:
-    """Multiply by the Hessian at a point, in widths of the box."""
-
-    def __init__(self, objective: Objective, x: Float[Tensor, " dim"]) -> None:
-        space = objective.space
-        self.objective, self.width = objective, (space.upper - space.lower).numpy()
-        step = STEP * torch.from_numpy(self.width)
-        self.x = torch.maximum(torch.minimum(x, space.upper - step), space.lower + step).numpy()  # room to every side
-
-    def gradient(self, *offsets: Array) -> Array:
-        """Return gradients [loss unit] at offsets from the point, one of shape (dim,) for one."""
-        points = torch.from_numpy(self.x + np.stack(offsets) * self.width)
-        found = evaluate(self.objective, points, grad=True).grad
-        if found is None or not bool(found.isfinite().all()):
-            raise ValueError(f"{self.objective.name} has no finite gradient at this point; cut it through another")
-        grad: Array = found.numpy() * self.width
-        return grad[0] if len(offsets) == 1 else grad
-
-    def __call__(self, direction: Array) -> Array:
-        offset = STEP * direction / max(float(np.linalg.norm(direction)), np.finfo(float).tiny)
-        ahead, behind = self.gradient(offset, -offset)
-        product: Array = (ahead - behind) / (2 * STEP) * np.linalg.norm(direction)
-        return product
+    order = np.argsort(-np.abs(found.values), kind="stable")[:2]
+    labels = [
+        f"Hessian's direction {axis + 1}, curvature {found.values[at]:.3g} \N{PLUS-MINUS SIGN} {found.error[at]:.2g} "
+        f"[{SHARES}]"
+        for axis, at in enumerate(order)
+    ]
+    return found.vectors[order], labels
 
 
 def _two(space: ParameterSpace) -> None:

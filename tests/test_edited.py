@@ -214,6 +214,7 @@ STUDIES: dict[str, Callable[[Path], Any]] = {
     "optimize": lambda out: gs.optimize(Throw, "random", budget=4, out=out),
     "race": lambda out: gs.race(Throw, ["random", "descents"], budget=6, seeds=2, out=out),
     "pairs": lambda out: gs.pairs(Throw, samples=2, out=out),
+    "hessian": lambda out: gs.hessian(Throw, out=out),
     "census": lambda out: gs.census(Throw, slices=1, resolution=6, out=out),
     "fidelity": lambda out: gs.study("fidelity", Throw, points=2, settings=["precision"], out=out),
     "convergence": lambda out: gs.study("convergence", Throw, points=2, out=out),

@@ -37,6 +37,7 @@ WRITING = {  # the command, the file for which there is no room any more, what i
         "fidelity.json", "variants are kept in made",
     ),
     "pairs": ("pairs branin --samples 2 --out made", "pairs.json", "2 batches are kept in made"),
+    "hessian": ("hessian branin --out made", "hessian.json", "batches are kept in made"),
     "census": ("census branin --slices 1 --resolution 6 --out made", "census.json", "1 of 1 slices are kept in made"),
     "check": ("check branin --power 50% --device cpu --out made", "check.json", "nothing of the check is kept"),
     "card": (

@@ -47,6 +47,7 @@ study mixed cartpole --set horizon=0.02 --points 2 --chaotic --time-limit 0.01 -
 study extremes bounce --set horizon=0.05 --points 4 --settings dt --precisions float64 --fidelity draft --device cpu
 pairs bounce --samples 2 --fidelity draft --device cpu
 report cut --points-per-axis 2 --device cpu
+hessian branin --device cpu
 census branin --slices 1 --resolution 6
 card --scene control --resolution 3
 gallery compute --only bounce-y --part slices --resolution 4 --fidelity draft --device cpu --data data

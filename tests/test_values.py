@@ -42,6 +42,7 @@ bench branin --batch 2 --seconds 0
 check branin --power 20%
 study fidelity bounce --points 2 --settings dt
 pairs ackley --samples 2 --top 3
+hessian branin
 census ackley --slices 1 --resolution 6
 card --scene control --resolution 3
 report cut --points-per-axis 2

@@ -24,6 +24,7 @@ FIGURES = {
     "Episode": "landscapes.draw.figures.contact:episode_figure",
     "ExtremesRecord": "landscapes.draw.figures.extremes:extremes_figure",
     "FidelityRecord": "landscapes.draw.figures.accuracy:fidelity_figure",
+    "Hessian": "landscapes.draw.figures.hessian:hessian_figure",
     "MixedRecord": "landscapes.draw.figures.accuracy:mixed_figure",
     "ModelRecord": "landscapes.draw.figures.accuracy:model_figure",
     "SymmetryRecord": "landscapes.draw.figures.symmetry:symmetry_figure",

@@ -176,6 +176,14 @@ POINT_KINDS: dict[str, dict[str, Any]] = {  # how the gradient at a point compar
     "NaN": {"facecolor": "#d55e00", "linewidth": 0.0},
     "wrong": {"facecolor": "#d55e00", "linewidth": 0.0},
 }
+EIGENVALUES: dict[str, dict[str, Any]] = {  # of a Hessian, by sign
+    "positive": {"color": "#0072b2", "marker": "o", "linestyle": "none", "markersize": 5.5},
+    "negative": {"color": "#d55e00", "marker": "s", "linestyle": "none", "markersize": 5.0},
+    "cannot tell": {
+        "color": QUIET, "marker": "o", "linestyle": "none", "markersize": 5.5, "markerfacecolor": "white"
+    },
+}  # fmt: skip
+EIGENVALUE_NAMES = {"positive": "positive", "negative": "negative", "cannot tell": "the sign cannot be told"}
 INTERVAL_LINE: dict[str, Any] = {"color": FAINT, "linewidth": 1.0, "zorder": 1.5, "solid_capstyle": "butt"}
 CHOSEN_MARK: dict[str, Any] = {  # a ring around a variant that a fidelity's name should mean
     "linestyle": "none", "marker": "o", "markersize": 12.0, "markerfacecolor": "none", "markeredgewidth": 1.3,

@@ -24,7 +24,7 @@ check branin --power 20%
 gallery list .
 """.strip().splitlines()
 ELSEWHERE = {  # whose JSON other tests read
-    *("bench", "bounce", "card", "census", "gallery compute", "league", "optimize", "overlay"),
+    *("bench", "bounce", "card", "census", "gallery compute", "hessian", "league", "optimize", "overlay"),
     *("pairs", "race", "report", "study", "sweep"),
 }
 

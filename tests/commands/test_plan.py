@@ -37,6 +37,7 @@ def priced(monkeypatch: pytest.MonkeyPatch) -> None:
         ("race branin --methods random,descents --budget 20 --seeds 3", 60, 60),
         ("league branin beale --methods random --budget 20 --seeds 2", 80, 0),
         ("census ackley --slices 1 --resolution 6", 16 * 5, 36),
+        ("hessian branin", 18, 1 + 9 * 4 + 2 * 4 + 2 * 4),
         ("replay bounce --no-film", 2, 0),
     ],
 )

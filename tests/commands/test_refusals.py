@@ -166,6 +166,7 @@ IN_MINE = {  # a folder that holds somebody else's files: what a result is calle
     "replay bounce --device cpu": "episode",
     "report cut": "report",
     "pairs ackley --samples 2": "pairs",
+    "hessian ackley": "Hessian",
     "census ackley --slices 2": "census",
     "study fidelity bounce --points 2": "fidelity study",
     "card --scene control": "report card",

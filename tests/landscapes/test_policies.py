@@ -100,9 +100,10 @@ def test_a_slice_over_weights_goes_on_and_is_none_of_the_scenes_own(run, tmp_pat
     assert "policy" in other.stderr
     with pytest.raises(ValueError, match="the slice is over the weights of a policy, cartpole with policy mlp:2"):
         environment_of(gs.open_slice(tmp_path / "cut").data, "cpu")
-    hessian = run(*line[:4], "--along", "hessian", *line[6:], "--out", "other", cwd=tmp_path)
+    hessian = run(*line[:3], "mlp:8", "--along", "hessian", *line[6:], "--out", "other", cwd=tmp_path)
     assert hessian.returncode == 2
     assert "has no gradients" in hessian.stderr
+    assert "30 parameters at most, and it has" in hessian.stderr
     assert not (tmp_path / "other").exists()
 
 

@@ -18,6 +18,7 @@ from gradscape.landscapes.measures.card import Card, CardSlice, ClosedFormError,
 from gradscape.landscapes.measures.census import MEASURES, Census, CensusDesign, SurveyedSlice, conclude
 from gradscape.landscapes.measures.classify import WORDS
 from gradscape.landscapes.measures.floor import Floor
+from gradscape.landscapes.measures.hessian import Eigenpair, Hessian
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.landscapes.statistics import Estimate, share
 from gradscape.optim.registry import methods
@@ -208,6 +209,28 @@ def census() -> Census:
     found[5].loss[:] = np.nan
     about = {"env": "bowl", "fidelity": "draft", "other": "", "loss_unit": "m", "command": COMMAND.format("census")}
     return conclude(design, found, {}, seed=0, **about, identity=MEASURED, provenance=MEASURED)
+
+
+def hessian(dim: int, known: int) -> Hessian:
+    """Return so many known eigenvalues of all, from large to negative, every third with an error as large as itself."""
+    rows = np.arange(known)
+    values = np.sign(known * 0.7 - rows) * 10.0 ** (4 - 0.5 * rows)
+    errors = np.where(rows % 3 == 2, 2 * np.abs(values), 0.1 * np.abs(values))
+    named = {f"the stiffness of spring {part} at the wall": 0.6 for part in range(3)}
+    pairs = tuple(
+        Eigenpair(row + 1, value, error, error / 2, error / 4, value, False, named)
+        for row, value, error in zip(rows.tolist(), values.tolist(), errors.tolist(), strict=True)
+    )
+    sampled = (3, 8) if known < dim else (0, 0)
+    nodes = np.linspace(-5, 900, sampled[0] * sampled[1]).reshape(sampled)
+    return Hessian(
+        identity=MEASURED, env="triple-move", fidelity="reference", through="best:runs/triple-move", point={},
+        moved=0.001, loss=1.0, loss_unit="m", gradient=3.0, dim=dim, source="gradients", why="", whole=known == dim,
+        step=2.0**-10, steps=(), pairs=pairs, trace=Estimate(1e4, 9e3, 1.1e4), condition=Estimate(np.nan, 5e3, np.nan),
+        negative=Estimate(0.3, 0.2, 0.6), undecided=0.3, asymmetry=0.5, asymmetry_explained=0.01, episodes=300,
+        failures=(), provenance=MEASURED | {"command": COMMAND.format("hessian")}, command="", values=values,
+        errors=errors, nodes=nodes, weights=np.full(sampled, 1 / max(sampled[1], 1)),
+    )  # fmt: skip
 
 
 CURVE = tuple(

@@ -26,6 +26,7 @@ from gradscape.landscapes.draw.figures.contact import Caption, episode_figure
 from gradscape.landscapes.draw.figures.contour import landscape_figure
 from gradscape.landscapes.draw.figures.convergence import convergence_figure
 from gradscape.landscapes.draw.figures.extremes import extremes_figure
+from gradscape.landscapes.draw.figures.hessian import hessian_figure
 from gradscape.landscapes.draw.figures.multiples import (
     CompanionSlice,
     Landscape,
@@ -52,7 +53,7 @@ from gradscape.optim.registry import methods
 
 from ....made_studies import fidelities, study
 from ...test_overlay import LAID, SLICE
-from .records import card, census, checked, convergence, extremes, league, mixed, symmetry
+from .records import card, census, checked, convergence, extremes, hessian, league, mixed, symmetry
 from .test_contour import BOUNCES, DATASET, LINE, Bowl, plane
 from .test_search import race, table
 from .test_sweep import SWEEP
@@ -158,6 +159,11 @@ FIGURES: dict[str, list[Callable[[float | None], page.Picture]]] = {
     "check_figure": [
         lambda width: check_figure(checked(), width=width),
         lambda width: check_figure(checked((), kinds={}), width=width),
+    ],
+    "hessian_figure": [
+        lambda width: hessian_figure(hessian(3, 3), width=width),
+        lambda width: hessian_figure(hessian(40, 40), width=width),
+        lambda width: hessian_figure(hessian(300, 10), width=width),
     ],
     "extremes_figure": [lambda width: extremes_figure(extremes(), width=width)],
     "symmetry_figure": [lambda width: symmetry_figure(symmetry(), width=width)],
