@@ -1,4 +1,18 @@
-"""Discontinuities of a loss: differences between neighbouring samples that do not vanish on a finer look."""
+"""Discontinuities of a loss: jumps between neighbouring samples that do not vanish on a finer look.
+
+A jump counts from a fixed part of the range on, whatever the samples are. Its trace is a difference between two
+neighbours that neither their gradients nor the differences around it explain. Every line of a slice, row or column, is
+in one of three states before anything is evaluated or drawn:
+
+- it has no trace of half a jump: the samples clear it;
+- its strongest trace is among the strongest of the slice: all of these are looked into;
+- neither: some of these lines are drawn at random, and every trace on them is looked into. That gives the interval of
+  the share of lines that cross a jump, and the power of a search that finds none.
+
+A trace is bisected towards the larger unexplained difference: a jump keeps its height, a slope loses half of it every
+time. What is left must be apart by more than the losses on either side of it vary among themselves, so that neither
+noise nor a fractal surface jumps.
+"""
 
 from __future__ import annotations
 
@@ -16,12 +30,16 @@ from torch import Tensor
 
 from ..identity import plane_of
 from ..objective import Objective, evaluate
-from ..plane import Plane
-from ..statistics import Estimate, share
+from ..statistics import CONFIDENCE, Estimate, Values, share
+from .ruggedness import box_slopes, span
 
+LEAST = 0.01  # of the slice's range, from which on a difference is a jump
 HALVINGS = 12  # a gap between samples is looked into down to 1/4096 of it
-EVALUATIONS_PER_PAIR = 2 + HALVINGS
-PERSISTS = 3  # halvings over which a jump keeps more than half of its height, and a slope an eighth
+SIDES = (1, 2, 4, 8)  # widths of what is left of a gap, at which both sides of it are evaluated
+EVALUATIONS_PER_PAIR = 2 + HALVINGS + 2 * len(SIDES)  # at most
+APART = 2  # times what the losses vary on one side of a jump is its height at least
+GUIDED = 1 / 2  # of the pairs that are looked into are those with the strongest traces
+AROUND = (-2, -1, 1, 2)  # neighbouring differences along a line whose median explains one
 Count = Callable[[Tensor], Mapping[str, Tensor]]
 
 
@@ -39,31 +57,54 @@ class Jump:
 
 @dataclass(frozen=True)
 class Jumps:
-    """Hold the jumps that were `found`, the highest first, and how often they occur between neighbouring samples.
+    """Hold the jumps of a slice that were `found`, the highest first, and how many of its lines cross one.
 
-    Of `neighbours` pairs of samples `steep` differ by at least `least` [loss unit]; `checked` of these were looked into
-    and `undecided` could not be, as an evaluation there failed.
+    A jump is at least `least` high [loss unit], and the losses have a `range`. Of the slice's `lines`, its rows and
+    columns, `crossed` cross a found jump. So many are `settled`: without chance, by the samples or by what their
+    strongest traces led to. Of the others `drawn` were looked into, and `hit` of these cross a jump. In all `checked`
+    pairs of neighbours were looked into, of which `undecided` could not be, as an evaluation there failed.
     """
 
-    derived: ClassVar = ("share", "explained_by_events")
+    derived: ClassVar = ("share", "unseen", "largest", "explained_by_events", "sentence")
 
     found: tuple[Jump, ...]
     least: float
-    neighbours: int
-    steep: int
+    range: float
+    lines: int
+    crossed: int
+    settled: int
+    drawn: int
+    hit: int
     checked: int
     undecided: int
+    evaluations: int
 
     @property
     def share(self) -> Estimate:
-        """Share of all pairs of neighbours with a jump between them; no interval where every steep one was checked."""
-        decided, part = self.checked - self.undecided, self.steep / self.neighbours if self.neighbours else math.nan
-        if self.steep == 0:
-            return Estimate(0.0, 0.0, 0.0)
-        found = share(len(self.found), decided)
-        if decided == self.steep:
-            return Estimate(found.value * part, found.value * part, found.value * part)
-        return Estimate(found.value * part, found.low * part, found.high * part)
+        """Share of the lines that cross a jump; no interval where every line was looked into."""
+        if not self.lines:
+            return Estimate(math.nan, math.nan, math.nan)
+        sure, others = self.crossed - self.hit, self.lines - self.settled
+        if self.drawn == others:
+            return Estimate(*(self.crossed / self.lines,) * 3)
+        rest = share(self.hit, self.drawn) if self.drawn else Estimate(math.nan, 0.0, 1.0)
+        value, low, high = ((sure + others * part) / self.lines for part in (rest.value, rest.low, rest.high))
+        return Estimate(self.crossed / self.lines if math.isnan(value) else value, low, high)
+
+    @property
+    def unseen(self) -> float:
+        """Share of the lines that could have a jump though none was found: the upper end of one-sided 95 %."""
+        if not self.lines or self.crossed:
+            return math.nan
+        others = self.lines - self.settled
+        if self.drawn == others:
+            return 0.0
+        return others / self.lines * (1 - (1 - CONFIDENCE) ** (1 / self.drawn) if self.drawn else 1.0)
+
+    @property
+    def largest(self) -> float:
+        """The height of the highest jump over the range of the losses, 0 where none was found."""
+        return self.found[0].height / self.range if self.found else 0.0
 
     @property
     def explained_by_events(self) -> Estimate | None:
@@ -71,81 +112,14 @@ class Jumps:
         explained = [jump.event for jump in self.found]
         return share(sum(map(bool, explained)), len(explained)) if explained and None not in explained else None
 
-
-def find_jumps(
-    objective: Objective,
-    datasets: Sequence[xr.Dataset],
-    *,
-    least: Sequence[float],
-    most: int = 64,
-    seed: int = 0,
-    events: Count | None = None,
-) -> list[Jumps]:
-    """Look for jumps between neighbouring samples of slices, by new evaluations; those of all slices are in one batch.
-
-    A jump is at least as high as its slice's bound in `least` [loss unit]. At most so many pairs of a slice, drawn at
-    random from those that differ by as much, are bisected towards the larger half: a jump keeps its height, a slope
-    loses half of it every time.
-    """
-    planes = [plane_of(dataset) for dataset in datasets]
-    pairs = [_steep_pairs(*one) for one in zip(datasets, planes, least, strict=True)]
-    drawn = [ends[np.sort(np.random.default_rng(seed).permutation(len(ends))[:most])] for ends, _ in pairs]
-    bisected = _bisect(objective, planes, [torch.from_numpy(ends) for ends in drawn])
-    jumps = []
-    for plane, (ends, neighbours), bound, (low, high, gaps) in zip(planes, pairs, least, bisected, strict=True):
-        decided = gaps.isfinite().all(dim=0)
-        last, earlier = gaps[-1], gaps[-1 - PERSISTS]
-        found = decided & (last >= bound) & (last > earlier / 2)
-        counted = _differ(events, plane.lift(low[found]), plane.lift(high[found])) if events else None
-        place, undecided = (low + high)[found] / 2, int((~decided).sum())
-        events_there = [None] * len(place) if counted is None else counted.tolist()
-        each = map(Jump, map(tuple, place.tolist()), last[found].tolist(), events_there)
-        highest_first = tuple(sorted(each, key=lambda jump: -jump.height))
-        jumps.append(Jumps(highest_first, bound, neighbours, len(ends), len(low), undecided))
-    return jumps
-
-
-def _steep_pairs(dataset: xr.Dataset, plane: Plane, least: float) -> tuple[NDArray[np.float64], int]:
-    """Return the ends of pairs that differ so much, shape (pairs, 2, rank), and how many pairs there are."""
-    loss = dataset["loss"].transpose("v", "u", missing_dims="ignore").to_numpy()
-    axes = [axis.numpy() for axis in plane.axes()]
-    places = np.stack(np.meshgrid(*axes[::-1], indexing="ij")[::-1], axis=-1)
-    pairs, neighbours = [np.zeros((0, 2, plane.rank))], 0
-    for axis in range(loss.ndim):
-        apart = np.abs(np.diff(loss, axis=axis))
-        neighbours += int(np.isfinite(apart).sum())
-        first, second = (np.delete(places, at, axis=axis) for at in (-1, 0))
-        with np.errstate(invalid="ignore"):
-            pairs.append(np.stack([first, second], axis=-2)[(apart >= least) & (apart > 0)])
-    return np.concatenate(pairs), neighbours
-
-
-def _bisect(
-    objective: Objective, planes: Sequence[Plane], ends: Sequence[Float[Tensor, "pairs end rank"]]
-) -> list[tuple[Tensor, Tensor, Float[Tensor, "halvings pairs"]]]:
-    """Halve every pair towards the larger difference; return its last ends and the difference after each halving."""
-    counts = [len(one) for one in ends]
-    low, high = torch.cat(list(ends)).unbind(dim=1)
-
-    def losses(u: Float[Tensor, "pairs rank"]) -> Float[Tensor, " pairs"]:
-        x = [plane.lift(part) for plane, part in zip(planes, torch.split(u, counts), strict=True)]
-        return evaluate(objective, torch.cat(x), grad=False).loss
-
-    below, above = losses(low), losses(high)  # again: a slice may come from another device
-    gaps = [(above - below).abs()]
-    for _ in range(HALVINGS):
-        middle = (low + high) / 2
-        between = losses(middle)
-        left = (between - below).abs() >= (above - between).abs()
-        high, above = torch.where(left[:, None], middle, high), torch.where(left, between, above)
-        low, below = torch.where(left[:, None], low, middle), torch.where(left, below, between)
-        gaps.append((above - below).abs() + 0 * between)  # NaN once a middle failed
-    halved = torch.split(torch.stack(gaps), counts, dim=1)
-    return list(zip(torch.split(low, counts), torch.split(high, counts), halved, strict=True))
-
-
-def _differ(events: Count, low: Float[Tensor, "jumps dim"], high: Float[Tensor, "jumps dim"]) -> Tensor | None:
-    before, after = events(low), events(high)
-    if not before:
-        return None
-    return torch.stack([before[name].cpu() != after[name].cpu() for name in before]).any(dim=0)
+    @property
+    def sentence(self) -> str:
+        """Say how high jumps are and how many lines cross one, or how many could have one that was not found."""
+        part = 100 * self.least / self.range if self.range > 0 else math.nan
+        if not self.found:
+            said = f"none of {part:.2g} % of the range or more" if part <= 100 else "none above the noise"
+            unseen = f"; up to {math.ceil(100 * self.unseen)} % of lines could have one" if self.unseen > 0 else ""
+            return said + unseen
+        value, low, high = (round(100 * part) for part in (self.share.value, self.share.low, self.share.high))
+        interval = f" ({low} to {high})" if low < high else ""
+        return f"jumps up to {100 * self.largest:.2g} % of the range; {value} %{interval} of lines cross one"
