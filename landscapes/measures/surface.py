@@ -1,0 +1,335 @@
+"""The surface of a landscape in a word, judged at fixed scales: shares of the range and of the box, no sample's width.
+
+A minimum counts from a prominence of 1 % of the range on, and so does a turn along a line; noise and numerics count
+where they are larger. Such a count is true of the landscape where the samples tell what lies between them. That is
+tested: losses at random places are held against what the samples around them, with their gradients, predict. Without an
+objective every other sample is held against those left. Where more than 5 % of the places are off by 1 % of the range or
+more, the slice is undersampled. Only the turns stay true then, as a lower bound: finer samples can only add to them.
+
+A landscape that turns often is extremely rugged where losses differ over a distance h by h to a power below 0.7, from
+1/2048 to 1/256 of the box. That takes new evaluations; without them it stays open.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+import torch
+import xarray as xr
+
+from ..identity import plane_of
+from ..objective import Objective, evaluate
+from ..statistics import Estimate, Values, fit_line, jackknife, share, student
+from .ruggedness import box_slopes, minima, span
+
+VERY_SMOOTH, SMOOTH, RUGGED, EXTREME = "very smooth", "smooth with local minima", "rugged", "extremely rugged"
+LEAST = 0.01  # of the range: the least prominence that counts, and the error from which samples do not tell a loss
+BAND = math.sqrt(2)  # a count is given for this many times the prominence, too, and for as small a part of it
+MANY_TURNS = 6.0  # along a side from which a landscape is rugged
+ROUGH = 0.7  # the exponent below which it is extremely so
+UNDERSAMPLED = 0.05  # share of the places between samples
+MOST_FLOOR = 0.1  # of the range that noise or numerics may hide of a smooth surface
+SIDE, LEVEL, LARGE = 0.02, 1e-3, 0.2  # a region is level if over this part of the box it ranges over that of the losses
+EXPLAINED = 0.05  # share of squared differences between samples that their neighbours leave open; an exponent's is more
+ROUNDING = {np.float32: 2.0**-20, np.float64: 2.0**-48}  # of the largest loss that is no difference: eight last digits
+PLACES, STARTS = 64, 32  # between samples, and of these where differences over short distances begin
+DISTANCES = tuple(2.0**-power for power in (11, 10, 9, 8))  # parts of the box
+GROUPS = 8  # of starts, one of which is left out at a time
+
+
+@dataclass(frozen=True, eq=False)
+class Between:
+    """Hold losses of a slice's plane at random places: `place` in steps along each axis of the array, and `loss`.
+
+    `rise` is how far the loss differs from the first of them on over each of `DISTANCES`, shape (start, distance).
+    """
+
+    place: Values
+    loss: Values
+    rise: Values
+
+
+def look_between(objective: Objective, datasets: Sequence[xr.Dataset], *, seed: int = 0) -> list[Between]:
+    """Evaluate losses at random places of slices, those of all slices in one batch: 192 for each."""
+    planes, parts = [plane_of(dataset) for dataset in datasets], []
+    for number, plane in enumerate(planes):
+        generator = np.random.default_rng((seed, number))
+        unit = generator.random((PLACES, plane.rank))
+        axis, from_ = generator.integers(plane.rank, size=STARTS), unit[:STARTS, None, :]
+        way = np.where(from_ < 0.5, 1.0, -1.0) * np.eye(plane.rank)[axis][:, None, :]
+        near = from_ + way * np.array(DISTANCES)[None, :, None]
+        parts.append(np.concatenate([unit, near.reshape(-1, plane.rank)]))
+    sides = [(plane.upper - plane.lower).numpy() for plane in planes]
+    x = [
+        p.lift(torch.from_numpy(p.lower.numpy() + one * side))
+        for p, one, side in zip(planes, parts, sides, strict=True)
+    ]
+    losses = torch.split(evaluate(objective, torch.cat(x), grad=False).loss, [len(one) for one in parts])
+    found = []
+    for plane, part, loss in zip(planes, parts, losses, strict=True):
+        values = loss.double().numpy()
+        rises = np.abs(values[PLACES:].reshape(STARTS, -1) - values[:STARTS, None])
+        steps = (np.array(plane.resolution) - 1)[: plane.rank]
+        found.append(Between((part[:PLACES] * steps)[:, ::-1], values[:PLACES], rises))
+    return found
+
+
+@dataclass(frozen=True)
+class Surface:
+    """Hold what a slice's surface is like, and its `word`, None where it is flat or not resolved.
+
+    `minima` and `turns` (mean over lines, for each axis, u first) count from `depth` on [loss unit]; their intervals are
+    the counts from a larger and from a smaller one on, see `BAND`. `level` is the share of the box in level regions,
+    `holder` the exponent over short distances, NaN where not known. `off` is the share of places between samples whose
+    loss these do not tell; `probed` whether that was seen by new evaluations. A rugged surface of which it is open
+    whether it is extremely so is rugged `at_least`. `unresolved` says why there is no word.
+    """
+
+    derived: ClassVar = ("large_flat",)
+
+    range: float
+    floor: float
+    depth: float
+    flat: bool
+    minima: Estimate
+    turns: tuple[Estimate, ...]
+    level: Estimate
+    holder: Estimate
+    off: Estimate
+    probed: bool
+    word: str | None
+    at_least: bool
+    unresolved: str
+
+    @property
+    def large_flat(self) -> bool | None:
+        """Whether there are large flat regions, None where that is not resolved."""
+        if self.flat or not math.isfinite(self.level.value):
+            return None
+        low = self.level.low if math.isfinite(self.level.low) else self.level.value
+        high = self.level.high if math.isfinite(self.level.high) else self.level.value
+        if low >= LARGE:
+            return True
+        return False if high < LARGE and not self.off.value > UNDERSAMPLED else None
+
+    def describe(self) -> str:
+        """Return the numbers that the word is from: "4 minima, and at most 2.9 turns along a side"."""
+        count, most = self.minima.value, max(self.turns, key=lambda one: one.value).value
+        said = f"{count:.0f} {'minimum' if count == 1 else 'minima'} and {most:.1f} turns along a side"
+        said += f", deeper than {100 * self.depth / self.range:.2g} % of the range"
+        if math.isfinite(self.holder.value):
+            said += f"; exponent over short distances {self.holder.value:.2f}"
+        return said
+
+
+def measure_surface(
+    dataset: xr.Dataset, *, floor: float = 0.0, own_range: float | None = None, between: Between | None = None
+) -> Surface:
+    """Judge the surface of a slice, from its samples and, if it is known, from what lies `between` them.
+
+    `floor` [loss unit] is what noise or numerics alone put losses apart by, `own_range` that of the whole environment.
+    """
+    loss = dataset["loss"].transpose("v", "u", missing_dims="ignore").to_numpy().astype(float)
+    whole, floor = span(loss), max(floor, rounding(loss))
+    if not whole > max(floor, LEAST * (own_range or 0.0)):
+        none = Estimate(math.nan, math.nan, math.nan)
+        flat = math.isfinite(whole)
+        return Surface(whole, floor, floor, flat, none, (none,) * loss.ndim, none, none, none, False, None, False, "")
+    depth = max(floor, LEAST * whole)
+    slope = _step_slopes(dataset) if "grad" in dataset else None
+    errors, rises = _held_out(loss, slope) if between is None else (_errors(loss, slope, between), None)
+    known = [one[np.isfinite(one)] for one in errors]
+    best = min(known, key=lambda one: (np.mean(one > depth) if len(one) else 1.0, np.mean(one) if len(one) else 1.0))
+    off = share(int((best > depth).sum()), len(best))
+    bands = [max(floor, depth * BAND), depth, max(floor, depth / BAND)]
+    deepest = minima(loss)
+    counts = [max(1, deepest.count(bound)) for bound in bands]
+    turned = [[turning_points(loss, axis, bound) for axis in range(loss.ndim)[::-1]] for bound in bands]
+    turns = tuple(Estimate(middle, low, high) for low, middle, high in zip(*turned, strict=True))
+    words = [_word(max(lines), count) for lines, count in zip(turned, counts, strict=True)]
+    holder = short_exponent(between, floor) if between is not None else _open(best, rises)
+    halved = words[1] if between is not None else _halved(loss, depth)
+    word, least, why = _judge(words, halved, off, holder, floor / whole)
+    return Surface(
+        whole, floor, depth, False, Estimate(*map(float, (counts[1], counts[0], counts[2]))), turns,
+        level_share(loss, floor), holder, off, between is not None, word, least, why,
+    )  # fmt: skip
+
+
+def _judge(
+    words: Sequence[str], halved: str, off: Estimate, holder: Estimate, hidden: float
+) -> tuple[str | None, bool, str]:
+    """Return the word, whether it is one at least, and why there is none; `words` are those of the band of depths."""
+    hides = f"noise or numerics hide what is below {100 * hidden:.0f} % of the range"
+    if words[0] == RUGGED:  # also where samples are too few: finer ones only add to the turns
+        if holder.high < ROUGH:
+            return EXTREME, False, ""
+        return RUGGED, not holder.low >= ROUGH, ""
+    if not off.value <= UNDERSAMPLED:
+        return None, False, f"the samples do not tell {100 * off.value:.0f} % of what lies between them"
+    if hidden > MOST_FLOOR:
+        return None, False, hides
+    if len(set(words)) > 1:
+        return None, False, f"{' or '.join(dict.fromkeys(words))}, by the depth from which minima count"
+    if halved != words[1]:
+        return None, False, f"{words[1]}, but {halved} by every second sample"
+    return words[1], False, ""
+
+
+def _word(turns: float, count: float) -> str:
+    if turns >= MANY_TURNS:
+        return RUGGED
+    return SMOOTH if count > 1 else VERY_SMOOTH
+
+
+def _halved(loss: Values, depth: float) -> str:
+    part = loss[(slice(None, None, 2),) * loss.ndim]
+    turns = max(turning_points(part, axis, depth) for axis in range(part.ndim))
+    return _word(turns, minima(part).count(depth))
+
+
+def turning_points(loss: Values, axis: int, depth: float) -> float:
+    """Return how often a line along an axis turns back by at least `depth`, the mean over lines; NaN left out.
+
+    A line counts where at least half of its samples have a loss.
+    """
+    lines = np.moveaxis(loss, axis, -1).reshape(-1, loss.shape[axis])
+    lines = lines[np.isfinite(lines).mean(axis=1) >= 0.5]
+    if not len(lines):
+        return math.nan
+    high, low = np.full(len(lines), -np.inf), np.full(len(lines), np.inf)
+    way, turned = np.zeros(len(lines), int), 0  # 0 while a line has gone nowhere
+    for at in lines.T:
+        high, low = np.fmax(high, at), np.fmin(low, at)
+        with np.errstate(invalid="ignore"):
+            down, up = (way >= 0) & (high - at >= depth), (way <= 0) & (at - low >= depth)
+        turned += int((way[down | up] != 0).sum())
+        way = np.where(down, -1, np.where(up, 1, way))
+        high, low = np.where(up | down, at, high), np.where(up | down, at, low)
+    return turned / len(lines)
+
+
+def level_share(loss: Values, floor: float) -> Estimate:
+    """Return the share of the box in regions that are level over 2 % of it, or over a sample's width if that is more.
+
+    NaN where noise hides it.
+    """
+    widths = [max(1, round(SIDE * (points - 1))) for points in loss.shape]
+    widest = max(width / (points - 1) / SIDE for width, points in zip(widths, loss.shape, strict=True))
+    bound = LEVEL * span(loss) * max(1.0, widest)
+    if floor > bound:
+        return Estimate(math.nan, math.nan, math.nan)
+    windows = np.lib.stride_tricks.sliding_window_view(loss, [width + 1 for width in widths])
+    ranges = np.ptp(windows, axis=tuple(range(-loss.ndim, 0)))
+    levels = np.where(np.isfinite(ranges), (ranges <= bound).astype(float), np.nan)
+    return jackknife(lambda part: _known_mean(part), levels, least=0.0, most=1.0)
+
+
+def short_exponent(between: Between, floor: float) -> Estimate:
+    """Return the power of the distance by which losses differ over short distances, by their mean absolute difference.
+
+    A jump here and there does not lower it: mean absolute differences over a jump grow like the distance. Distances
+    whose differences are within `floor` [loss unit] are left out; NaN where fewer than three are left.
+    """
+    rises = between.rise[np.isfinite(between.rise).all(axis=1)]
+    if len(rises) < 2 * GROUPS:
+        return Estimate(math.nan, math.nan, math.nan)
+    seen = rises.mean(axis=0) > max(floor, 0.0)
+    if seen.sum() < 3:
+        return Estimate(math.nan, math.nan, math.nan)
+    distances = np.log(np.array(DISTANCES)[seen])
+
+    def exponent(part: Values) -> float:
+        apart = part[:, seen].mean(axis=0)
+        return fit_line(distances, np.log(apart)).slope if (apart > 0).all() else math.nan
+
+    value = exponent(rises)
+    parts = np.array([exponent(np.delete(rises, slice(k, None, GROUPS), axis=0)) for k in range(GROUPS)])
+    if not np.isfinite(parts).all():
+        return Estimate(value, math.nan, math.nan)
+    reach = math.sqrt((GROUPS - 1) * float(np.var(parts))) * float(student(GROUPS - 1))
+    return Estimate(value, value - reach, value + reach)
+
+
+def rounding(loss: Values) -> float:
+    """Return the difference of losses that their own rounding makes, by the type that they were computed in."""
+    known = loss[np.isfinite(loss)]
+    if not known.size:
+        return 0.0
+    single = bool((known == known.astype(np.float32)).all())
+    return float(ROUNDING[np.float32 if single else np.float64] * np.abs(known).max())
+
+
+def _open(best: Values, rises: Values | None) -> Estimate:
+    """Return an exponent of at least `ROUGH` where samples tell those between them, and else NaN."""
+    if rises is None or not rises.size or not best.size:
+        return Estimate(math.nan, math.nan, math.nan)
+    left = float(np.mean(best**2) / max(float(np.mean(rises**2)), 1e-300))
+    return Estimate(math.nan, ROUGH if left < EXPLAINED else math.nan, math.nan)
+
+
+def _errors(loss: Values, slope: Values | None, between: Between) -> list[Values]:
+    return [np.abs(one - between.loss) for one in _predictions(loss, slope, between.place)]
+
+
+def _held_out(loss: Values, slope: Values | None) -> tuple[list[Values], Values]:
+    """Return how far samples are off what every second sample predicts, and how far off the nearest of those."""
+    even = (slice(None, None, 2),) * loss.ndim
+    coarse = loss[even]
+    at = np.argwhere(np.ones(loss.shape, bool))
+    at = at[(at % 2).any(axis=1) & (at <= 2 * (np.array(coarse.shape) - 1)).all(axis=1)]
+    truth = loss[tuple(at.T)]
+    found = _predictions(coarse, None if slope is None else 2 * slope[even], at / 2)
+    return [np.abs(one - truth) for one in found], _finite(truth - loss[tuple((at - at % 2).T)])
+
+
+def _predictions(loss: Values, slope: Values | None, places: Values) -> list[Values]:
+    """Return losses at places between samples: by straight lines and, where there are gradients, by cubics (Hermite)."""
+    linear = _interpolate(loss, None, places)
+    if slope is None:
+        return [linear]
+    cubic = _interpolate(loss, slope, places)
+    return [linear, np.where(np.isfinite(cubic), cubic, linear)]
+
+
+def _interpolate(loss: Values, slope: Values | None, places: Values) -> Values:
+    """Interpolate between the samples around each place, axis by axis, with slopes by a step along each axis, or without.
+
+    With them each cell is bicubic, its mixed derivative by differences of the gradients: exact for a quadratic.
+    """
+    rank = loss.ndim
+    cell = np.clip(np.floor(places).astype(int), 0, np.array(loss.shape) - 2)
+    t = places - cell
+    value = [[1 - t, t]] if slope is None else [[(1 + 2 * t) * (1 - t) ** 2, t**2 * (3 - 2 * t)]]
+    if slope is not None:
+        value.append([t * (1 - t) ** 2, t**2 * (t - 1)])
+    derivatives = {(0,) * rank: loss}
+    if slope is not None:
+        derivatives |= {tuple(int(k == axis) for k in range(rank)): slope[..., axis] for axis in range(rank)}
+        if rank == 2:
+            mixed = np.gradient(slope[..., 0], axis=1) + np.gradient(slope[..., 1], axis=0)
+            derivatives[1, 1] = mixed / 2
+    found = np.zeros(len(places))
+    for orders, array in derivatives.items():
+        for corner in np.ndindex((2,) * rank):
+            weight = np.prod([value[orders[k]][corner[k]][:, k] for k in range(rank)], axis=0)
+            found = found + weight * array[tuple((cell + np.array(corner)).T)]
+    return found
+
+
+def _step_slopes(dataset: xr.Dataset) -> Values:
+    slopes: Values = (box_slopes(dataset) / (np.array(plane_of(dataset).resolution) - 1))[..., ::-1]
+    return slopes
+
+
+def _finite(values: Values) -> Values:
+    return values[np.isfinite(values)]
+
+
+def _known_mean(values: Values) -> float:
+    known = _finite(values)
+    return float(known.mean()) if known.size else math.nan

@@ -1,0 +1,181 @@
+"""A landscape in words, at fixed scales: what its surface is like, whether it jumps, and whether its gradients help.
+
+Each word comes from one measure, is the same however many samples a slice has, and is left out where that measure does
+not resolve it. The rules were set on half of the functions of `benchmarks/words.py`, and on nothing else.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+import xarray as xr
+
+from ..objective import Objective
+from .discontinuities import Jumps
+from .floor import Floor
+from .following import FOLLOWING_WORDS, Following
+from .noise import noise_floor
+from .slice_floor import counted_from
+from .surface import EXTREME, RUGGED, SMOOTH, VERY_SMOOTH, Surface, look_between, measure_surface
+
+FAILS, FLAT, NOISY, LARGE_FLAT, DISCONTINUOUS = (
+    "mostly failed",
+    "flat",
+    "noisy losses",
+    "large flat regions",
+    "discontinuous",
+)
+WORDS = (FAILS, FLAT, NOISY, VERY_SMOOTH, SMOOTH, RUGGED, EXTREME, LARGE_FLAT, DISCONTINUOUS, *FOLLOWING_WORDS)
+MOSTLY = 0.5  # share of the samples from which a slice that failed is called nothing else
+REPEATS = 1.96 * math.sqrt(2)  # standard deviations: 95 % of repeats are closer
+NOISY_FROM = 0.01  # of the range
+
+
+@dataclass(frozen=True)
+class QuotedWord:
+    """Hold a word of somebody else's for a landscape, and whether it was measured too."""
+
+    word: str
+    measured: bool
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Hold what a slice's words are from: its surface, jumps and gradients, and what limits all of them.
+
+    `jumps` and `following` are None where they were not looked for, `deviation` [loss unit] is that of noise, None where
+    it was not measured, `floor` that of numerics, None without replicas. Of `samples` so many `failed`.
+    """
+
+    derived: ClassVar = ("words", "reasons", "open", "lines")
+
+    surface: Surface
+    jumps: Jumps | None
+    following: Following | None
+    samples: int
+    failed: int
+    deviation: float | None = None
+    floor: Floor | None = None
+
+    @property
+    def words(self) -> tuple[str, ...]:
+        """The words, in the order of `WORDS`."""
+        return tuple(word for word in WORDS if word in self.reasons)
+
+    @property
+    def reasons(self) -> dict[str, str]:
+        """Each word with the measure that it comes from."""
+        if self.failed > MOSTLY * self.samples:
+            return {FAILS: f"no loss at {self.failed / self.samples:.0%} of the samples"}
+        if self.surface.flat:
+            return {FLAT: self._flat()}
+        reasons = self._surface()
+        if self.surface.large_flat:
+            reasons[LARGE_FLAT] = f"{self.surface.level.value:.0%} of the box is level over 2 % of it"
+        if self.jumps is not None and self.jumps.found:
+            reasons.pop(VERY_SMOOTH, None)
+            reasons[DISCONTINUOUS] = self.jumps.sentence
+        if (noisy := self.noise) is not None and noisy >= NOISY_FROM:
+            reasons[NOISY] = self._noise()
+        return reasons | (self.following.reasons if self.following is not None else {})
+
+    @property
+    def open(self) -> tuple[str, ...]:
+        """What is not resolved, and why."""
+        if self.failed > MOSTLY * self.samples or self.surface.flat:
+            return ()
+        said = []
+        if self.surface.word is None:
+            said.append(f"surface not resolved: {self.surface.unresolved or 'no losses'}")
+        if self.surface.at_least:
+            said.append("not resolved whether it is extremely rugged")
+        if self.surface.large_flat is None:
+            said.append("large flat regions not resolved")
+        if self.jumps is None:
+            said.append("jumps not searched")
+        return tuple(said)
+
+    @property
+    def lines(self) -> tuple[str, ...]:
+        """What limits every word: noise, failed samples, and the numerical floor."""
+        numerics = self.floor.sentence() if self.floor is not None else "numerical floor not measured"
+        return self._noise(), _failed(self.failed, self.samples), numerics
+
+    @property
+    def noise(self) -> float | None:
+        """How far apart 95 % of repeats are at most, over the range; None where that is not known."""
+        if self.deviation is None or not self.surface.range > 0:
+            return None
+        return REPEATS * self.deviation / self.surface.range
+
+    def compare_words(self, said: Sequence[str]) -> tuple[QuotedWord, ...]:
+        """Return each word of somebody else's, and whether it was measured."""
+        return tuple(QuotedWord(word, word in self.reasons) for word in said)
+
+    def _surface(self) -> dict[str, str]:
+        found = self.surface
+        if found.word is None:
+            return {}
+        return {found.word: f"{found.describe()}{'; at least' if found.at_least else ''}"}
+
+    def _flat(self) -> str:
+        if self.surface.range == 0:
+            return "all losses are the same"
+        if self.surface.range <= self.surface.floor:
+            return (
+                f"losses range over {self.surface.range:.2g}, noise, numerics or rounding over {self.surface.floor:.2g}"
+            )
+        return f"losses range over {self.surface.range:.2g}, less than 1 % of what those of the environment do"
+
+    def _noise(self) -> str:
+        if self.noise is None:
+            return "noise not measured" if self.deviation is None else f"noise {self.deviation:.2g}"
+        return f"95 % of repeats agree within {100 * self.noise:.2g} % of the range"
+
+
+def _failed(failed: int, samples: int) -> str:
+    return f"no loss at {failed / samples:.1%} of the samples" if failed else "a loss at every sample"
+
+
+def judge(
+    objective: Objective,
+    datasets: Sequence[xr.Dataset],
+    *,
+    deviation: float,
+    floor: Floor | None = None,
+    own_range: float | None = None,
+    seed: int = 0,
+) -> list[Verdict]:
+    """Judge slices, with new evaluations of their objective, those of all slices in one batch."""
+    noisy = [max(noise_floor(deviation, one["loss"].size), counted_from(floor)) for one in datasets]
+    between = look_between(objective, datasets, seed=seed)
+    found = []
+    for dataset, least, one in zip(datasets, noisy, between, strict=True):
+        surface = measure_surface(dataset, floor=least, own_range=own_range, between=one)
+        found.append(_verdict(dataset, surface, None, None, deviation, floor))
+    return found
+
+
+def judge_samples(
+    dataset: xr.Dataset, *, deviation: float | None = None, floor: Floor | None = None, own_range: float | None = None
+) -> Verdict:
+    """Judge a slice from its samples alone: jumps are not searched, gradients compared where samples are close."""
+    least = max(noise_floor(deviation or 0.0, dataset["loss"].size), counted_from(floor))
+    surface = measure_surface(dataset, floor=least, own_range=own_range)
+    return _verdict(dataset, surface, None, None, deviation, floor)
+
+
+def _verdict(
+    dataset: xr.Dataset,
+    surface: Surface,
+    jumps: Jumps | None,
+    following: Following | None,
+    deviation: float | None,
+    floor: Floor | None,
+) -> Verdict:
+    loss = dataset["loss"].to_numpy()
+    return Verdict(surface, jumps, following, loss.size, int((~np.isfinite(loss)).sum()), deviation, floor)
