@@ -22,7 +22,9 @@ import torch
 import xarray as xr
 
 from ..identity import plane_of
+from ..lattice import lift_between
 from ..objective import Objective, evaluate
+from ..plane import Plane
 from ..statistics import Estimate, Values, fit_line, jackknife, share, student
 from .ruggedness import box_slopes, minima, span
 
@@ -36,7 +38,8 @@ MOST_FLOOR = 0.1  # of the range that noise or numerics may hide of a smooth sur
 SIDE, LEVEL, LARGE = 0.02, 1e-3, 0.2  # a region is level if over this part of the box it ranges over that of the losses
 EXPLAINED = 0.05  # share of squared differences between samples that their neighbours leave open; an exponent's is more
 ROUNDING = {np.float32: 2.0**-20, np.float64: 2.0**-48}  # of the largest loss that is no difference: eight last digits
-PLACES, STARTS = 64, 32  # between samples, and of these where differences over short distances begin
+PLACES = 64  # between samples, and where differences over short distances begin
+WAYS, WAY_POINTS = 24, 64  # minima whose way to a lower one is looked at, and at most so many steps along it
 DISTANCES = tuple(2.0**-power for power in (11, 10, 9, 8))  # parts of the box
 GROUPS = 8  # of starts, one of which is left out at a time
 
@@ -46,36 +49,85 @@ class Between:
     """Hold losses of a slice's plane at random places: `place` in steps along each axis of the array, and `loss`.
 
     `rise` is how far the loss differs from the first of them on over each of `DISTANCES`, shape (start, distance).
+    `prominence` [loss unit] is that of the slice's minima, the deepest first: of those looked into no more than what
+    lies on the straight way to a lower one.
     """
 
     place: Values
     loss: Values
     rise: Values
+    prominence: Values
 
 
-def look_between(objective: Objective, datasets: Sequence[xr.Dataset], *, seed: int = 0) -> list[Between]:
-    """Evaluate losses at random places of slices, those of all slices in one batch: 192 for each."""
-    planes, parts = [plane_of(dataset) for dataset in datasets], []
-    for number, plane in enumerate(planes):
-        generator = np.random.default_rng((seed, number))
-        unit = generator.random((PLACES, plane.rank))
-        axis, from_ = generator.integers(plane.rank, size=STARTS), unit[:STARTS, None, :]
-        way = np.where(from_ < 0.5, 1.0, -1.0) * np.eye(plane.rank)[axis][:, None, :]
-        near = from_ + way * np.array(DISTANCES)[None, :, None]
-        parts.append(np.concatenate([unit, near.reshape(-1, plane.rank)]))
-    sides = [(plane.upper - plane.lower).numpy() for plane in planes]
-    x = [
-        p.lift(torch.from_numpy(p.lower.numpy() + one * side))
-        for p, one, side in zip(planes, parts, sides, strict=True)
-    ]
-    losses = torch.split(evaluate(objective, torch.cat(x), grad=False).loss, [len(one) for one in parts])
-    found = []
-    for plane, part, loss in zip(planes, parts, losses, strict=True):
-        values = loss.double().numpy()
-        rises = np.abs(values[PLACES:].reshape(STARTS, -1) - values[:STARTS, None])
-        steps = (np.array(plane.resolution) - 1)[: plane.rank]
-        found.append(Between((part[:PLACES] * steps)[:, ::-1], values[:PLACES], rises))
-    return found
+def look_between(
+    objective: Objective, datasets: Sequence[xr.Dataset], floors: Sequence[float], *, seed: int = 0
+) -> list[Between]:
+    """Evaluate losses between the samples of slices, those of all slices in one batch.
+
+    These are 320 for each slice, and some for each of the minima that its samples show but for the lowest. Along a
+    narrow valley samples have minima that are not there: the straight way from one to the next has no pass.
+    """
+    planes, losses = [plane_of(one) for one in datasets], [_loss(one) for one in datasets]
+    drawn = [_draw(plane.rank, (seed, number)) for number, plane in enumerate(planes)]
+    ways = [_ways(loss, floor) for loss, floor in zip(losses, floors, strict=True)]
+    x = []
+    for plane, part, way in zip(planes, drawn, ways, strict=True):
+        steps = np.array(plane.resolution)[::-1] - 1
+        x.append(lift_between(plane, np.concatenate([part * steps, *way.points])))
+    found = torch.split(evaluate(objective, torch.cat(x), grad=False).loss, [len(one) for one in x])
+    return [_between(*each) for each in zip(planes, drawn, ways, found, strict=True)]
+
+
+def _between(plane: Plane, drawn: Values, ways: _Ways, found: torch.Tensor) -> Between:
+    values, steps = found.double().numpy(), np.array(plane.resolution)[::-1] - 1
+    rises = np.abs(values[PLACES : len(drawn)].reshape(PLACES, -1) - values[:PLACES, None])
+    return Between(drawn[:PLACES] * steps, values[:PLACES], rises, ways.prominences(values[len(drawn) :]))
+
+
+def _draw(rank: int, seed: tuple[int, int]) -> Values:
+    """Return random places in shares of the box, and those at `DISTANCES` from each, along a random axis."""
+    generator = np.random.default_rng(seed)
+    start = generator.random((PLACES, rank))
+    axis = np.eye(rank)[generator.integers(rank, size=PLACES)]
+    near = start[:, None] + np.where(start < 0.5, axis, -axis)[:, None] * np.array(DISTANCES)[:, None]
+    return np.concatenate([start, near.reshape(-1, rank)])
+
+
+@dataclass(frozen=True, eq=False)
+class _Ways:
+    """Hold the straight ways from minima of a slice to the nearest lower ones; `prominence` is by the samples."""
+
+    prominence: Values
+    lowest: Values
+    points: tuple[Values, ...]
+
+    def prominences(self, losses: Values) -> Values:
+        """Return the prominence of each minimum, with the losses at the points of all ways."""
+        found = self.prominence.copy()
+        ends = np.cumsum([len(one) for one in self.points])
+        for number, way in enumerate(np.split(losses, ends[:-1]) if len(ends) else []):
+            found[number + 1] = np.fmin(found[number + 1], max(0.0, float(np.max(way) - self.lowest[number])))
+        if len(self.points) == WAYS and (found[1 : WAYS + 1] < self.prominence[1 : WAYS + 1] / 2).all():
+            found[WAYS + 1 :] = 0.0  # they are less deep than those that are all none
+        return found
+
+
+def _ways(loss: Values, floor: float) -> _Ways:
+    whole, known = span(loss), minima(loss) if np.isfinite(loss).any() else None
+    if known is None or not whole > floor:
+        return _Ways(np.zeros(0), np.zeros(0), ())
+    depth = max(floor, LEAST * whole)
+    some = int((known.depth > max(floor, depth / BAND)).sum())
+    places = np.stack(np.unravel_index(known.sample[:some], loss.shape), axis=-1).astype(float)
+    low, points = loss.ravel()[known.sample[:some]], list[Values]()
+    rugged = max(turning_points(loss, axis, depth) for axis in range(loss.ndim)) >= MANY_TURNS
+    for one in range(1, 1 if rugged else min(some, WAYS + 1)):
+        lower = np.flatnonzero((low < low[one]) | ((low == low[one]) & (np.arange(some) < one)))
+        apart = np.linalg.norm(places[lower] - places[one], axis=1)
+        steps = max(4, min(WAY_POINTS, math.ceil(2 * apart.min())))
+        along = (np.arange(1, steps) / steps)[:, None]
+        points.append(places[one] + along * (places[lower[apart.argmin()]] - places[one]))
+    return _Ways(known.depth, low[1 : len(points) + 1], tuple(points))
 
 
 @dataclass(frozen=True)
@@ -133,7 +185,7 @@ def measure_surface(
 
     `floor` [loss unit] is what noise or numerics alone put losses apart by, `own_range` that of the whole environment.
     """
-    loss = dataset["loss"].transpose("v", "u", missing_dims="ignore").to_numpy().astype(float)
+    loss = _loss(dataset)
     whole, floor = span(loss), max(floor, rounding(loss))
     if not whole > max(floor, LEAST * (own_range or 0.0)):
         none = Estimate(math.nan, math.nan, math.nan)
@@ -146,8 +198,8 @@ def measure_surface(
     best = min(known, key=lambda one: (np.mean(one > depth) if len(one) else 1.0, np.mean(one) if len(one) else 1.0))
     off = share(int((best > depth).sum()), len(best))
     bands = [max(floor, depth * BAND), depth, max(floor, depth / BAND)]
-    deepest = minima(loss)
-    counts = [max(1, deepest.count(bound)) for bound in bands]
+    deepest = minima(loss).depth if between is None else between.prominence
+    counts = [max(1, int((deepest > bound).sum())) for bound in bands]
     turned = [[turning_points(loss, axis, bound) for axis in range(loss.ndim)[::-1]] for bound in bands]
     turns = tuple(Estimate(middle, low, high) for low, middle, high in zip(*turned, strict=True))
     words = [_word(max(lines), count) for lines, count in zip(turned, counts, strict=True)]
@@ -319,6 +371,10 @@ def _interpolate(loss: Values, slope: Values | None, places: Values) -> Values:
             weight = np.prod([value[orders[k]][corner[k]][:, k] for k in range(rank)], axis=0)
             found = found + weight * array[tuple((cell + np.array(corner)).T)]
     return found
+
+
+def _loss(dataset: xr.Dataset) -> Values:
+    return dataset["loss"].transpose("v", "u", missing_dims="ignore").to_numpy().astype(float)
 
 
 def _step_slopes(dataset: xr.Dataset) -> Values:

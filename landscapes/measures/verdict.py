@@ -152,7 +152,7 @@ def judge(
 ) -> list[Verdict]:
     """Judge slices, with new evaluations of their objective, those of all slices in one batch."""
     noisy = [max(noise_floor(deviation, one["loss"].size), counted_from(floor)) for one in datasets]
-    between = look_between(objective, datasets, seed=seed)
+    between = look_between(objective, datasets, noisy, seed=seed)
     found = []
     for dataset, least, one in zip(datasets, noisy, between, strict=True):
         surface = measure_surface(dataset, floor=least, own_range=own_range, between=one)
