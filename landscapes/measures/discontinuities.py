@@ -230,7 +230,8 @@ class _Search:
         left = self.most - int((~unseen).sum())
         each = np.bincount(self.line[unseen], minlength=self.lines)[order]
         self.drawn = order[:left] if (self.state == JUMP).any() else order[np.cumsum(each) <= left]
-        return self._first(np.flatnonzero(unseen & np.isin(self.line, self.drawn)), left)
+        fits = np.isin(self.line, self.drawn) if len(self.drawn) else True  # else at least the next strongest traces
+        return self._first(np.flatnonzero(unseen & fits), left)
 
     def _first(self, pairs: NDArray[np.intp], most: int) -> NDArray[np.intp]:
         """Return so many pairs: the strongest of each line, then the second of each, and so on."""
@@ -364,8 +365,8 @@ class _Batch:
         self.objective, self.planes, self.owner = objective, planes, owner
         self.counts = np.zeros(len(planes), int)
 
-    def losses(self, u: Float[Values, "pair *places rank"], wanted: NDArray[np.bool_]) -> Float[Values, "pair *places"]:
-        """Return the losses of some of the pairs, NaN for the others.
+    def losses(self, u: Float[Values, "pair *places rank"], wanted: NDArray[np.bool_]) -> Values:
+        """Return the losses of some of the pairs, shape (pair, *places), NaN for the others.
 
         An engine that compiles for each size of batch evaluates all of them.
         """
