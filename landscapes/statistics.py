@@ -87,6 +87,15 @@ def share(hits: int, tries: int) -> Estimate:
     return Estimate(hits / tries, low, high)
 
 
+def upper_bound(hits: int, tries: int) -> float:
+    """Return the largest share that so few hits do not rule out, one-sided (Clopper & Pearson 1934); 1 of no tries."""
+    if hits >= tries:
+        return 1.0
+    from scipy.special import betaincinv
+
+    return float(betaincinv(hits + 1, tries - hits, CONFIDENCE))
+
+
 def mean(values: Values, *, least: float = -np.inf, most: float = np.inf) -> Estimate:
     """Return the mean of independent values, NaN left out, with Student's interval."""
     known = values[np.isfinite(values)]
