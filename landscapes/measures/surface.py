@@ -193,55 +193,106 @@ def measure_surface(
         return Surface(whole, floor, floor, flat, none, (none,) * loss.ndim, none, none, none, False, None, False, "")
     depth = max(floor, LEAST * whole)
     slope = _step_slopes(dataset) if "grad" in dataset else None
-    errors, rises = _held_out(loss, slope) if between is None else (_errors(loss, slope, between), None)
-    known = [one[np.isfinite(one)] for one in errors]
-    best = min(known, key=lambda one: (np.mean(one > depth) if len(one) else 1.0, np.mean(one) if len(one) else 1.0))
-    off = share(int((best > depth).sum()), len(best))
+    known = _Samples(loss, slope, depth) if between is None else _Probed(loss, slope, depth, between, floor)
     bands = [max(floor, depth * BAND), depth, max(floor, depth / BAND)]
-    deepest = minima(loss).depth if between is None else between.prominence
-    counts = [max(1, int((deepest > bound).sum())) for bound in bands]
+    counts = [max(1, int((known.prominence > bound).sum())) for bound in bands]
     turned = [[turning_points(loss, axis, bound) for axis in range(loss.ndim)[::-1]] for bound in bands]
     turns = tuple(Estimate(middle, low, high) for low, middle, high in zip(*turned, strict=True))
     words = [_word(max(lines), count) for lines, count in zip(turned, counts, strict=True)]
-    holder = short_exponent(between, floor) if between is not None else _open(best, rises)
-    halved = words[1] if between is not None else _halved(loss, depth)
-    word, least, why = _judge(words, halved, off, holder, floor / whole)
+    word, least, why = _judge(words, known, floor / whole)
     return Surface(
         whole, floor, depth, False, Estimate(*map(float, (counts[1], counts[0], counts[2]))), turns,
-        level_share(loss, floor), holder, off, between is not None, word, least, why,
+        level_share(loss, floor), known.holder, known.off, between is not None, word, least, why,
     )  # fmt: skip
 
 
-def _judge(
-    words: Sequence[str], halved: str, off: Estimate, holder: Estimate, hidden: float
-) -> tuple[str | None, bool, str]:
+class _Probed:
+    """Say of the samples of a slice whether they tell what lies between them, by new evaluations."""
+
+    def __init__(self, loss: Values, slope: Values | None, depth: float, between: Between, floor: float) -> None:
+        error = _nearest([np.abs(one - between.loss) for one in _predictions(loss, slope, between.place)], depth)
+        self.off = share(int((error > depth).sum()), int(np.isfinite(error).sum()))
+        self.prominence, self.holder = between.prominence, short_exponent(between, floor)
+        self.smooth = self.holder.low >= ROUGH
+
+    def doubt(self, word: str) -> str:
+        """Say why a word may not hold, nothing where it does."""
+        return ""
+
+
+class _Samples:
+    """Say of the samples of a slice whether they tell what lies between them, by every second of them alone."""
+
+    def __init__(self, loss: Values, slope: Values | None, depth: float) -> None:
+        self.loss, self.slope, self.depth = loss, slope, depth
+        self.error, rise = _held_out(loss, slope, depth)
+        known = _finite(self.error)
+        self.off = share(int((known > depth).sum()), len(known))
+        self.minima = minima(loss)
+        self.prominence, self.holder = self.minima.depth, Estimate(math.nan, math.nan, math.nan)
+        self.smooth = bool(len(known)) and float(np.mean(known**2)) < EXPLAINED * float(np.mean(rise**2))
+
+    def doubt(self, word: str) -> str:
+        """Say why a word may not hold, nothing where it does."""
+        every, told = self._halved(), self._told()
+        if every != word:
+            return f"{word}, but {every} by every second sample"
+        if told != (self.prominence > self.depth).sum() and word != RUGGED:
+            return "some minima are no deeper than what samples do not tell"
+        largest, off = self._contradiction()
+        if off > UNDERSAMPLED:
+            return f"gradients contradict the losses at {100 * off:.0f} % of the steps between samples"
+        if largest > self.depth and word == VERY_SMOOTH:
+            return f"a step between samples that may be a jump, of {100 * largest / span(self.loss):.2g} % of the range"
+        return ""
+
+    def _halved(self) -> str:
+        part = self.loss[(slice(None, None, 2),) * self.loss.ndim]
+        turns = max(turning_points(part, axis, self.depth) for axis in range(part.ndim))
+        return _word(turns, minima(part).count(self.depth))
+
+    def _told(self) -> int:
+        """Count the minima that are twice as deep as samples around them are off."""
+        from scipy.ndimage import maximum_filter
+
+        around = maximum_filter(np.nan_to_num(self.error), size=3, mode="nearest").ravel()[self.minima.sample]
+        deep = self.minima.depth
+        return int(((deep > self.depth) & ((deep > 2 * around) | (np.arange(len(deep)) == 0))).sum())
+
+    def _contradiction(self) -> tuple[float, float]:
+        """Return the largest difference of neighbours that is not explained, and the share that gradients do not."""
+        steps, told = list[Values](), list[Values]()
+        for axis in range(self.loss.ndim):
+            difference = np.diff(self.loss, axis=axis)
+            steps.append(np.abs(np.diff(difference, axis=axis)).ravel() / 2)
+            if self.slope is not None:
+                pairs = np.take(self.slope[..., axis], range(self.loss.shape[axis] - 1), axis)
+                pairs = (pairs + np.take(self.slope[..., axis], range(1, self.loss.shape[axis]), axis)) / 2
+                told.append(np.abs(difference - pairs).ravel())
+        found = _finite(np.concatenate(told or steps))
+        if not found.size:
+            return 0.0, 0.0
+        return float(found.max()), float((found > self.depth).mean()) if told else 0.0
+
+
+def _judge(words: Sequence[str], known: _Probed | _Samples, hidden: float) -> tuple[str | None, bool, str]:
     """Return the word, whether it is one at least, and why there is none; `words` are those of the band of depths."""
-    hides = f"noise or numerics hide what is below {100 * hidden:.0f} % of the range"
     if words[0] == RUGGED:  # also where samples are too few: finer ones only add to the turns
-        if holder.high < ROUGH:
-            return EXTREME, False, ""
-        return RUGGED, not holder.low >= ROUGH, ""
-    if not off.value <= UNDERSAMPLED:
-        return None, False, f"the samples do not tell {100 * off.value:.0f} % of what lies between them"
+        return (EXTREME, False, "") if known.holder.high < ROUGH else (RUGGED, not known.smooth, "")
+    if not known.off.value <= UNDERSAMPLED:
+        return None, False, f"the samples do not tell {100 * known.off.value:.0f} % of what lies between them"
     if hidden > MOST_FLOOR:
-        return None, False, hides
+        return None, False, f"noise or numerics hide what is below {100 * hidden:.0f} % of the range"
     if len(set(words)) > 1:
         return None, False, f"{' or '.join(dict.fromkeys(words))}, by the depth from which minima count"
-    if halved != words[1]:
-        return None, False, f"{words[1]}, but {halved} by every second sample"
-    return words[1], False, ""
+    doubt = known.doubt(words[1])
+    return (None, False, doubt) if doubt else (words[1], False, "")
 
 
 def _word(turns: float, count: float) -> str:
     if turns >= MANY_TURNS:
         return RUGGED
     return SMOOTH if count > 1 else VERY_SMOOTH
-
-
-def _halved(loss: Values, depth: float) -> str:
-    part = loss[(slice(None, None, 2),) * loss.ndim]
-    turns = max(turning_points(part, axis, depth) for axis in range(part.ndim))
-    return _word(turns, minima(part).count(depth))
 
 
 def turning_points(loss: Values, axis: int, depth: float) -> float:
@@ -316,27 +367,26 @@ def rounding(loss: Values) -> float:
     return float(ROUNDING[np.float32 if single else np.float64] * np.abs(known).max())
 
 
-def _open(best: Values, rises: Values | None) -> Estimate:
-    """Return an exponent of at least `ROUGH` where samples tell those between them, and else NaN."""
-    if rises is None or not rises.size or not best.size:
-        return Estimate(math.nan, math.nan, math.nan)
-    left = float(np.mean(best**2) / max(float(np.mean(rises**2)), 1e-300))
-    return Estimate(math.nan, ROUGH if left < EXPLAINED else math.nan, math.nan)
-
-
-def _errors(loss: Values, slope: Values | None, between: Between) -> list[Values]:
-    return [np.abs(one - between.loss) for one in _predictions(loss, slope, between.place)]
-
-
-def _held_out(loss: Values, slope: Values | None) -> tuple[list[Values], Values]:
-    """Return how far samples are off what every second sample predicts, and how far off the nearest of those."""
+def _held_out(loss: Values, slope: Values | None, depth: float) -> tuple[Values, Values]:
+    """Return how far every other sample is off what those left predict, NaN at these, and off the nearest of them."""
     even = (slice(None, None, 2),) * loss.ndim
-    coarse = loss[even]
+    coarse, error = loss[even], np.full(loss.shape, np.nan)
     at = np.argwhere(np.ones(loss.shape, bool))
     at = at[(at % 2).any(axis=1) & (at <= 2 * (np.array(coarse.shape) - 1)).all(axis=1)]
     truth = loss[tuple(at.T)]
     found = _predictions(coarse, None if slope is None else 2 * slope[even], at / 2)
-    return [np.abs(one - truth) for one in found], _finite(truth - loss[tuple((at - at % 2).T)])
+    error[tuple(at.T)] = _nearest([np.abs(one - truth) for one in found], depth)
+    return error, _finite(truth - loss[tuple((at - at % 2).T)])
+
+
+def _nearest(errors: Sequence[Values], depth: float) -> Values:
+    """Return the errors of the prediction that is the most often right, and of those alike the nearest."""
+
+    def size(error: Values) -> tuple[float, float]:
+        known = _finite(error)
+        return (float(np.mean(known > depth)), float(np.mean(known))) if known.size else (1.0, math.inf)
+
+    return min(errors, key=size)
 
 
 def _predictions(loss: Values, slope: Values | None, places: Values) -> list[Values]:

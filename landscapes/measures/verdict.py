@@ -15,7 +15,7 @@ import numpy as np
 import xarray as xr
 
 from ..objective import Objective
-from .discontinuities import Jumps
+from .discontinuities import Count, Jumps, find_jumps
 from .floor import Floor
 from .following import FOLLOWING_WORDS, Following
 from .noise import noise_floor
@@ -33,6 +33,7 @@ WORDS = (FAILS, FLAT, NOISY, VERY_SMOOTH, SMOOTH, RUGGED, EXTREME, LARGE_FLAT, D
 MOSTLY = 0.5  # share of the samples from which a slice that failed is called nothing else
 REPEATS = 1.96 * math.sqrt(2)  # standard deviations: 95 % of repeats are closer
 NOISY_FROM = 0.01  # of the range
+PAIRS = 48  # of samples that are looked into for jumps
 
 
 @dataclass(frozen=True)
@@ -148,15 +149,23 @@ def judge(
     deviation: float,
     floor: Floor | None = None,
     own_range: float | None = None,
+    pairs: int = PAIRS,
     seed: int = 0,
+    events: Count | None = None,
 ) -> list[Verdict]:
-    """Judge slices, with new evaluations of their objective, those of all slices in one batch."""
-    noisy = [max(noise_floor(deviation, one["loss"].size), counted_from(floor)) for one in datasets]
-    between = look_between(objective, datasets, noisy, seed=seed)
+    """Judge slices by new evaluations of their objective, those of all slices in one batch.
+
+    `deviation` [loss unit] is that of the losses' noise, `floor` the numerical floor, `own_range` [loss unit] the range
+    of the whole environment where that is known. At most so many `pairs` of each slice are looked into for jumps, which
+    `events` explain.
+    """
+    floors = [least_difference(one, deviation, floor) for one in datasets]
+    between = look_between(objective, datasets, floors, seed=seed)
+    jumps = find_jumps(objective, datasets, least=floors, most=pairs, seed=seed, events=events)
     found = []
-    for dataset, least, one in zip(datasets, noisy, between, strict=True):
+    for dataset, least, one, steps in zip(datasets, floors, between, jumps, strict=True):
         surface = measure_surface(dataset, floor=least, own_range=own_range, between=one)
-        found.append(_verdict(dataset, surface, None, None, deviation, floor))
+        found.append(_verdict(dataset, surface, steps, None, deviation, floor))
     return found
 
 
@@ -164,9 +173,14 @@ def judge_samples(
     dataset: xr.Dataset, *, deviation: float | None = None, floor: Floor | None = None, own_range: float | None = None
 ) -> Verdict:
     """Judge a slice from its samples alone: jumps are not searched, gradients compared where samples are close."""
-    least = max(noise_floor(deviation or 0.0, dataset["loss"].size), counted_from(floor))
+    least = least_difference(dataset, deviation or 0.0, floor)
     surface = measure_surface(dataset, floor=least, own_range=own_range)
     return _verdict(dataset, surface, None, None, deviation, floor)
+
+
+def least_difference(dataset: xr.Dataset, deviation: float, floor: Floor | None) -> float:
+    """Return the difference of losses from which on it is more than noise and numerics [loss unit]."""
+    return max(noise_floor(float(np.nan_to_num(deviation)), dataset["loss"].size), counted_from(floor))
 
 
 def _verdict(
