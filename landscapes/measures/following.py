@@ -18,7 +18,6 @@ import xarray as xr
 from jaxtyping import Float
 from torch import Tensor
 
-from ..identity import plane_of
 from ..objective import Objective, Status, evaluate
 from ..plane import Plane
 from ..statistics import Estimate, Values, mean, share
@@ -38,9 +37,11 @@ FEWEST = 5  # points that show a slope, without which there is no grade
 MOSTLY = 0.5  # share uphill beyond which gradients are opposite: random directions are uphill as often as downhill
 NOTABLE = 0.1  # share of gradients that are zero, biased or missing beyond which it is worth a word
 RARE = 0.01  # share of gradients that explode beyond which it is: one of them undoes many steps
+SHOWN = 4  # deviations of a difference by noise alone, beyond which it is a slope: it is one by chance at 1 in 3000
 VANISHING = 1e-9  # ranges per side of the box, up to which a gradient is zero
 EXPLODES = 100  # times the slope over 1 % of the box, and ranges per side of the box, beyond which a gradient explodes
 WIDTH = 0.01  # of the box: the standard deviation of the Gaussian under which means of gradients are held to slopes
+UNKNOWN = Estimate(math.nan, math.nan, math.nan)
 NEAR = 2  # times a scale, or its part, that differences of samples may be over instead
 
 
@@ -49,8 +50,8 @@ class ScaleCosine:
     """Hold how gradients follow differences over one `scale`, a part of the box.
 
     `width` is the part that the differences are really over, which the samples of a stored slice decide. Of `of` points
-    `points` show a slope above the noise and have a gradient that is not zero. Of these are the mean `cosine` of the
-    two, its three `quartiles`, and the share that is `uphill` (below zero).
+    that have a gradient and show a slope above the noise, `points` have one that is not zero. Of these are the mean
+    `cosine` of the two, its three `quartiles`, and the share that is `uphill` (below zero).
     """
 
     derived: ClassVar = ("grade",)
@@ -76,12 +77,12 @@ class ScaleCosine:
         return NOT if high < FOLLOWS_LOOSELY else None
 
     def describe(self) -> str:
-        """Say what the mean cosine is, and over what."""
+        """Say what the mean cosine is, and its grade."""
         if not self.points:
-            return f"no slope above the noise over {self.scale:.1%} of the box"
-        value, low, high = self.cosine.value, self.cosine.low, self.cosine.high
-        interval = f" ({low:z.2f} to {high:z.2f})" if low < high else ""
-        return f"{value:z.2f}{interval} over {_percent(self.width)} of the box"
+            return "all gradients zero" if self.of else "no slope above the noise"
+        value, low, high = (f"{one:z.2f}" for one in (self.cosine.value, self.cosine.low, self.cosine.high))
+        interval = f" ({low} to {high})" if low != high and math.isfinite(self.cosine.low) else ""
+        return f"{value}{interval}, {self.grade or 'not resolved'}".replace("-", "\N{MINUS SIGN}")
 
 
 @dataclass(frozen=True)
@@ -89,23 +90,27 @@ class Following:
     """Hold how gradients follow the landscape at several `scales`, and where they are of no use.
 
     Shares are of `points`, NaN where they are not known: of those with a loss, the gradient is `missing`; of those with
-    a gradient, it is `zero`, or `exploding`; of those that show a slope over 1 % of the box, it is `stuck` at zero
-    nevertheless; of some more closely looked at, its mean over a Gaussian is `biased`.
+    a gradient, it is `zero`, or `exploding`; of some more closely looked at, its mean over a Gaussian is `biased`.
     """
 
-    derived: ClassVar = ("words", "reasons", "sentence")
+    derived: ClassVar = ("stuck", "words", "reasons", "sentence")
 
     scales: tuple[ScaleCosine, ...]
     points: int
     missing: Estimate
     zero: Estimate
-    stuck: Estimate
     exploding: Estimate
     biased: Estimate
 
     def at(self, scale: float) -> ScaleCosine | None:
         """Return how gradients follow over one of `SCALES`, None where the samples do not allow it."""
         return next((one for one in self.scales if one.scale == scale), None)
+
+    @property
+    def stuck(self) -> Estimate:
+        """Share of gradients that are zero nevertheless among the points that show a slope over 1 % of the box."""
+        chief = self.at(CHIEF)
+        return UNKNOWN if chief is None else share(chief.of - chief.points, chief.of)
 
     @property
     def words(self) -> tuple[str, ...]:
@@ -133,23 +138,16 @@ class Following:
             reasons[BIASED] = f"their mean is not the slope of the mean loss at {_share(self.biased)} of the points"
         useless = self.missing.low > NOTABLE or self.stuck.low > NOTABLE
         if chief is not None and chief.grade and not (useless and chief.grade != NOT):
-            reasons[WORD_OF[chief.grade]] = f"mean cosine {chief.describe()}{self._exceptions(chief)}"
+            others = any(one.grade not in (None, chief.grade) for one in self.scales)
+            about = "mean cosine of gradient and slope over 1 % of the box"
+            reasons[WORD_OF[chief.grade]] = self.sentence if others else f"{about}: {chief.describe()}"
         return reasons
-
-    def _exceptions(self, chief: ScaleCosine) -> str:
-        """Say at which scales gradients follow otherwise than at the chief one."""
-        others = [one for one in self.scales if one.grade not in (None, chief.grade)]
-        return "".join(
-            f"; {one.grade if one.grade != FOLLOW else 'but they follow'}, {one.describe()}" for one in others
-        )
 
     @property
     def sentence(self) -> str:
         """Say in a line how gradients follow at each scale."""
-        known = [one for one in self.scales if one.points]
-        if not known:
-            return "the loss has no slope above the noise that a gradient could follow"
-        return "mean cosine of gradient and slope: " + ", ".join(one.describe() for one in known)
+        said = [f"{100 * one.width:.2g} %: {one.describe()}" for one in self.scales]
+        return "mean cosine of gradient and slope, by parts of the box: " + ("; ".join(said) or "not known")
 
 
 def measure_following(
@@ -196,7 +194,7 @@ def follow_samples(
     """
     if "grad" not in dataset:
         return None
-    plane, loss = plane_of(dataset), dataset["loss"].transpose("v", "u", missing_dims="ignore").to_numpy()
+    loss = dataset["loss"].transpose("v", "u", missing_dims="ignore").to_numpy()
     slope, status = box_slopes(dataset), dataset["status"].transpose("v", "u", missing_dims="ignore").to_numpy()
     asked = np.flatnonzero(np.isfinite(slope).all(axis=-1) | (status == Status.NO_GRADIENT))
     chosen = np.unravel_index(np.sort(np.random.default_rng(seed).permutation(asked)[:points]), loss.shape)
@@ -210,9 +208,6 @@ def follow_samples(
     return _conclude(slope[chosen], loss[chosen], over, span(loss), deviation, UNKNOWN)
 
 
-UNKNOWN = Estimate(math.nan, math.nan, math.nan)
-
-
 def _conclude(
     slope: Float[Values, "point axis"],
     loss: Float[Values, " point"],
@@ -224,16 +219,17 @@ def _conclude(
     """Sum up slopes by gradients [loss unit per side] and differences `over` scales, each with its width."""
     size = np.linalg.norm(slope, axis=-1)
     having, zero = np.isfinite(size), size <= VANISHING * whole
-    scales, stuck, exploding = list[ScaleCosine](), UNKNOWN, UNKNOWN
+    scales, exploding = list[ScaleCosine](), UNKNOWN
     for scale, width, difference in over:
         noise = math.sqrt(2) * deviation / width
-        shown = having & (np.linalg.norm(difference, axis=-1) > 2 * noise)
+        shown = having & (np.linalg.norm(difference, axis=-1) > SHOWN * noise)
         cosine = agreement(slope, difference, noise)["cosine"][shown & ~zero]
         quartiles = np.quantile(cosine, (0.25, 0.5, 0.75)) if len(cosine) else np.full(3, np.nan)
         average, uphill = mean(cosine, least=-1, most=1), share(int((cosine < 0).sum()), len(cosine))
-        scales.append(ScaleCosine(scale, width, len(cosine), len(loss), average, tuple(quartiles.tolist()), uphill))
+        scales.append(
+            ScaleCosine(scale, width, len(cosine), int(shown.sum()), average, tuple(quartiles.tolist()), uphill)
+        )
         if scale == CHIEF:
-            stuck = share(int((shown & zero).sum()), int(shown.sum()))
             known = having & np.isfinite(difference).all(axis=-1)
             too_large = (size > EXPLODES * np.linalg.norm(difference, axis=-1)) & (size > EXPLODES * whole)
             exploding = share(int((known & too_large).sum()), int(known.sum()))
@@ -243,7 +239,6 @@ def _conclude(
         points=len(loss),
         missing=share(int((there & ~having).sum()), int(there.sum())),
         zero=share(int((having & zero).sum()), int(having.sum())),
-        stuck=stuck,
         exploding=exploding,
         biased=biased,
     )
@@ -253,10 +248,6 @@ def _biased(objective: Objective, plane: Plane, u: Float[Tensor, "point rank"], 
     found = smoothed_slopes(objective, plane, u, widths=(WIDTH,), pairs=pairs, seed=seed)
     known = np.isfinite(found["bias"].to_numpy()).all(axis=-1)
     return share(int(find_bias(found).to_numpy()[known].sum()), int(known.sum()))
-
-
-def _percent(part: float) -> str:
-    return f"{100 * part:.2g} %"
 
 
 def _share(estimate: Estimate) -> str:
