@@ -38,9 +38,9 @@ MOST_FLOOR = 0.1  # of the range that noise or numerics may hide of a smooth sur
 SIDE, LEVEL, LARGE = 0.02, 1e-3, 0.2  # a region is level if over this part of the box it ranges over that of the losses
 EXPLAINED = 0.05  # share of squared differences between samples that their neighbours leave open; an exponent's is more
 ROUNDING = {np.float32: 2.0**-20, np.float64: 2.0**-48}  # of the largest loss that is no difference: eight last digits
-PLACES = 64  # between samples, and where differences over short distances begin
+PLACES = 96  # between samples, and where differences over short distances begin
 WAYS, WAY_POINTS = 24, 64  # minima whose way to a lower one is looked at, and at most so many steps along it
-DISTANCES = tuple(2.0**-power for power in (11, 10, 9, 8))  # parts of the box
+DISTANCES = tuple(2.0**-power for power in (11, 10, 9, 8))  # from there, in parts of the box
 GROUPS = 8  # of starts, one of which is left out at a time
 
 
@@ -60,15 +60,21 @@ class Between:
 
 
 def look_between(
-    objective: Objective, datasets: Sequence[xr.Dataset], floors: Sequence[float], *, seed: int = 0
+    objective: Objective,
+    datasets: Sequence[xr.Dataset],
+    floors: Sequence[float],
+    *,
+    places: int = PLACES,
+    seed: int = 0,
 ) -> list[Between]:
     """Evaluate losses between the samples of slices, those of all slices in one batch.
 
-    These are 320 for each slice, and some for each of the minima that its samples show but for the lowest. Along a
-    narrow valley samples have minima that are not there: the straight way from one to the next has no pass.
+    These are five for each of so many `places` of a slice, and some for each of the minima that its samples show but
+    for the lowest. Along a narrow valley samples have minima that are not there: the straight way to the next has no
+    pass.
     """
     planes, losses = [plane_of(one) for one in datasets], [_loss(one) for one in datasets]
-    drawn = [_draw(plane.rank, (seed, number)) for number, plane in enumerate(planes)]
+    drawn = [_draw(plane.rank, places, (seed, number)) for number, plane in enumerate(planes)]
     ways = [_ways(loss, floor) for loss, floor in zip(losses, floors, strict=True)]
     x = []
     for plane, part, way in zip(planes, drawn, ways, strict=True):
@@ -80,15 +86,16 @@ def look_between(
 
 def _between(plane: Plane, drawn: Values, ways: _Ways, found: torch.Tensor) -> Between:
     values, steps = found.double().numpy(), np.array(plane.resolution)[::-1] - 1
-    rises = np.abs(values[PLACES : len(drawn)].reshape(PLACES, -1) - values[:PLACES, None])
-    return Between(drawn[:PLACES] * steps, values[:PLACES], rises, ways.prominences(values[len(drawn) :]))
+    places = len(drawn) // (1 + len(DISTANCES))
+    rises = np.abs(values[places : len(drawn)].reshape(places, -1) - values[:places, None])
+    return Between(drawn[:places] * steps, values[:places], rises, ways.prominences(values[len(drawn) :]))
 
 
-def _draw(rank: int, seed: tuple[int, int]) -> Values:
+def _draw(rank: int, places: int, seed: tuple[int, int]) -> Values:
     """Return random places in shares of the box, and those at `DISTANCES` from each, along a random axis."""
     generator = np.random.default_rng(seed)
-    start = generator.random((PLACES, rank))
-    axis = np.eye(rank)[generator.integers(rank, size=PLACES)]
+    start = generator.random((places, rank))
+    axis = np.eye(rank)[generator.integers(rank, size=places)]
     near = start[:, None] + np.where(start < 0.5, axis, -axis)[:, None] * np.array(DISTANCES)[:, None]
     return np.concatenate([start, near.reshape(-1, rank)])
 

@@ -14,13 +14,15 @@ from typing import ClassVar
 import numpy as np
 import xarray as xr
 
+from ..identity import plane_of
 from ..objective import Objective
 from .discontinuities import Count, Jumps, find_jumps
 from .floor import Floor
-from .following import FOLLOWING_WORDS, Following
+from .following import FOLLOWING_WORDS, Following, follow_samples, measure_following
 from .noise import noise_floor
+from .ruggedness import span
 from .slice_floor import counted_from
-from .surface import EXTREME, RUGGED, SMOOTH, VERY_SMOOTH, Surface, look_between, measure_surface
+from .surface import PLACES, EXTREME, RUGGED, SMOOTH, VERY_SMOOTH, Surface, look_between, measure_surface
 
 FAILS, FLAT, NOISY, LARGE_FLAT, DISCONTINUOUS = (
     "mostly failed",
@@ -34,6 +36,7 @@ MOSTLY = 0.5  # share of the samples from which a slice that failed is called no
 REPEATS = 1.96 * math.sqrt(2)  # standard deviations: 95 % of repeats are closer
 NOISY_FROM = 0.01  # of the range
 PAIRS = 48  # of samples that are looked into for jumps
+POINTS, SMOOTHED = 100, 36  # where gradients are held against slopes, and against those of the smoothed loss
 
 
 @dataclass(frozen=True)
@@ -149,23 +152,46 @@ def judge(
     deviation: float,
     floor: Floor | None = None,
     own_range: float | None = None,
+    places: int = PLACES,
     pairs: int = PAIRS,
+    points: int = POINTS,
+    smoothed: int = SMOOTHED,
     seed: int = 0,
     events: Count | None = None,
 ) -> list[Verdict]:
     """Judge slices by new evaluations of their objective, those of all slices in one batch.
 
     `deviation` [loss unit] is that of the losses' noise, `floor` the numerical floor, `own_range` [loss unit] the range
-    of the whole environment where that is known. At most so many `pairs` of each slice are looked into for jumps, which
-    `events` explain.
+    of the whole environment where that is known. Losses between samples are those of so many `places`, see
+    `look_between`. At most so many `pairs` of each slice are looked into for jumps, which
+    `events` explain. Gradients are held against slopes at so many `points`, and against those of the smoothed loss at
+    `smoothed` of them.
     """
     floors = [least_difference(one, deviation, floor) for one in datasets]
-    between = look_between(objective, datasets, floors, seed=seed)
+    between = look_between(objective, datasets, floors, places=places, seed=seed)
     jumps = find_jumps(objective, datasets, least=floors, most=pairs, seed=seed, events=events)
+    following = _follow(objective, datasets, deviation=deviation, points=points, smoothed=smoothed, seed=seed)
     found = []
-    for dataset, least, one, steps in zip(datasets, floors, between, jumps, strict=True):
-        surface = measure_surface(dataset, floor=least, own_range=own_range, between=one)
-        found.append(_verdict(dataset, surface, steps, None, deviation, floor))
+    for dataset, least, *parts in zip(datasets, floors, between, jumps, following, strict=True):
+        surface = measure_surface(dataset, floor=least, own_range=own_range, between=parts[0])
+        found.append(_verdict(dataset, surface, parts[1], parts[2], deviation, floor))
+    return found
+
+
+def _follow(
+    objective: Objective, datasets: Sequence[xr.Dataset], *, deviation: float, points: int, smoothed: int, seed: int
+) -> Sequence[Following | None]:
+    """Measure how gradients follow on slices that have gradients, None for the others."""
+    found: list[Following | None] = [None] * len(datasets)
+    able = [number for number, one in enumerate(datasets) if "grad" in one]
+    if able:
+        planes = [plane_of(datasets[number]) for number in able]
+        ranges = [float(np.nan_to_num(span(datasets[number]["loss"].to_numpy()))) for number in able]
+        told = measure_following(
+            objective, planes, ranges=ranges, deviation=deviation, points=points, smoothed=smoothed, seed=seed
+        )
+        for number, one in zip(able, told, strict=True):
+            found[number] = one
     return found
 
 
@@ -175,7 +201,8 @@ def judge_samples(
     """Judge a slice from its samples alone: jumps are not searched, gradients compared where samples are close."""
     least = least_difference(dataset, deviation or 0.0, floor)
     surface = measure_surface(dataset, floor=least, own_range=own_range)
-    return _verdict(dataset, surface, None, None, deviation, floor)
+    following = follow_samples(dataset, deviation=float(np.nan_to_num(deviation or 0.0)), points=dataset["loss"].size)
+    return _verdict(dataset, surface, None, following, deviation, floor)
 
 
 def least_difference(dataset: xr.Dataset, deviation: float, floor: Floor | None) -> float:
