@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -79,12 +79,49 @@ def share(hits: int, tries: int) -> Estimate:
     """Return a share with its exact binomial interval (Clopper & Pearson 1934)."""
     if not tries:
         return Estimate(math.nan, math.nan, math.nan)
+    return Estimate(hits / tries, *_binomial(hits, tries))
+
+
+def clustered_share(hits: Values, clusters: Sequence[NDArray[np.intp]]) -> Estimate:
+    """Return the share of tries that are hits, shape (try,), and its interval where tries of a cluster are alike.
+
+    `clusters` are the numbers of the clusters of each try, by one or several groupings, of which the one counts that
+    says least; of none there is no interval, as all tries were made that there are. It is the exact binomial interval
+    of as many independent tries as would vary as much, corrected for few clusters: Korn & Graubard 1998, Survey
+    Methodology 24(2). Where no two clusters differ these are as many as there are clusters.
+    """
+    tries = len(hits)
+    if not tries:
+        return Estimate(math.nan, math.nan, math.nan)
+    value = float(hits.mean())
+    if not clusters:
+        return Estimate(value, math.nan, math.nan)
+    count = min(_independent(hits, one) for one in clusters)
+    return Estimate(value, *(_binomial(value * count, count) if count > 0 else (0.0, 1.0)))
+
+
+def _independent(hits: Values, cluster: NDArray[np.intp]) -> float:
+    """Return how many independent tries would tell a share as well as those of clusters do."""
+    names, of = np.unique(cluster, return_inverse=True)
+    if len(names) < 2:
+        return 0.0
+    value = hits.mean()
+    sums = np.bincount(of, hits - value)
+    variance = len(names) / (len(names) - 1) * float(np.square(sums).sum()) / len(hits) ** 2
+    spread = value * (1 - value)
+    count = min(len(hits), spread / variance) if variance > 0 and spread > 0 else float(len(names))
+    ratio = float(student(len(hits) - 1)) / float(student(len(names) - 1))
+    return float(count * ratio**2)
+
+
+def _binomial(hits: float, tries: float) -> tuple[float, float]:
+    """Return the ends of the exact interval, also of numbers that are not whole."""
     from scipy.special import betaincinv
 
     tail = (1 - CONFIDENCE) / 2
-    low = float(betaincinv(hits, tries - hits + 1, tail)) if hits else 0.0
+    low = float(betaincinv(hits, tries - hits + 1, tail)) if hits > 0 else 0.0
     high = float(betaincinv(hits + 1, tries - hits, 1 - tail)) if hits < tries else 1.0
-    return Estimate(hits / tries, low, high)
+    return low, high
 
 
 def upper_bound(hits: int, tries: int) -> float:

@@ -2,9 +2,9 @@
 
 A minimum counts from a prominence of 1 % of the range on, and so does a turn along a line; noise and numerics count
 where they are larger. Such a count is true of the landscape where the samples tell what lies between them. That is
-tested: losses at random places are held against what the samples around them, with their gradients, predict. Without an
-objective every other sample is held against those left. Where more than 5 % of the places are off by 1 % of the range or
-more, the slice is undersampled. Only the turns stay true then, as a lower bound: finer samples can only add to them.
+tested: losses at random places are held against what the samples around them, with their gradients, predict. Without
+an objective every other sample is held against those left. Where more than 5 % of the places are off by 1 % of the
+range or more, the slice is undersampled. Only the turns stay true then, as a lower bound: finer samples can only add.
 
 A landscape that turns often is extremely rugged where losses differ over a distance h by h to a power below 0.7, from
 1/2048 to 1/256 of the box. That takes new evaluations; without them it stays open.
@@ -39,8 +39,9 @@ SIDE, LEVEL, LARGE = 0.02, 1e-3, 0.2  # a region is level if over this part of t
 EXPLAINED = 0.05  # share of squared differences between samples that their neighbours leave open; an exponent's is more
 ROUNDING = {np.float32: 2.0**-20, np.float64: 2.0**-48}  # of the largest loss that is no difference: eight last digits
 PLACES = 96  # between samples, and where differences over short distances begin
-WAYS, WAY_POINTS = 24, 64  # minima whose way to a lower one is looked at, and at most so many steps along it
+WAYS, WAY_POINTS = 16, 32  # minima whose way to a lower one is looked at, and at most so many steps along it
 DISTANCES = tuple(2.0**-power for power in (11, 10, 9, 8))  # from there, in parts of the box
+EVALUATIONS_PER_PLACE = 1 + len(DISTANCES)
 GROUPS = 8  # of starts, one of which is left out at a time
 
 
@@ -86,7 +87,7 @@ def look_between(
 
 def _between(plane: Plane, drawn: Values, ways: _Ways, found: torch.Tensor) -> Between:
     values, steps = found.double().numpy(), np.array(plane.resolution)[::-1] - 1
-    places = len(drawn) // (1 + len(DISTANCES))
+    places = len(drawn) // EVALUATIONS_PER_PLACE
     rises = np.abs(values[places : len(drawn)].reshape(places, -1) - values[:places, None])
     return Between(drawn[:places] * steps, values[:places], rises, ways.prominences(values[len(drawn) :]))
 
@@ -141,8 +142,8 @@ def _ways(loss: Values, floor: float) -> _Ways:
 class Surface:
     """Hold what a slice's surface is like, and its `word`, None where it is flat or not resolved.
 
-    `minima` and `turns` (mean over lines, for each axis, u first) count from `depth` on [loss unit]; their intervals are
-    the counts from a larger and from a smaller one on, see `BAND`. `level` is the share of the box in level regions,
+    `minima` and `turns` (mean over lines, for each axis, u first) count from `depth` on [loss unit]; their intervals
+    are counts from a larger and from a smaller one on, see `BAND`. `level` is the share of the box in level regions,
     `holder` the exponent over short distances, NaN where not known. `off` is the share of places between samples whose
     loss these do not tell; `probed` whether that was seen by new evaluations. A rugged surface of which it is open
     whether it is extremely so is rugged `at_least`. `unresolved` says why there is no word.
@@ -397,7 +398,7 @@ def _nearest(errors: Sequence[Values], depth: float) -> Values:
 
 
 def _predictions(loss: Values, slope: Values | None, places: Values) -> list[Values]:
-    """Return losses at places between samples: by straight lines and, where there are gradients, by cubics (Hermite)."""
+    """Return losses at places between samples: by straight lines and, with gradients, by cubics (Hermite)."""
     linear = _interpolate(loss, None, places)
     if slope is None:
         return [linear]
@@ -406,7 +407,7 @@ def _predictions(loss: Values, slope: Values | None, places: Values) -> list[Val
 
 
 def _interpolate(loss: Values, slope: Values | None, places: Values) -> Values:
-    """Interpolate between the samples around each place, axis by axis, with slopes by a step along each axis, or without.
+    """Interpolate between the samples around each place, with slopes by a step along each axis, or without.
 
     With them each cell is bicubic, its mixed derivative by differences of the gradients: exact for a quadratic.
     """

@@ -15,14 +15,14 @@ import numpy as np
 import xarray as xr
 
 from ..identity import plane_of
-from ..objective import Objective
+from ..objective import Objective, evaluate
 from .discontinuities import Count, Jumps, find_jumps
 from .floor import Floor
 from .following import FOLLOWING_WORDS, Following, follow_samples, measure_following
 from .noise import noise_floor
 from .ruggedness import span
 from .slice_floor import counted_from
-from .surface import PLACES, EXTREME, RUGGED, SMOOTH, VERY_SMOOTH, Surface, look_between, measure_surface
+from .surface import EXTREME, PLACES, RUGGED, SMOOTH, VERY_SMOOTH, Surface, look_between, measure_surface
 
 FAILS, FLAT, NOISY, LARGE_FLAT, DISCONTINUOUS = (
     "mostly failed",
@@ -35,6 +35,7 @@ WORDS = (FAILS, FLAT, NOISY, VERY_SMOOTH, SMOOTH, RUGGED, EXTREME, LARGE_FLAT, D
 MOSTLY = 0.5  # share of the samples from which a slice that failed is called nothing else
 REPEATS = 1.96 * math.sqrt(2)  # standard deviations: 95 % of repeats are closer
 NOISY_FROM = 0.01  # of the range
+RANGE_POINTS = 32  # at which the range of the whole environment is measured
 PAIRS = 48  # of samples that are looked into for jumps
 POINTS, SMOOTHED = 100, 36  # where gradients are held against slopes, and against those of the smoothed loss
 
@@ -51,8 +52,8 @@ class QuotedWord:
 class Verdict:
     """Hold what a slice's words are from: its surface, jumps and gradients, and what limits all of them.
 
-    `jumps` and `following` are None where they were not looked for, `deviation` [loss unit] is that of noise, None where
-    it was not measured, `floor` that of numerics, None without replicas. Of `samples` so many `failed`.
+    `jumps` and `following` are None where they were not looked for. `deviation` [loss unit] is that of noise, None
+    where it was not measured, `floor` that of numerics, None without replicas. Of `samples` so many `failed`.
     """
 
     derived: ClassVar = ("words", "reasons", "open", "lines")
@@ -172,9 +173,9 @@ def judge(
     jumps = find_jumps(objective, datasets, least=floors, most=pairs, seed=seed, events=events)
     following = _follow(objective, datasets, deviation=deviation, points=points, smoothed=smoothed, seed=seed)
     found = []
-    for dataset, least, *parts in zip(datasets, floors, between, jumps, following, strict=True):
-        surface = measure_surface(dataset, floor=least, own_range=own_range, between=parts[0])
-        found.append(_verdict(dataset, surface, parts[1], parts[2], deviation, floor))
+    for dataset, least, one, steps, slopes in zip(datasets, floors, between, jumps, following, strict=True):
+        surface = measure_surface(dataset, floor=least, own_range=own_range, between=one)
+        found.append(_verdict(dataset, surface, steps, slopes, deviation, floor))
     return found
 
 
@@ -203,6 +204,13 @@ def judge_samples(
     surface = measure_surface(dataset, floor=least, own_range=own_range)
     following = follow_samples(dataset, deviation=float(np.nan_to_num(deviation or 0.0)), points=dataset["loss"].size)
     return _verdict(dataset, surface, None, following, deviation, floor)
+
+
+def measure_range(objective: Objective, *, seed: int = 0) -> float:
+    """Return the range of an objective's losses at random points of its box, 0 where all of them failed."""
+    found = evaluate(objective, objective.space.uniform(RANGE_POINTS, seed=seed), grad=False).loss
+    known = found[found.isfinite()]
+    return float(known.max() - known.min()) if len(known) else 0.0
 
 
 def least_difference(dataset: xr.Dataset, deviation: float, floor: Floor | None) -> float:

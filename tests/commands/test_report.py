@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from gradscape.landscapes.measures.classify import Verdict
 
 from gradscape.envs.functions import Function
 from gradscape.gallery.files import DATA
@@ -15,7 +16,6 @@ from gradscape.gallery.paper import read_paper
 from gradscape.jobs import report as job
 from gradscape.jobs.report import PaperWords, Report, environments_markdown
 from gradscape.landscapes.convert import from_json
-from gradscape.landscapes.measures.classify import Verdict
 from gradscape.landscapes.measures.gradient_quality import ScaleRow
 from gradscape.landscapes.measures.slice_comparison import exactly
 from gradscape.landscapes.storage.records import read_json, write_record

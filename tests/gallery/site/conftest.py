@@ -9,6 +9,7 @@ from pathlib import Path
 import imageio_ffmpeg
 import pytest
 import torch
+from gradscape.landscapes.measures.classify import Verdict
 
 from gradscape.envs.records import Fidelity
 from gradscape.gallery.figures import Figure
@@ -19,7 +20,6 @@ from gradscape.gallery.site.build import build_site
 from gradscape.jobs.card import save_slices
 from gradscape.jobs.report import PaperWords, Report
 from gradscape.landscapes.convert import to_json
-from gradscape.landscapes.measures.classify import Verdict
 from gradscape.landscapes.measures.gradient_quality import ScaleRow
 from gradscape.landscapes.objective import Evaluation, Objective
 from gradscape.landscapes.plane import Plane

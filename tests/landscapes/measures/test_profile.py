@@ -5,10 +5,10 @@ from collections.abc import Callable
 
 import pytest
 import torch
+from gradscape.landscapes.measures.classify import WORDS, QuotedWord
 
 from gradscape import ParameterSpace, Plane, from_torch, sample
 from gradscape.landscapes.convert import to_json
-from gradscape.landscapes.measures.classify import WORDS, QuotedWord
 from gradscape.landscapes.measures.profile import Profile, effort, measure_profile
 from gradscape.landscapes.objective import Evaluation, Objective, Status
 

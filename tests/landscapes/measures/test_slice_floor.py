@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 import xarray as xr
+from gradscape.landscapes.measures.classify import BELOW
 from torch import Tensor
 
 import gradscape as gs
@@ -15,7 +16,6 @@ from gradscape.jobs.census import open_census
 from gradscape.jobs.slice import SliceJob
 from gradscape.jobs.watch import Stopped
 from gradscape.landscapes.draw.figures.contour import landscape_figure
-from gradscape.landscapes.measures.classify import BELOW
 from gradscape.landscapes.measures.slice_floor import split_effort
 from gradscape.landscapes.objective import Evaluation, Objective
 from gradscape.landscapes.storage.floor_map import FLOOR

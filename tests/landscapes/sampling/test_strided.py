@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 import xarray as xr
+from gradscape.landscapes.measures.doubled_resolution import DoubledResolution, double_resolution
 from matplotlib.quiver import Quiver
 from torch import Tensor
 
@@ -16,7 +17,6 @@ import gradscape as gs
 from gradscape import ParameterSpace, Plane, from_torch
 from gradscape.jobs.slice import SliceJob
 from gradscape.landscapes.draw.figures.contour import arrows_along, landscape_figure
-from gradscape.landscapes.measures.doubled_resolution import DoubledResolution, double_resolution
 from gradscape.landscapes.measures.gradient_quality import compare_samples
 from gradscape.landscapes.measures.ruggedness import ruggedness
 from gradscape.landscapes.measures.undersampled import find_undersampled
