@@ -175,9 +175,13 @@ class Word:
 
 @dataclass(frozen=True)
 class ReportEntry:
-    """What `landscape report` found of a slice; `picture` says what the picture of gradient quality shows."""
+    """What `landscape report` found of a slice; `picture` says what the picture of gradient quality shows.
+
+    `notes` say what is not resolved, and what limits every word.
+    """
 
     words: Sequence[Word]
+    notes: Sequence[str]
     where: str
     device: str
     fidelity: str
@@ -378,7 +382,9 @@ def read_report(folder: Path) -> Report | None:
 def enter_report(report: Report) -> ReportEntry:
     """Return what a page shows of a report."""
     where = report.paper.where if report.paper else ""
-    return ReportEntry(_words(report), where, report.device, report.fidelity, _describe_quality(report.profile), REPORT)
+    verdict, picture = report.profile.verdict, _describe_quality(report.profile)
+    notes = (*verdict.open, *verdict.lines)
+    return ReportEntry(_words(report), notes, where, report.device, report.fidelity, picture, REPORT)
 
 
 def _words(report: Report) -> list[Word]:

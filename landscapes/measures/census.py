@@ -20,7 +20,7 @@ from ..convert import NOT_JSON
 from ..directions import orthonormal
 from ..identity import plane_of
 from ..lattice import count_gradients
-from ..objective import Objective, evaluate, in_box
+from ..objective import Evaluation, Objective, ObjectiveWrapper, evaluate
 from ..plane import Plane
 from ..space import ParameterSpace
 from ..statistics import CONFIDENCE, Estimate, clustered_share
@@ -188,36 +188,38 @@ def survey(
     `gradients`. Measures are those of a report, without their intervals within the slice: what counts here is how they
     differ from slice to slice. Jumps are looked for in at most `STEEP` pairs of samples of a slice.
     """
-    wholes = sample_cuts(objective, planes, gradients=gradients)
+    counted = _Counting(objective)
+    wholes = sample_cuts(counted, planes, gradients=gradients)
     verdicts = judge(
-        objective, wholes, deviation=deviation, floor=floor, own_range=own_range,
+        counted, wholes, deviation=deviation, floor=floor, own_range=own_range,
         places=PLACES, pairs=STEEP, points=POINTS, smoothed=0, seed=seed,
     )  # fmt: skip
     surveyed = []
-    for plane, whole, verdict in zip(planes, wholes, verdicts, strict=True):
+    for number, (whole, verdict) in enumerate(zip(wholes, verdicts, strict=True)):
         thin = thin_out(whole)
         coarse = measure_surface(thin, floor=least_difference(thin, deviation, floor), own_range=own_range)
         measures, halved = _measure(whole, verdict, verdict.surface), _measure(thin, verdict, coarse)
         halved[MEASURES.index("jumps")] = math.nan
-        samples = plane.grid().reshape(-1, plane.dim)
-        asked = len(samples) if objective.beyond_box else int(in_box(objective.space, samples).sum())
-        episodes = asked + _looked(verdict)
+        episodes = (counted.episodes + number) // len(planes)  # an even share, which add up to all
         surveyed.append(SurveyedSlice(whole["loss"].to_numpy(), measures, halved, verdict.words, episodes))
     return surveyed
+
+
+class _Counting(ObjectiveWrapper):
+    """Evaluate an objective, and count its episodes."""
+
+    episodes = 0
+
+    def evaluate(self, x: Tensor, *, grad: bool = True) -> Evaluation:
+        """Return losses, and gradients if asked."""
+        self.episodes += len(x)
+        return self.objective.evaluate(x, grad=grad)
 
 
 def judging_effort() -> tuple[int, int]:
     """Return how many losses, at most, and how many gradients it takes to judge a slice that is sampled."""
     losses = PLACES * EVALUATIONS_PER_PLACE + WAYS * WAY_POINTS + STEEP * EVALUATIONS_PER_PAIR
     return losses + 4 * POINTS * len(SCALES), POINTS
-
-
-def _looked(verdict: Verdict) -> int:
-    """Return how many episodes a verdict took."""
-    following = verdict.following
-    slopes = 0 if following is None else following.points * (1 + 4 * len(following.scales))
-    jumps = 0 if verdict.jumps is None else verdict.jumps.evaluations
-    return PLACES * EVALUATIONS_PER_PLACE + slopes + jumps
 
 
 def sample_cuts(objective: Objective, planes: Sequence[Plane], *, gradients: int = 1) -> list[xr.Dataset]:

@@ -14,7 +14,7 @@ import pytest
 from docs.pages import commands, extension, pictures, reproduction, scenes
 from docs.pages.kept import NOT_MEASURED, Kept, KeptFigure
 from docs.pages.text import prose
-from gradscape.landscapes.measures.classify import WORDS
+from gradscape.landscapes.measures.verdict import WORDS
 from hypothesis import given
 from hypothesis import strategies as st
 from markdown_it import MarkdownIt

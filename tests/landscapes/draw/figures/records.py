@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 import xarray as xr
-from gradscape.landscapes.measures.classify import WORDS
+from gradscape.landscapes.measures.verdict import WORDS
 
 from gradscape.envs.records import Fidelity
 from gradscape.jobs.check import CheckReport
