@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 from .terminal import Console, table
 
 if TYPE_CHECKING:
     from ..landscapes.measures.census import Census
+    from ..landscapes.statistics import Estimate
 
 
 def show(found: Census, console: Console) -> None:
@@ -21,8 +23,10 @@ def show(found: Census, console: Console) -> None:
     words = table("word", "slices that it fits", box=SIMPLE)
     for word, share in sorted(found.words.items(), key=lambda one: -one[1].value):
         if share.value > 0:
-            words.add_row(word, f"{share.value:.0%} ({share.low:.0%} to {share.high:.0%})")
+            words.add_row(word, _format(share))
     console.print(words)
+    if flat := len(found.slices) - found.solid:
+        console.print(f"Flat slices, {flat}, are left out of the shares of all other words.")
     other = [found.other] if found.other else []
     rows = table("measure", "5 %", "median", "95 %", "point", "cut", "both", "halved", *other, box=SIMPLE, padding=0)
     rows.columns[0].no_wrap = True
@@ -36,6 +40,11 @@ def show(found: Census, console: Console) -> None:
         "point, cut, both: shares of a measure's variance over the slices that go with the base point, with the cut, "
         f"with what they do together. halved: the variance that half the resolution adds{at}, as a share of the same.",
     )
+
+
+def _format(share: Estimate) -> str:
+    ends = f" ({share.low:.0%} to {share.high:.0%})" if math.isfinite(share.low) else ", of all that there are"
+    return f"{share.value:.0%}{ends}"
 
 
 def _number(value: float) -> str:

@@ -20,7 +20,7 @@ ABSENT = "The paper does not have this environment, so it claims nothing about i
 
 @dataclass(frozen=True)
 class PaperWords:
-    """Hold the paper's words for an environment's landscape, of `classify.WORDS`, and where it says them.
+    """Hold the paper's words for an environment's landscape, of `verdict.WORDS`, and where it says them.
 
     `losses` are the ends of the colour bars of its slices, None where they cannot be read.
     """
@@ -38,7 +38,7 @@ class PaperWords:
 class PaperCaption:
     """Hold what the paper says, in our words, of what a slice shows, and the number of its figure, None in ours.
 
-    `words` are those of this slice alone, of `classify.WORDS`, where it does not say of it what it says of the scene.
+    `words` are those of this slice alone, of `verdict.WORDS`, where it does not say of it what it says of the scene.
     """
 
     says: str = "It does not show this slice."
@@ -50,7 +50,7 @@ class PaperCaption:
 class PaperFinding:
     """Hold what was measured of the paper's words for some slices, beyond what their reports say.
 
-    `words` are of `classify.WORDS`, or the paper's own where it has more. `setting` is what turns our landscape into
+    `words` are of `verdict.WORDS`, or the paper's own where it has more. `setting` is what turns our landscape into
     the paper's, empty where none was found; `holds` says whether the words hold with it; `measured` how that is known.
     """
 
@@ -92,7 +92,7 @@ class Paper:
 @cache
 def read_paper(path: Path = PAPER) -> Paper:
     """Read what the paper says. Raises ValueError where it says a word that landscapes are not described in."""
-    from ..landscapes.measures.classify import WORDS
+    from ..landscapes.measures.verdict import WORDS
     from ..optim.claims import Claim
 
     tables = tomllib.loads(path.read_text())

@@ -49,6 +49,14 @@ class Task:
     other: bool
 
 
+@dataclass(frozen=True)
+class _Scale:
+    """Hold the standard deviation of the losses' noise and their range over the box [loss unit]."""
+
+    deviation: float
+    range: float
+
+
 @dataclass(frozen=True, kw_only=True)
 class CensusJob(CheckpointedJob["Census"]):
     """The slices of `design` to survey for `env`; a part of the checkpoint for each.
@@ -126,9 +134,11 @@ class CensusJob(CheckpointedJob["Census"]):
 
     def work(self) -> list[Work]:
         """Return the samples of all slices, and what their noise and their numerical floor are measured by."""
-        without, having = self.design.samples
+        from ..landscapes.measures.verdict import RANGE_POINTS
+
+        without, having = self._effort()
         again = sum(task.other for task in self.tasks)
-        noise, others = NOISE_POINTS * (1 + REPEATS), len(self.env.replicas())
+        noise, others = NOISE_POINTS * (1 + REPEATS) + RANGE_POINTS, len(self.env.replicas())
         replicas = NOISE_POINTS * (1 + others) if others else 0
         counts = [(self.env, len(self.tasks) - again, noise, replicas), (self.other, again, 0, 0)]
         return [
@@ -142,14 +152,25 @@ class CensusJob(CheckpointedJob["Census"]):
             if env is not None
         ]
 
+    def _effort(self) -> tuple[int, int]:
+        """Return how many losses, and how many gradients, a slice takes at most: its samples and what judges them."""
+        from ..landscapes.measures.census import judging_effort
+
+        (losses, gradients), (more_losses, more_gradients) = self.design.samples, judging_effort()
+        return losses + more_losses, gradients + more_gradients
+
     def compute(self, watch: Watch) -> Census:
         """Survey what is missing, and return the census."""
-        from ..landscapes.measures.slice_floor import counted_from
-
-        deviation, replicas = self._noise(watch), self._replicas(watch)
-        numerics = counted_from(self._floor(replicas, None)) if replicas else 0.0
+        noise, replicas = self._noise(watch), self._replicas(watch)
         self._announce(watch)
-        return self._conclude(self._survey(deviation, numerics, watch), replicas)
+        how = {
+            "deviation": noise.deviation,
+            "own_range": noise.range,
+            "floor": self._floor(replicas, None) if replicas else None,
+            "seed": self.seed,
+            "gradients": self.design.gradients,
+        }
+        return self._conclude(self._survey(how, watch), replicas)
 
     def write(self, found: Census) -> list[str]:
         """Draw and write the census, the losses in a file of their own."""
@@ -169,20 +190,22 @@ class CensusJob(CheckpointedJob["Census"]):
         """Return what is not surveyed yet."""
         return [task for task in self.tasks if self.checkpoint.load(task.piece) is None]
 
-    def _noise(self, watch: Watch) -> float:
-        """Return the deviation of the losses' noise [loss unit], measured at random points of the box."""
+    def _noise(self, watch: Watch) -> _Scale:
+        """Return how large the losses' noise and range are, measured at random points of the box."""
         from ..landscapes.measures.noise import noise
         from ..landscapes.measures.profile import PRECISION
+        from ..landscapes.measures.verdict import measure_range
 
-        if (kept := self.checkpoint.load("noise")) is None:
+        if (kept := self.checkpoint.load("noise")) is None or "range" not in kept:
             with watch.busy(f"{self.env.name}: {PREPARING}, then its noise"):
                 self.env.prepare()
                 x = self.env.space.uniform(NOISE_POINTS, seed=self.seed)
                 rounding = PRECISION[self.env.fidelity.precision]
                 found = noise(self.env, x, rounding=rounding, repeats=REPEATS, seed=self.seed)
-            kept = {"deviation": np.array(found.deviation)}
+                whole = measure_range(self.env, seed=self.seed)
+            kept = {"deviation": np.array(found.deviation), "range": np.array(whole)}
             self.checkpoint.save("noise", **kept)
-        return float(np.nan_to_num(kept["deviation"]))
+        return _Scale(float(np.nan_to_num(kept["deviation"])), float(kept["range"]))
 
     def _replicas(self, watch: Watch) -> dict[str, Evaluation]:
         """Return what the environment and its replicas are at random points, by name; nothing where it has none."""
@@ -222,27 +245,27 @@ class CensusJob(CheckpointedJob["Census"]):
         kept = f"; {len(self.tasks) - len(left)} are there already" if len(left) < len(self.tasks) else ""
         watch.note(f"{what}{kept}")
         if left:
-            each = simulation_seconds(self.env, without, having, samples)
+            losses, slopes = self._effort()
+            each = simulation_seconds(self.env, losses, slopes, losses + slopes)
             lower = "--slices, --resolution and --gradients"
             seconds = len(left) * (each + MEASURING_SECONDS) + PICTURE_SECONDS
             watch.announce(f"about {duration(seconds)} here; {lower} change it", seconds)
 
-    def _survey(self, deviation: float, numerics: float, watch: Watch) -> dict[str, SurveyedSlice]:
+    def _survey(self, how: Mapping[str, Any], watch: Watch) -> dict[str, SurveyedSlice]:
         from ..landscapes.measures.census import SurveyedSlice
 
         left = self.left()
         with watch.progress(len(self.tasks), "slices") as advance:
             done = len(self.tasks) - len(left)
             advance(done)
-            for piece, arrays in self._do(left, deviation, numerics):
+            for piece, arrays in self._do(left, how):
                 self.checkpoint.save(piece, **arrays)
                 advance(done := done + 1)
         pieces = {task.piece: self.checkpoint.load(task.piece) for task in self.tasks}
         return {name: SurveyedSlice.of_arrays(arrays) for name, arrays in pieces.items() if arrays is not None}
 
-    def _do(self, tasks: Sequence[Task], deviation: float, numerics: float) -> Iterator[tuple[str, Mapping[str, Any]]]:
+    def _do(self, tasks: Sequence[Task], how: Mapping[str, Any]) -> Iterator[tuple[str, Mapping[str, Any]]]:
         """Survey slices, here or by workers, so many abreast as fill a batch, and yield what each one's piece holds."""
-        how = {"deviation": deviation, "numerics": numerics, "seed": self.seed, "gradients": self.design.gradients}
         workers = workers_of(self.executor) if self.executor else 1
         for other in (False, True):
             env = self.other if other else self.env

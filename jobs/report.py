@@ -22,9 +22,9 @@ from ..landscapes.capacity import Need, require, size
 from ..landscapes.convert import NOT_JSON, from_json, to_json
 from ..landscapes.cost import duration
 from ..landscapes.identity import MODEL_VERSION, digest_of, plane_of, stored_identity
-from ..landscapes.measures.classify import QuotedWord
-from ..landscapes.measures.doubled_resolution import DoubledResolution
+from ..landscapes.measures.following import CHIEF, SCALES
 from ..landscapes.measures.profile import Profile
+from ..landscapes.measures.verdict import QuotedWord, Verdict
 from ..landscapes.objective import BoxedObjective, Evaluation, ObjectiveWrapper, evaluate
 from ..landscapes.plain import digest
 from ..landscapes.storage.files import is_full, make_folder, other_files, replacing, tidy, write_json
@@ -41,7 +41,6 @@ if TYPE_CHECKING:
 
     from ..envs.base import Environment
     from ..landscapes.draw.figure import Picture
-    from ..landscapes.measures.gradient_quality import ScaleRow
     from ..landscapes.measures.lyapunov import GradientGrowth
     from ..landscapes.objective import Objective
     from ..landscapes.statistics import Estimate
@@ -51,12 +50,11 @@ TABLE = REPORTS.files[1]
 POINTS = 6  # along each axis where gradients are tested by new evaluations
 HORIZONS, GROWTH_POINTS = (0.2, 0.4, 0.6, 0.8, 1.0), 16  # shares of the episode, and where gradients are compared
 RESOLUTION = 24  # points per axis of a slice that is sampled for its report
-HEADINGS = ("slice", "minima", "flat", "jumps", "cosine", "measured", "the paper's words", "measured too")
+HEADINGS = ("slice", "minima", "turns", "jumps", "cosine", "measured", "the paper's words", "measured too")
 ENVIRONMENTS = (
-    "environment", "slices", "minima", "flat", "jumps", "cosine, small step", "cosine, two samples", "measured",
+    "environment", "slices", "minima", "turns", "largest jump", "cosine over 1 %", "cosine over 5 %", "measured",
     "the paper's words", "agree",
 )  # fmt: skip
-MIN_SEEN = 0.5  # of the points that any step sees, for a smaller one to be worth showing
 
 
 @dataclass(frozen=True)
@@ -380,8 +378,10 @@ def _leave(dataset: xr.Dataset, report: Report, folder: Path, watch: Watch) -> N
     from ..landscapes.draw.figures.quality import quality_figure
     from ..landscapes.storage.records import save_bundle
 
-    noise, quality = xr.Dataset({"deviation": report.profile.noise.deviation}), report.profile.quality
-    assert quality is not None  # measured just now
+    fuzz, quality = report.profile.noise, report.profile.quality
+    assert fuzz is not None  # measured just now
+    assert quality is not None
+    noise = xr.Dataset({"deviation": fuzz.deviation})
     save_bundle(folder / ARRAYS, steps=quality.steps, smooth=quality.smooth, noise=noise)
     save(quality_figure(dataset, quality), folder / PICTURE)
     _leave_measures(folder, report)
@@ -461,7 +461,7 @@ def _check_summary(folder: Path) -> None:
 
 
 class Quoted(Protocol):
-    """What the paper says of an environment's landscape: words of `classify.WORDS`, and where it says them."""
+    """What the paper says of an environment's landscape: words of `verdict.WORDS`, and where it says them."""
 
     @property
     def words(self) -> tuple[str, ...]: ...  # noqa: D102
@@ -531,12 +531,10 @@ class Report:
         return self.profile.measures
 
     def verdict_lines(self) -> list[str]:
-        """Return the words, each with its reason, and whether the paper has them, a line each."""
-        lines = [f"{word}: {self.profile.verdict.reasons[word]}" for word in self.words]
-        if self.profile.floor:
-            lines.append(self.profile.floor.sentence())
-        if self.profile.doubled:
-            lines.append(_describe_changes(self.profile.doubled))
+        """Return each word with its reason, what is not resolved, and whether the paper has the words, a line each."""
+        verdict = self.profile.verdict
+        lines = [f"{word}: {verdict.reasons[word]}" for word in self.words]
+        lines += [*verdict.open, *verdict.lines]
         if self.paper:
             said = "; ".join(f"{one.word}: {'yes' if one.measured else 'no'}" for one in self.paper.words)
             lines.append(f"the paper's words ({self.paper.where}), measured too? {said}")
@@ -577,12 +575,6 @@ class Report:
 
         lines = "".join(f"<li>{escape(line)}</li>" for line in self.verdict_lines())
         return f"<p>{escape(self.name)} ({escape(self.env)})</p><ul>{lines}</ul>{self.table().to_html()}"
-
-
-def _describe_changes(doubled: DoubledResolution) -> str:
-    """Say which words would change at twice the resolution."""
-    said = [f"{word} would appear" for word in doubled.appear] + [f"{word} would go" for word in doubled.go]
-    return f"at twice the resolution: {', '.join(said) or 'the verdict is the same'}"
 
 
 @dataclass(frozen=True)
@@ -633,38 +625,39 @@ def slices_markdown(reports: Sequence[Report]) -> str:
 
 
 def environments_markdown(reports: Sequence[Report]) -> str:
-    """Return a row for each environment, as Markdown: the least and the most of its slices, and the words.
-
-    The small step is the smallest that sees a slope above the noise at half as many points as any step does.
-    """
+    """Return a row for each environment, as Markdown: the least and the most of its slices, and the words."""
     groups = groupby(reports, key=lambda report: report.env)
     return markdown(ENVIRONMENTS, (_environment(env, list(group)) for env, group in groups))
 
 
 def _environment(env: str, reports: Sequence[Report]) -> tuple[str, ...]:
-    from ..landscapes.measures.classify import WORDS
+    from ..landscapes.measures.verdict import WORDS
 
     words, count = by_environment(reports)[env], len(reports)
     measured = [_of(word, words.measured[word], count) for word in WORDS if word in words.measured]
-    profiles = [report.profile for report in reports]
-    samples = [profile.differences_of_samples[0] for profile in profiles if profile.differences_of_samples]
+    verdicts = [report.profile.verdict for report in reports]
     return (
         f"`{env}`",
         str(count),
-        _span([profile.losses.notable for profile in profiles], "{:.0f}"),
-        _span([_value(profile.losses.flat, 100) for profile in profiles], "{:.0f} %"),
-        _span([_value(profile.jumps.share, 100) for profile in profiles], "{:.1f} %"),
-        _span([_value(_small(profile.differences).cosine) for profile in profiles], "{:z.2f}"),
-        _span([_value(row.cosine) for row in samples], "{:z.2f}"),
+        _span([_value(one.surface.minima) for one in verdicts], "{:.0f}"),
+        _span([_turns(one) for one in verdicts], "{:.1f}"),
+        _span([None if one.jumps is None else 100 * one.jumps.largest for one in verdicts], "{:.2g} %"),
+        *(_span([_cosine(one, scale) for one in verdicts], "{:z.2f}") for scale in SCALES[1:]),
         ", ".join(measured),
         ", ".join(_of(word, hits, count) for word, hits in words.paper.items()),
         _agreement(list(words.paper.values()), count),
     )
 
 
-def _small(rows: Sequence[ScaleRow]) -> ScaleRow:
-    most = max(row.points for row in rows)
-    return next(row for row in rows if row.points >= MIN_SEEN * most)
+def _turns(verdict: Verdict) -> float | None:
+    """Return how often lines along an axis turn back, of the axis along which they do most."""
+    known = [one.value for one in verdict.surface.turns if math.isfinite(one.value)]
+    return max(known, default=None)
+
+
+def _cosine(verdict: Verdict, scale: float) -> float | None:
+    at = None if verdict.following is None else verdict.following.at(scale)
+    return None if at is None else _value(at.cosine)
 
 
 def _value(estimate: Estimate | None, scale: float = 1.0) -> float | None:
@@ -692,15 +685,15 @@ def _agreement(hits: Sequence[int], count: int) -> str:
 
 
 def _slice(report: Report) -> tuple[str, ...]:
-    losses, samples = report.profile.losses, report.profile.differences_of_samples
+    verdict = report.profile.verdict
     words = report.paper.words if report.paper else ()
     hits = sum(one.measured for one in words)
     return (
         report.name,
-        str(losses.notable),
-        _span([_value(losses.flat, 100)], "{:.1f} %"),
-        _span([_value(report.profile.jumps.share, 100)], "{:.1f} %"),
-        _span([_value(samples[0].cosine) if samples else None], "{:z.2f}"),
+        _span([_value(verdict.surface.minima)], "{:.0f}"),
+        _span([_turns(verdict)], "{:.1f}"),
+        "" if verdict.jumps is None else _span([100 * verdict.jumps.largest], "{:.2g} %"),
+        _span([_cosine(verdict, CHIEF)], "{:z.2f}"),
         ", ".join(report.words),
         ", ".join(one.word for one in words),
         f"{hits} of {len(words)}" if words else "",

@@ -9,6 +9,7 @@ whose model changed since, has a row that says so.
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
@@ -23,6 +24,10 @@ from gradscape.gallery.league import read_league
 from gradscape.gallery.paper import read_paper
 from gradscape.jobs.report import Report, environments_markdown
 from gradscape.landscapes.checks.causes import causes
+from gradscape.landscapes.convert import from_json
+from gradscape.landscapes.measures.census import Census
+from gradscape.landscapes.measures.verdict import FLAT
+from gradscape.landscapes.statistics import Estimate
 from gradscape.landscapes.storage.records import read_json
 from gradscape.optim.league import League, SceneStandings
 from gradscape.optim.options import OURS, PAPER, defaults
@@ -40,13 +45,13 @@ from .text import cell, table
 ROOT = Path(__file__).parents[2]
 FLOORS = DATA / "floors.json"  # which benchmarks/symmetry.py writes
 UNMEASURED, MISSING = "not measured since the scene changed", "not measured"
-FAINT = 0.01  # of the range of the losses of all slices of a census
+UNCOUNTED = "not measured since the words changed"
 COLUMNS = {  # of README: what a slice may be, and the words that say so, of which a slice has one at most
     "very smooth": ("very smooth",),
     "smooth with local minima": ("smooth with local minima",),
     "rugged": ("rugged", "extremely rugged"),
     "with jumps": ("discontinuous",),
-    "gradients good": ("gradients good",),
+    "gradients follow": ("gradients follow",),
 }
 Record = Mapping[str, Any]
 
@@ -79,43 +84,40 @@ def studies(kind: str, scene: str, data: Path = DATA) -> list[StudyRecord] | str
 
 
 def censuses() -> str:
-    """What many slices of a scene are like: the share of them that each word fits, and those that hardly move."""
+    """What many slices of a scene are like: the share of them that each word fits, of those that are not flat."""
     rows = []
     for scene in scenes():
-        said, found = _paper_words(scene), kept("census/{}-{}.json", scene)
+        said, found = _paper_words(scene), _census(scene)
         if isinstance(found, str):
             rows.append([f"`{scene}`", "", "", found, ", ".join(said)])
             continue
-        words, slices = found[0]["words"], found[0]["slices"]
-        told = {word: f"{word} {_interval(one)}" for word, one in words.items()}
-        measured = [
-            told[word] for word in sorted(words, key=lambda word: -words[word]["value"]) if words[word]["value"]
-        ]
-        faint = f"{100 * faint_share(slices):.0f} %"
-        rows.append(
-            [f"`{scene}`", str(len(slices)), faint, ", ".join(measured), ", ".join(told[word] for word in said)]
-        )
-    head = ("environment", "slices", "faint", "measured: share of the slices (95 % interval)", "the paper's words")
+        told = {word: f"{word} {_interval(one)}" for word, one in found.words.items() if word != FLAT}
+        order = sorted(told, key=lambda word: -found.words[word].value)
+        measured = [told[word] for word in order if found.words[word].value > 0]
+        flat = str(len(found.slices) - found.solid)
+        paper = ", ".join(told[word] for word in said)
+        rows.append([f"`{scene}`", str(len(found.slices)), flat, ", ".join(measured), paper])
+    head = ("environment", "slices", "flat", "measured: share of the others (95 % interval)", "the paper's words")
     return table(head, rows)
 
 
-def faint_share(slices: list[Record]) -> float:
-    """Return the share of slices along which losses move by less than `FAINT` of what they do over all of them."""
-    ends = [one["range"] for one in slices if None not in one["range"]]
-    whole = max(high for _, high in ends) - min(low for low, _ in ends)
-    return sum(high - low < FAINT * whole for low, high in ends) / len(slices)
-
-
 def short_censuses() -> str:
-    """README's: the shares alone."""
+    """README's: how many slices are not flat, and the shares of them."""
     rows = []
     for scene in scenes():
-        found = kept("census/{}-{}.json", scene)
-        shares = [found, *[""] * (len(COLUMNS) - 1)] if isinstance(found, str) else [
-            f"{100 * sum(found[0]['words'][word]['value'] for word in words):.0f} %" for words in COLUMNS.values()
+        found = _census(scene)
+        cells = [found, *[""] * len(COLUMNS)] if isinstance(found, str) else [
+            str(found.solid), *(_interval(found.share(words)) for words in COLUMNS.values())
         ]  # fmt: skip
-        rows.append([f"`{scene}`", *shares, ", ".join(_paper_words(scene))])
-    return table(("environment", *COLUMNS, "the paper says"), rows)
+        rows.append([f"`{scene}`", *cells, ", ".join(_paper_words(scene))])
+    return table(("environment", "slices", *COLUMNS, "the paper says"), rows)
+
+
+def _census(scene: str) -> Census | str:
+    found = kept("census/{}-{}.json", scene)
+    if isinstance(found, str):
+        return UNCOUNTED if found == MISSING else found
+    return from_json(Census, found[0])
 
 
 def _paper_words(scene: str) -> tuple[str, ...]:
@@ -123,9 +125,11 @@ def _paper_words(scene: str) -> tuple[str, ...]:
     return words[scene].words if scene in words else ()
 
 
-def _interval(share: Record) -> str:
-    ends = f" ({100 * share['low']:.0f} to {100 * share['high']:.0f})" if share["low"] < share["high"] else ""
-    return f"{100 * share['value']:.0f} %{ends}"
+def _interval(share: Estimate) -> str:
+    if not math.isfinite(share.value):
+        return ""
+    value, low, high = (100 * one for one in (share.value, share.low, share.high))
+    return f"{value:.0f} % ({low:.0f} to {high:.0f})" if math.isfinite(low) else f"{value:.0f} % of all"
 
 
 def kept_league() -> League:

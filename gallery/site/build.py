@@ -28,7 +28,7 @@ from ...landscapes.convert import to_json
 from ...landscapes.draw.card import FILTERS, TEMPLATES, card_scenes, colour_stops
 from ...landscapes.identity import plane_of
 from ...landscapes.measures.card import Card
-from ...landscapes.measures.classify import WORDS
+from ...landscapes.measures.verdict import WORDS
 from ...landscapes.storage.arrays import parameters_of
 from ...landscapes.storage.files import check_ours, placing, resolve
 from ...landscapes.storage.paths import is_slice

@@ -19,10 +19,10 @@ from ...jobs.slice import count_statuses, flat_points
 from ...landscapes.convert import from_json, to_json
 from ...landscapes.identity import plane_of, stored_identity, stored_provenance
 from ...landscapes.lattice import own_cells
-from ...landscapes.measures.classify import WORDS
 from ...landscapes.measures.profile import Profile
 from ...landscapes.measures.slice_floor import floor_of
 from ...landscapes.measures.undersampled import Undersampled, contradicted_cells
+from ...landscapes.measures.verdict import WORDS
 from ...landscapes.objective import NOT_EVALUATED, Status, failed
 from ...landscapes.overlay import improvements, lay
 from ...landscapes.plain import number
@@ -175,9 +175,13 @@ class Word:
 
 @dataclass(frozen=True)
 class ReportEntry:
-    """What `landscape report` found of a slice; `picture` says what the picture of gradient quality shows."""
+    """What `landscape report` found of a slice; `picture` says what the picture of gradient quality shows.
+
+    `notes` say what is not resolved, and what limits every word.
+    """
 
     words: Sequence[Word]
+    notes: Sequence[str]
     where: str
     device: str
     fidelity: str
@@ -378,7 +382,9 @@ def read_report(folder: Path) -> Report | None:
 def enter_report(report: Report) -> ReportEntry:
     """Return what a page shows of a report."""
     where = report.paper.where if report.paper else ""
-    return ReportEntry(_words(report), where, report.device, report.fidelity, _describe_quality(report.profile), REPORT)
+    verdict, picture = report.profile.verdict, _describe_quality(report.profile)
+    notes = (*verdict.open, *verdict.lines)
+    return ReportEntry(_words(report), notes, where, report.device, report.fidelity, picture, REPORT)
 
 
 def _words(report: Report) -> list[Word]:
@@ -394,12 +400,8 @@ def _words(report: Report) -> list[Word]:
 
 def _describe_quality(profile: Profile) -> str:
     """Say what the picture of gradient quality shows."""
-    smallest = next((row for row in profile.differences if row.points >= row.of / 2), None)
-    parts = [
-        f"mean cosine of gradient and difference {_format_signed(row.cosine.value)} over {row.scale:.2g} of the box"
-        for row in [smallest, *profile.differences_of_samples]
-        if row and math.isfinite(row.cosine.value)
-    ]
+    following = profile.verdict.following
+    parts = [following.sentence] if following is not None and following.scales else []
     for row in profile.smoothing:
         if math.isfinite(row.biased.value):
             biased = round(row.biased.value * row.points)
@@ -411,10 +413,6 @@ def quality_rows(profile: Profile) -> list[dict[str, Any]]:
     """Return what the picture of gradient quality shows by scale, a row for each scale of each of its three parts."""
     parts = ("differences", "differences_of_samples", "smoothing")
     return [{"part": part.replace("_", " "), **to_json(row)} for part in parts for row in getattr(profile, part)]
-
-
-def _format_signed(value: float) -> str:
-    return f"{value:z.2f}".replace("-", "\N{MINUS SIGN}")
 
 
 def read_measures(folder: Path) -> dict[str, str | float]:

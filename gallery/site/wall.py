@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import groupby
@@ -12,7 +13,9 @@ from ...jobs.card import read_card
 from ...landscapes.convert import from_json
 from ...landscapes.measures.card import Card
 from ...landscapes.measures.census import Census
-from ...landscapes.measures.classify import GOOD, MISSING, NOISY, OPPOSITE, WORDS, ZERO
+from ...landscapes.measures.following import FOLLOWING_WORDS
+from ...landscapes.measures.verdict import FLAT, WORDS
+from ...landscapes.statistics import Estimate
 from ...landscapes.storage.records import read_json, reading
 from ...landscapes.storage.store import open_slice
 from ..files import CARD, CARD_RECORD, DEVICES, STORE, WALL_PICTURE, WALL_TABLE, RecordFiles
@@ -21,8 +24,8 @@ from .downloads import save_table
 from .page_data import FigureEntry
 from .studio import Studio
 
-GRADIENTS = (GOOD, NOISY, OPPOSITE, ZERO, MISSING)
-SHAPES = tuple(word for word in WORDS if word not in GRADIENTS)
+GRADIENTS = FOLLOWING_WORDS
+SHAPES = tuple(word for word in WORDS if word not in (*GRADIENTS, FLAT))
 MIN_SHARE = 1 / 3  # of the slices: from this share on a word is said of an environment
 SHOWN_WORDS = 3  # of how smooth an environment is
 REMAKE_CENSUS = "delete it, and `landscape census {} --device {}` measures it again"
@@ -48,6 +51,7 @@ class Tile:
     """An environment on the wall: the slice that is shown, and which words fit which share of how many slices.
 
     They are those of its `census`, with the command, the picture and the table of that, or of the gallery's own slices.
+    Of a census `flat` slices are not among them.
     """
 
     env: str
@@ -62,6 +66,7 @@ class Tile:
     picture: str = ""
     table: str = ""
     command: str = ""
+    flat: int = 0
 
     def fitting(self, least: float = MIN_SHARE) -> list[str]:
         """Return the words that fit such a share of the slices, or more."""
@@ -77,7 +82,8 @@ class Tile:
         if not self.slices:
             return "not measured yet"
         said = ", ".join(map(str, self.shape)) or "none of the words"
-        return f"{said} of {self.slices} slice{'s' if self.slices > 1 else ''}{'' if self.census else ' here'}"
+        flat = f"; {self.flat} more are flat" if self.flat else ""
+        return f"{said} of {self.slices} slice{'s' if self.slices > 1 else ''}{'' if self.census else ' here'}{flat}"
 
     def share(self, word: str) -> WordShare | None:
         """Return the share of a word, None where nothing is known of it."""
@@ -100,12 +106,18 @@ def _tile(env: str, group: Sequence[FigureEntry], data: Path, out: Path, studio:
     about = (env, best.id, best.page, best.labels, best.dim, str(best.identity.get("engine", "")))
     if found := _place_census(env, data, out, studio):
         census, files = found
-        words = [WordShare(word, one.value, one.low, one.high) for word, one in census.words.items()]
+        words = [_word_share(word, one) for word, one in census.words.items() if math.isfinite(one.value)]
         picture, table = (path.relative_to(out).as_posix() for path in (files.picture, files.table))
-        return Tile(*about, len(census.slices), True, words, picture, table, census.command)
+        flat = len(census.slices) - census.solid
+        return Tile(*about, census.solid, True, words, picture, table, census.command, flat)
     said = [set(entry.words) for entry in group if entry.report is not None]
     words = [WordShare(word, sum(word in one for one in said) / len(said)) for word in WORDS] if said else []
     return Tile(*about, len(said), False, words)
+
+
+def _word_share(word: str, share: Estimate) -> WordShare:
+    ends = (share.low, share.high) if math.isfinite(share.low) else (None, None)
+    return WordShare(word, share.value, *ends)
 
 
 def _place_census(env: str, data: Path, out: Path, studio: Studio) -> tuple[Census, RecordFiles] | None:

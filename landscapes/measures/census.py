@@ -20,16 +20,16 @@ from ..convert import NOT_JSON
 from ..directions import orthonormal
 from ..identity import plane_of
 from ..lattice import count_gradients
-from ..objective import Objective, evaluate, in_box
+from ..objective import Evaluation, Objective, ObjectiveWrapper, evaluate
 from ..plane import Plane
 from ..space import ParameterSpace
-from ..statistics import CONFIDENCE, Estimate
-from .classify import WORDS, Verdict, classify, likeness
-from .discontinuities import EVALUATIONS_PER_PAIR, Jumps, find_jumps
+from ..statistics import CONFIDENCE, Estimate, clustered_share
+from .discontinuities import EVALUATIONS_PER_PAIR
 from .floor import Floor
-from .gradient_quality import compare_samples
-from .noise import noise_floor
-from .ruggedness import Ruggedness, half_step, ruggedness
+from .following import CHIEF, SCALES
+from .ruggedness import ruggedness
+from .surface import EVALUATIONS_PER_PLACE, WAY_POINTS, WAYS, Surface, measure_surface
+from .verdict import FLAT, WORDS, Verdict, judge, least_difference
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -40,6 +40,7 @@ Array = NDArray[np.float64]
 PAIRS, RANDOM = "pairs", "random"
 ALONG = (PAIRS, RANDOM)  # what cuts are: pairs of parameters, or pairs of random directions
 STEEP = 16  # pairs of neighbouring samples of a slice that are bisected for jumps
+PLACES, POINTS = 48, 48  # between the samples of a slice, and where gradients are held against slopes
 MEASURES = (
     "turns",
     "notable minima",
@@ -55,7 +56,7 @@ MEASURES = (
     "cosine",
     "uphill",
     "range",
-)  # as a report has them: means over the axes, shares, and the range of the losses in their unit
+)  # as a report has them: the most of the axes' turns, means over axes, shares, and the range of the losses
 
 
 RESAMPLES = 999
@@ -124,6 +125,12 @@ class CensusDesign:
         return cls(space, bases, tuple(cuts), resolution, gradients)
 
     @property
+    def exhausted(self) -> tuple[bool, bool]:
+        """Whether base points and cuts are all that there are, so that others would not say otherwise."""
+        dim, pairs = self.space.dim, self.cuts[0].dims is not None
+        return pairs and dim == 2, pairs and len(self.cuts) == dim * (dim - 1) // 2
+
+    @property
     def samples(self) -> tuple[int, int]:
         """How many samples of a slice are without a gradient, and how many have one."""
         having = count_gradients((self.resolution, self.resolution), self.gradients)
@@ -171,33 +178,48 @@ def survey(
     deviation: float,
     seed: int,
     gradients: int = 1,
-    numerics: float = 0.0,
+    floor: Floor | None = None,
+    own_range: float | None = None,
 ) -> list[SurveyedSlice]:
     """Sample and measure slices, their points in one batch.
 
-    `deviation` [loss unit] is the standard deviation of the losses' noise, and measures of losses count nothing below
-    what it should put so many samples apart, or below `numerics` (`counted_from`), whichever is more.
-    Measures are those of a report, without their intervals within the slice: what counts here is how they differ from
-    slice to slice. Those of gradients are of every so many samples along each axis, `gradients`, and hold them against
-    the losses of all. Jumps are looked for in at most `STEEP` pairs of samples of a slice.
+    `deviation` [loss unit] is the standard deviation of the losses' noise, `floor` the numerical floor and `own_range`
+    the range of the environment's losses, see `judge`. Slices have gradients at every so many samples along each axis,
+    `gradients`. Measures are those of a report, without their intervals within the slice: what counts here is how they
+    differ from slice to slice. Jumps are looked for in at most `STEEP` pairs of samples of a slice.
     """
-    wholes = sample_cuts(objective, planes, gradients=gradients)
-    rugged = [_ruggedness(whole, numerics, deviation) for whole in wholes]
-    least = [
-        max(found.floor, half_step(found.range, plane.resolution))
-        for plane, whole, found in zip(planes, wholes, rugged, strict=True)
-    ]
-    jumps = find_jumps(objective, wholes, least=least, most=STEEP, seed=seed)
+    counted = _Counting(objective)
+    wholes = sample_cuts(counted, planes, gradients=gradients)
+    verdicts = judge(
+        counted, wholes, deviation=deviation, floor=floor, own_range=own_range,
+        places=PLACES, pairs=STEEP, points=POINTS, smoothed=0, seed=seed,
+    )  # fmt: skip
     surveyed = []
-    for plane, whole, found, steep in zip(planes, wholes, rugged, jumps, strict=True):
-        measures, verdict = _measure(whole, found, steep, deviation)
+    for number, (whole, verdict) in enumerate(zip(wholes, verdicts, strict=True)):
         thin = thin_out(whole)
-        halved, _ = _measure(thin, _ruggedness(thin, numerics, deviation), None, deviation)
-        samples = plane.grid().reshape(-1, plane.dim)
-        asked = len(samples) if objective.beyond_box else int(in_box(objective.space, samples).sum())
-        loss, episodes = whole["loss"].to_numpy(), asked + EVALUATIONS_PER_PAIR * steep.checked
-        surveyed.append(SurveyedSlice(loss, measures, halved, verdict.words, episodes))
+        coarse = measure_surface(thin, floor=least_difference(thin, deviation, floor), own_range=own_range)
+        measures, halved = _measure(whole, verdict, verdict.surface), _measure(thin, verdict, coarse)
+        halved[MEASURES.index("jumps")] = math.nan
+        episodes = (counted.episodes + number) // len(planes)  # an even share, which add up to all
+        surveyed.append(SurveyedSlice(whole["loss"].to_numpy(), measures, halved, verdict.words, episodes))
     return surveyed
+
+
+class _Counting(ObjectiveWrapper):
+    """Evaluate an objective, and count its episodes."""
+
+    episodes = 0
+
+    def evaluate(self, x: Tensor, *, grad: bool = True) -> Evaluation:
+        """Return losses, and gradients if asked."""
+        self.episodes += len(x)
+        return self.objective.evaluate(x, grad=grad)
+
+
+def judging_effort() -> tuple[int, int]:
+    """Return how many losses, at most, and how many gradients it takes to judge a slice that is sampled."""
+    losses = PLACES * EVALUATIONS_PER_PLACE + WAYS * WAY_POINTS + STEEP * EVALUATIONS_PER_PAIR
+    return losses + 4 * POINTS * len(SCALES), POINTS
 
 
 def sample_cuts(objective: Objective, planes: Sequence[Plane], *, gradients: int = 1) -> list[xr.Dataset]:
@@ -243,38 +265,30 @@ def _dataset(plane: Plane, loss: Array, grad: Array, status: Array) -> xr.Datase
     return xr.Dataset(columns, attrs=about)
 
 
-def _ruggedness(dataset: xr.Dataset, numerics: float, deviation: float) -> Ruggedness:
-    noise = noise_floor(deviation, dataset["loss"].size)
-    return ruggedness(dataset, floor=max(noise, numerics), noise=noise, estimate=_alone)
-
-
-def _measure(dataset: xr.Dataset, found: Ruggedness, steep: Jumps | None, deviation: float) -> tuple[Array, Verdict]:
-    cosine = compare_samples(dataset, deviation=deviation)["cosine"].isel(scale=0).to_numpy()
-    share = steep.share.value if steep is not None else math.nan
-    return _values(found, share, cosine), classify(found, steep, cosine)
-
-
 def _alone(statistic: Any, samples: Array, **bounds: float) -> Estimate:
     """Return a measure without an interval, which the other slices give."""
     return Estimate(statistic(samples), math.nan, math.nan)
 
 
-def _values(found: Ruggedness, jumps: float, cosine: Array) -> Array:
-    flat = found.flat.value if found.flat is not None else math.nan
+def _measure(dataset: xr.Dataset, verdict: Verdict, surface: Surface) -> Array:
+    """Return the measures of a slice, of the surface that is given."""
+    found = ruggedness(dataset, floor=surface.floor, estimate=_alone)
+    near = None if verdict.following is None else verdict.following.at(CHIEF)
     return np.array(
         [
-            found.turns.value,
-            found.notable,
-            found.level.value,
-            flat,
-            jumps,
+            max(one.value for one in surface.turns),
+            surface.minima.value,
+            surface.level.value,
+            math.nan if verdict.following is None else verdict.following.zero.value,
+            math.nan if verdict.jumps is None else verdict.jumps.share.value,
             np.mean([one.value for one in found.correlation_length]),
             np.mean([one.value for one in found.holder]),
             np.mean([one.value for one in found.total_variation]),
             found.information.value,
             found.dispersion.value,
             found.fitness_distance.value,
-            *likeness(cosine),
+            math.nan if near is None else near.cosine.value,
+            math.nan if near is None else near.uphill.value,
             found.range,
         ]
     )
@@ -331,10 +345,11 @@ class CensusedSlice:
 class Census:
     """Hold what many slices of an environment are like.
 
-    `words` says of every word which share of the slices it fits, `spreads` and `parts` say of every measure how it is
-    distributed and what its variance goes with. `other` is the fidelity that some slices were measured at, too, empty
-    where there is none. Slices have gradients at every so many samples along each axis, `gradients`. `losses`
-    [loss unit] are those of the slices, shape (slice, v, u), in a file of their own. `floor` is what replicas of the
+    `words` says of every word which share of the slices it fits, without those that are flat. `spreads` and `parts`
+    say of every measure how it is distributed and what its variance goes with. `exhausted` says whether base points and
+    cuts are all that there are. `other` is the fidelity that some slices were measured at, too, empty where there is
+    none. Slices have gradients at every so many samples along each axis, `gradients`. `losses` [loss unit] are those of
+    the slices, shape (slice, v, u), in a file of their own. `floor` is what replicas of the
     environment differ by at random points, against the median range of the slices; None where it has none.
     """
 
@@ -351,6 +366,7 @@ class Census:
     words: dict[str, Estimate]
     spreads: dict[str, Spread]
     parts: dict[str, VarianceComponents]
+    exhausted: tuple[bool, bool]
     identity: dict[str, Any]
     provenance: dict[str, Any]
     command: str
@@ -358,6 +374,16 @@ class Census:
     losses: NDArray[np.float32] = field(
         default_factory=lambda: np.zeros(0, np.float32), metadata=NOT_JSON, repr=False, compare=False
     )
+
+    @property
+    def solid(self) -> int:
+        """How many slices are not flat: those that shares of other words are of."""
+        return sum(FLAT not in one.words for one in self.slices)
+
+    def share(self, words: Sequence[str]) -> Estimate:
+        """Return the share of slices that any of some words fits, of those that are not flat."""
+        places = [(one.base, one.cut) for one in self.slices]
+        return share_of_any([one.words for one in self.slices], words, places, self.exhausted)
 
     @property
     def order(self) -> list[int]:
@@ -406,7 +432,7 @@ def conclude(
     floor: Floor | None = None,
 ) -> Census:
     """Sum up the slices of a design, and those that were measured at another fidelity, too, by their numbers."""
-    drawn = bootstrap(design.places, seed=seed)
+    drawn = bootstrap(design.places, seed=seed, exhausted=design.exhausted)
     shape = len(design.bases), len(design.cuts)
     whole, halved = (
         np.array([getattr(one, name) for one in found]).reshape(*shape, -1) for name in ("measures", "halved")
@@ -424,7 +450,8 @@ def conclude(
         seed=seed,
         episodes=sum(one.episodes for one in (*found, *others.values())),
         slices=tuple(_sum_up(one, *place, design.plane(*place).labels) for place, one in places),
-        words=word_shares([one.words for one in found], drawn),
+        words=word_shares([one.words for one in found], design.places, design.exhausted),
+        exhausted=design.exhausted,
         spreads=spreads,
         parts=parts,
         losses=np.array([one.loss for one in found], dtype=np.float32),
@@ -446,31 +473,45 @@ def _sum_up(found: SurveyedSlice, base: int, cut: int, axes: tuple[str, ...]) ->
     return CensusedSlice(base, cut, axes, ends, 1 - known.size / found.loss.size, measures, found.words)
 
 
-def bootstrap(places: Sequence[tuple[int, int]], *, seed: int) -> NDArray[np.int64]:
+def bootstrap(
+    places: Sequence[tuple[int, int]], *, seed: int, exhausted: tuple[bool, bool] = (False, False)
+) -> NDArray[np.int64]:
     """Draw how often each slice counts, shape (resample, slice): base points and cuts are drawn, each by themselves.
 
     Slices that share a point or a cut depend on each other (pigeonhole bootstrap: Owen 2007, Ann. Appl. Stat. 1(2)).
-    Where there is but one of either it is kept.
+    Where there is but one of either it is kept, and so are all of them where there are no others.
     """
     generator, at = np.random.default_rng(seed), np.array(places)
     counts = [
-        generator.multinomial(many, np.full(many, 1 / many), size=RESAMPLES)
-        if many > 1
-        else np.ones((RESAMPLES, 1), int)
-        for many in at.max(axis=0) + 1
+        np.ones((RESAMPLES, many), int)
+        if many == 1 or all_of_them
+        else generator.multinomial(many, np.full(many, 1 / many), size=RESAMPLES)
+        for many, all_of_them in zip(at.max(axis=0) + 1, exhausted, strict=True)
     ]
     return np.asarray(counts[0][:, at[:, 0]] * counts[1][:, at[:, 1]], dtype=np.int64)
 
 
-def word_shares(words: Sequence[Sequence[str]], drawn: NDArray[np.int64]) -> dict[str, Estimate]:
-    """Return the share of slices that each word fits, with the percentile interval of the resamples."""
-    return {word: _share(np.array([word in one for one in words], dtype=float), drawn) for word in WORDS}
+def word_shares(
+    words: Sequence[Sequence[str]], places: Sequence[tuple[int, int]], exhausted: tuple[bool, bool]
+) -> dict[str, Estimate]:
+    """Return the share of slices that each word fits, of those that are not flat; that of flat ones is of all."""
+    return {word: share_of_any(words, [word], places, exhausted) for word in WORDS}
 
 
-def _share(hits: Array, drawn: NDArray[np.int64]) -> Estimate:
-    weights = drawn.sum(axis=1)
-    found = (drawn @ hits)[weights > 0] / weights[weights > 0]
-    return Estimate(float(hits.mean()), *_interval(found))
+def share_of_any(
+    said: Sequence[Sequence[str]],
+    words: Sequence[str],
+    places: Sequence[tuple[int, int]],
+    exhausted: tuple[bool, bool],
+) -> Estimate:
+    """Return the share of slices that any of some words fits, with its interval; see `word_shares`.
+
+    Slices of one base point are a cluster, and so are those of one cut where there are others.
+    """
+    counted = np.array([FLAT in words or FLAT not in one for one in said])
+    hits = np.array([any(word in one for word in words) for one in said], dtype=float)[counted]
+    clusters = [np.array(places)[counted, axis] for axis in (0, 1) if not exhausted[axis]]
+    return clustered_share(hits, clusters)
 
 
 def spread(values: Array, drawn: NDArray[np.int64]) -> Spread:

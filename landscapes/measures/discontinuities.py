@@ -1,4 +1,18 @@
-"""Discontinuities of a loss: differences between neighbouring samples that do not vanish on a finer look."""
+"""Discontinuities of a loss: jumps between neighbouring samples that do not vanish on a finer look.
+
+A jump counts from a fixed part of the range on, whatever the samples are. Its trace is a difference between two
+neighbours that neither their gradients nor the differences around it explain. Every line of a slice, row or column, is
+in one of three states before anything is evaluated or drawn:
+
+- it has no trace of half a jump: the samples clear it;
+- its strongest trace is among the strongest of the slice, which are looked into, and is a jump;
+- neither: some of these lines are drawn at random. That gives the interval of the share of lines that cross a jump and,
+  where none is found in all traces of the lines that are drawn, the power of the search.
+
+A trace is bisected towards the larger unexplained difference: a jump keeps its height, a slope loses half of it every
+time. What is left must be apart by more than the losses on either side of it vary among themselves, so that neither
+noise nor a fractal surface jumps.
+"""
 
 from __future__ import annotations
 
@@ -17,11 +31,17 @@ from torch import Tensor
 from ..identity import plane_of
 from ..objective import Objective, evaluate
 from ..plane import Plane
-from ..statistics import Estimate, share
+from ..statistics import Estimate, Values, share, upper_bound
+from .ruggedness import box_slopes, span
 
+LEAST = 0.01  # of the slice's range, from which on a difference is a jump
 HALVINGS = 12  # a gap between samples is looked into down to 1/4096 of it
-EVALUATIONS_PER_PAIR = 2 + HALVINGS
-PERSISTS = 3  # halvings over which a jump keeps more than half of its height, and a slope an eighth
+SIDES = (1, 2, 4, 8, 16, 32)  # widths of what is left of a gap, at which both sides of it are evaluated
+EVALUATIONS_PER_PAIR = 2 + HALVINGS + 2 * (1 + len(SIDES))  # at most
+APART = 2  # times what the losses vary on one side of a jump is its height at least
+GUIDED = 1 / 2  # of the pairs that are looked into are those with the strongest traces
+BELIEVED = 2  # times the differences here and around is what gradients that explain one say at most
+AROUND = (-2, -1, 1, 2)  # neighbouring differences along a line whose median explains one
 Count = Callable[[Tensor], Mapping[str, Tensor]]
 
 
@@ -39,31 +59,58 @@ class Jump:
 
 @dataclass(frozen=True)
 class Jumps:
-    """Hold the jumps that were `found`, the highest first, and how often they occur between neighbouring samples.
+    """Hold the jumps of a slice that were `found`, the highest first, and how many of its lines cross one.
 
-    Of `neighbours` pairs of samples `steep` differ by at least `least` [loss unit]; `checked` of these were looked into
-    and `undecided` could not be, as an evaluation there failed.
+    A jump is at least `least` high [loss unit], and the losses have a `range`. Of the slice's `lines`, its rows and
+    columns, `crossed` cross a found jump. So many are `settled` without chance, by the samples or by their strongest
+    traces. Of the others `drawn` were drawn at random: `hit` of these cross a jump, and `clear` have none. In all
+    `checked` pairs of neighbours were looked into, of which `undecided` could not be, as an evaluation there failed.
     """
 
-    derived: ClassVar = ("share", "explained_by_events")
+    derived: ClassVar = ("share", "unseen", "largest", "explained_by_events", "sentence")
 
     found: tuple[Jump, ...]
     least: float
-    neighbours: int
-    steep: int
+    range: float
+    lines: int
+    crossed: int
+    settled: int
+    drawn: int
+    hit: int
+    clear: int
     checked: int
     undecided: int
+    evaluations: int
 
     @property
     def share(self) -> Estimate:
-        """Share of all pairs of neighbours with a jump between them; no interval where every steep one was checked."""
-        decided, part = self.checked - self.undecided, self.steep / self.neighbours if self.neighbours else math.nan
-        if self.steep == 0:
-            return Estimate(0.0, 0.0, 0.0)
-        found = share(len(self.found), decided)
-        if decided == self.steep:
-            return Estimate(found.value * part, found.value * part, found.value * part)
-        return Estimate(found.value * part, found.low * part, found.high * part)
+        """Share of the lines that cross a jump; its interval counts what is not known of the lines drawn both ways."""
+        if not self.lines:
+            return Estimate(math.nan, math.nan, math.nan)
+        sure, others = self.crossed - self.hit, self.lines - self.settled
+        most = self.drawn - self.clear
+        if self.drawn == others:  # no chance is left
+            parts = (self.hit, self.hit, most)
+        else:
+            low, high = share(self.hit, self.drawn), share(most, self.drawn)
+            parts = (others * low.value, others * low.low, others * high.high) if self.drawn else (0, 0, others)
+        value, low_, high_ = ((sure + part) / self.lines for part in parts)
+        return Estimate(value, low_, high_)
+
+    @property
+    def unseen(self) -> float:
+        """Share of the lines that could have a jump though none was found: a one-sided 95 % bound."""
+        if not self.lines or self.crossed:
+            return math.nan
+        others, unknown = self.lines - self.settled, self.drawn - self.clear
+        if self.drawn == others:
+            return unknown / self.lines
+        return others / self.lines * upper_bound(unknown, self.drawn)
+
+    @property
+    def largest(self) -> float:
+        """The height of the highest jump over the range of the losses, 0 where none was found."""
+        return self.found[0].height / self.range if self.found else 0.0
 
     @property
     def explained_by_events(self) -> Estimate | None:
@@ -71,77 +118,267 @@ class Jumps:
         explained = [jump.event for jump in self.found]
         return share(sum(map(bool, explained)), len(explained)) if explained and None not in explained else None
 
+    @property
+    def sentence(self) -> str:
+        """Say how high jumps are and how many lines cross one, or how many could have one that was not found."""
+        if not self.found:
+            part = self.least / self.range if self.range > 0 else math.inf
+            said = f"none of {_percent(part)} of the range or more" if part < 1 else "none above the noise"
+            unseen = f"; up to {math.ceil(100 * self.unseen)} % of lines could have one" if self.unseen > 0 else ""
+            return said + unseen
+        value, low, high = (round(100 * part) for part in (self.share.value, self.share.low, self.share.high))
+        interval = f" ({low} to {high})" if low < high else ""
+        return f"jumps up to {_percent(self.largest)} of the range; {value} %{interval} of lines cross one"
+
+
+def _percent(part: float) -> str:
+    return f"{100 * part:.0f} %" if part >= 0.0995 else f"{100 * part:.2g} %"
+
 
 def find_jumps(
     objective: Objective,
     datasets: Sequence[xr.Dataset],
     *,
-    least: Sequence[float],
+    least: Sequence[float] | None = None,
     most: int = 64,
     seed: int = 0,
     events: Count | None = None,
 ) -> list[Jumps]:
     """Look for jumps between neighbouring samples of slices, by new evaluations; those of all slices are in one batch.
 
-    A jump is at least as high as its slice's bound in `least` [loss unit]. At most so many pairs of a slice, drawn at
-    random from those that differ by as much, are bisected towards the larger half: a jump keeps its height, a slope
-    loses half of it every time.
+    A jump is `LEAST` of its slice's range or more, and no less than the slice's floor in `least` [loss unit], by
+    default 0. At most `most` pairs of a slice are looked into: first those with the strongest traces, then those of
+    lines that are drawn at random.
     """
-    planes = [plane_of(dataset) for dataset in datasets]
-    pairs = [_steep_pairs(*one) for one in zip(datasets, planes, least, strict=True)]
-    drawn = [ends[np.sort(np.random.default_rng(seed).permutation(len(ends))[:most])] for ends, _ in pairs]
-    bisected = _bisect(objective, planes, [torch.from_numpy(ends) for ends in drawn])
-    jumps = []
-    for plane, (ends, neighbours), bound, (low, high, gaps) in zip(planes, pairs, least, bisected, strict=True):
-        decided = gaps.isfinite().all(dim=0)
-        last, earlier = gaps[-1], gaps[-1 - PERSISTS]
-        found = decided & (last >= bound) & (last > earlier / 2)
-        counted = _differ(events, plane.lift(low[found]), plane.lift(high[found])) if events else None
-        place, undecided = (low + high)[found] / 2, int((~decided).sum())
-        events_there = [None] * len(place) if counted is None else counted.tolist()
-        each = map(Jump, map(tuple, place.tolist()), last[found].tolist(), events_there)
-        highest_first = tuple(sorted(each, key=lambda jump: -jump.height))
-        jumps.append(Jumps(highest_first, bound, neighbours, len(ends), len(low), undecided))
-    return jumps
+    floors = [0.0] * len(datasets) if least is None else least
+    slices = [_Search(*one, most, seed) for one in zip(datasets, floors, strict=True)]
+    for choose in (_Search.strongest, _Search.draw):
+        chosen = [choose(one) for one in slices]
+        for one, pairs, seen in zip(slices, chosen, _look(objective, slices, chosen), strict=True):
+            one.learn(pairs, seen)
+    return [one.conclude(events) for one in slices]
 
 
-def _steep_pairs(dataset: xr.Dataset, plane: Plane, least: float) -> tuple[NDArray[np.float64], int]:
-    """Return the ends of pairs that differ so much, shape (pairs, 2, rank), and how many pairs there are."""
-    loss = dataset["loss"].transpose("v", "u", missing_dims="ignore").to_numpy()
-    axes = [axis.numpy() for axis in plane.axes()]
-    places = np.stack(np.meshgrid(*axes[::-1], indexing="ij")[::-1], axis=-1)
-    pairs, neighbours = [np.zeros((0, 2, plane.rank))], 0
-    for axis in range(loss.ndim):
-        apart = np.abs(np.diff(loss, axis=axis))
-        neighbours += int(np.isfinite(apart).sum())
-        first, second = (np.delete(places, at, axis=axis) for at in (-1, 0))
-        with np.errstate(invalid="ignore"):
-            pairs.append(np.stack([first, second], axis=-2)[(apart >= least) & (apart > 0)])
-    return np.concatenate(pairs), neighbours
+@dataclass(frozen=True, eq=False)
+class _Look:
+    """Hold what became of pairs: the ends that are left of each, its state, its height and the losses evaluated."""
+
+    low: Values
+    high: Values
+    state: NDArray[np.int8]
+    height: Values
+    evaluations: int
+
+
+UNSEEN, FAILED, NO_JUMP, JUMP = range(4)  # what is known of a trace
+
+
+class _Search:
+    """Keep what is known of the traces of jumps in a slice: pairs of neighbours whose difference is not explained.
+
+    `ends` are their places [plane units], shape (trace, end, rank), `trend` is what explains a part of their difference
+    [loss unit], `line` the number of the row or column that they are on. The strongest come first.
+    """
+
+    def __init__(self, dataset: xr.Dataset, floor: float, most: int, seed: int) -> None:
+        loss = dataset["loss"].transpose("v", "u", missing_dims="ignore").to_numpy()
+        self.plane, self.range, self.most = plane_of(dataset), float(np.nan_to_num(span(loss))), most
+        self.least = max(float(floor), LEAST * self.range)
+        self.generator = np.random.default_rng(seed)
+        slopes = box_slopes(dataset) / (np.array(self.plane.resolution) - 1) if "grad" in dataset else None
+        self._find_traces(loss, slopes)
+        self.low, self.high = self.ends[:, 0].copy(), self.ends[:, 1].copy()
+        self.state, self.height = np.full(len(self.line), UNSEEN, np.int8), np.zeros(len(self.line))
+        self.open = self.drawn = np.zeros(0, np.intp)
+        self.evaluations = 0
+
+    def _find_traces(self, loss: Values, slopes: Values | None) -> None:
+        axes = [axis.numpy() for axis in self.plane.axes()]
+        places = np.stack(np.meshgrid(*axes[::-1], indexing="ij")[::-1], axis=-1)
+        found, self.lines = list[tuple[Values, Values, Values, NDArray[np.intp]]](), 0
+        for axis in range(loss.ndim):
+            rows, at = (_lines(values, axis, loss.ndim) for values in (loss, places))
+            slope = None if slopes is None else _lines(slopes[..., loss.ndim - 1 - axis], axis, loss.ndim)
+            difference = np.diff(rows, axis=1)
+            trend = _trend(difference, slope)
+            trace = np.abs(difference - trend)
+            line, step = np.nonzero((trace >= self.least / 2) & (trace > 0))
+            known = np.isfinite(difference).any(axis=1)
+            number = self.lines + np.cumsum(known)[line] - 1
+            ends = np.stack([at[line, step], at[line, step + 1]], axis=1)
+            found.append((trace[line, step], ends, trend[line, step], number))
+            self.lines += int(known.sum())
+        trace, ends, trend, number = (np.concatenate(parts) for parts in zip(*found, strict=True))
+        order = np.argsort(-trace, kind="stable")
+        self.ends, self.trend, self.line = ends[order], trend[order], number[order]
+
+    def strongest(self) -> NDArray[np.intp]:
+        """Return the pairs with the strongest traces, one of each line before a second one of any."""
+        whole = len(self.line) <= self.most or self.lines == 1
+        return self._first(np.arange(len(self.line)), self.most if whole else round(GUIDED * self.most))
+
+    def draw(self) -> NDArray[np.intp]:
+        """Draw lines that are not settled, and return the pairs to look into there.
+
+        Where jumps were found, that is the strongest trace of as many lines as possible, since it will be another one;
+        else it is all traces of fewer lines.
+        """
+        unseen = self.state == UNSEEN
+        pending = np.unique(self.line[unseen | (self.state == FAILED)])
+        self.open = np.setdiff1d(pending, self.line[self.state == JUMP])
+        order = self.generator.permutation(self.open)
+        left = self.most - int((~unseen).sum())
+        each = np.bincount(self.line[unseen], minlength=self.lines)[order]
+        self.drawn = order[:left] if (self.state == JUMP).any() else order[np.cumsum(each) <= left]
+        fits = np.isin(self.line, self.drawn) if len(self.drawn) else True  # else at least the next strongest traces
+        return self._first(np.flatnonzero(unseen & fits), left)
+
+    def _first(self, pairs: NDArray[np.intp], most: int) -> NDArray[np.intp]:
+        """Return so many pairs: the strongest of each line, then the second of each, and so on."""
+        place = np.zeros(len(pairs), int)
+        by_line = np.argsort(self.line[pairs], kind="stable")
+        starts = np.flatnonzero(np.diff(self.line[pairs][by_line], prepend=-1))
+        place[by_line] = np.arange(len(pairs)) - np.repeat(starts, np.diff(starts, append=len(pairs)))
+        return pairs[np.sort(np.argsort(place, kind="stable")[:most])]
+
+    def learn(self, pairs: NDArray[np.intp], look: _Look) -> None:
+        """Keep what became of pairs."""
+        self.low[pairs], self.high[pairs] = look.low, look.high
+        self.state[pairs], self.height[pairs] = look.state, look.height
+        self.evaluations += look.evaluations
+
+    def conclude(self, events: Count | None) -> Jumps:
+        """Return the jumps that were found, and what is known of the lines."""
+        found = np.flatnonzero(self.state == JUMP)
+        found = found[np.argsort(-self.height[found], kind="stable")]
+        low, high = (torch.from_numpy(one[found]) for one in (self.low, self.high))
+        counted = _differ(events, self.plane.lift(low), self.plane.lift(high)) if events and len(found) else None
+        each = [None] * len(found) if counted is None else counted.tolist()
+        places = ((low + high) / 2).tolist()
+        crossed = np.unique(self.line[found])
+        unclear = np.union1d(self.line[self.state != NO_JUMP], crossed)
+        return Jumps(
+            found=tuple(map(Jump, map(tuple, places), self.height[found].tolist(), each)),
+            least=self.least,
+            range=self.range,
+            lines=self.lines,
+            crossed=len(crossed),
+            settled=self.lines - len(self.open),
+            drawn=len(self.drawn),
+            hit=len(np.intersect1d(self.drawn, crossed)),
+            clear=len(np.setdiff1d(self.drawn, unclear)),
+            checked=int((self.state != UNSEEN).sum()),
+            undecided=int((self.state == FAILED).sum()),
+            evaluations=self.evaluations,
+        )
+
+
+def _lines(values: Values, axis: int, rank: int) -> Values:
+    """Return values of samples as lines along an axis, shape (line, sample, ...)."""
+    moved = np.moveaxis(values, axis, rank - 1)
+    return moved.reshape(-1, *moved.shape[rank - 1 :])
+
+
+def _trend(difference: Float[Values, "line step"], slope: Float[Values, "line sample"] | None) -> Values:
+    """Return what explains differences along lines: the gradients around, or else the median difference around.
+
+    `slope` is the derivative by a step. It explains by the trapezoid of both ends or by the cubic through four samples,
+    whichever is nearer, unless it says more than twice what the losses do here and around.
+    """
+    padded, count = np.pad(difference, ((0, 0), (2, 2)), constant_values=np.nan), difference.shape[1]
+    around = np.sort(np.stack([padded[:, 2 + off : 2 + off + count] for off in AROUND]), axis=0)  # NaN comes last
+    known = np.isfinite(around).sum(axis=0)
+    middle = [np.take_along_axis(around, np.maximum(at, 0)[None], axis=0)[0] for at in ((known - 1) // 2, known // 2)]
+    trend = np.where(known > 0, (middle[0] + middle[1]) / 2, 0.0)
+    largest = np.maximum(np.abs(difference), np.nan_to_num(np.abs(around)).max(axis=0))
+    with np.errstate(over="ignore", invalid="ignore"):  # gradients may be as large as numbers are
+        for nearer, told in enumerate(() if slope is None else _integrals(slope)):
+            believed = np.abs(told) <= BELIEVED * largest
+            if nearer:
+                believed &= np.abs(difference - told) < np.abs(difference - trend)
+            trend = np.where(believed, told, trend)
+    return trend
+
+
+def _integrals(slope: Float[Values, "line sample"]) -> tuple[Values, Values]:
+    """Return the integrals of derivatives over each step, linear and cubic between samples."""
+    linear = (slope[:, :-1] + slope[:, 1:]) / 2
+    if slope.shape[1] < 3:
+        return linear, linear
+    first, last = (3 * (near - middle) + far for near, middle, far in (slope[:, :3].T, slope[:, :-4:-1].T))
+    wide = np.concatenate([first[:, None], slope, last[:, None]], axis=1)
+    return linear, (13 * (wide[:, 1:-2] + wide[:, 2:-1]) - wide[:, :-3] - wide[:, 3:]) / 24
+
+
+def _look(objective: Objective, slices: Sequence[_Search], chosen: Sequence[NDArray[np.intp]]) -> list[_Look]:
+    """Look into pairs of all slices, given by their numbers: bisect them, and compare both sides of what is left."""
+    several = list(zip(slices, chosen, strict=True))
+    owner = np.repeat(np.arange(len(slices)), [len(pairs) for pairs in chosen])
+    asked = _Batch(objective, [one.plane for one in slices], owner)
+    ends, trend = (np.concatenate([getattr(one, name)[pairs] for one, pairs in several]) for name in ("ends", "trend"))
+    least = np.array([one.least for one in slices])[owner]
+    low, high, open_, failed = _bisect(asked, ends, trend, least)
+    reach = np.array([0, *SIDES])[:, None] * (high - low)[:, None]
+    sides = np.stack([low[:, None] - reach, high[:, None] + reach], axis=1)  # (pair, side, place, rank)
+    around = asked.losses(np.clip(sides, ends.min(axis=1)[:, None, None], ends.max(axis=1)[:, None, None]), open_)
+    failed |= open_ & ~np.isfinite(around).all(axis=(1, 2))
+    height = np.abs(np.diff(np.median(around, axis=-1), axis=1))[:, 0]
+    within = np.ptp(around, axis=-1).max(axis=1)
+    jump = open_ & ~failed & (height >= least) & (height > APART * within)
+    state = np.where(failed, FAILED, np.where(jump, JUMP, NO_JUMP)).astype(np.int8)
+    return [
+        _Look(*(values[owner == number] for values in (low, high, state, height)), int(count))
+        for number, count in enumerate(asked.counts)
+    ]
 
 
 def _bisect(
-    objective: Objective, planes: Sequence[Plane], ends: Sequence[Float[Tensor, "pairs end rank"]]
-) -> list[tuple[Tensor, Tensor, Float[Tensor, "halvings pairs"]]]:
-    """Halve every pair towards the larger difference; return its last ends and the difference after each halving."""
-    counts = [len(one) for one in ends]
-    low, high = torch.cat(list(ends)).unbind(dim=1)
+    asked: _Batch, ends: Float[Values, "pair end rank"], trend: Float[Values, " pair"], least: Float[Values, " pair"]
+) -> tuple[Values, Values, NDArray[np.bool_], NDArray[np.bool_]]:
+    """Halve pairs towards the larger unexplained difference; return their last ends, which persist, which failed.
 
-    def losses(u: Float[Tensor, "pairs rank"]) -> Float[Tensor, " pairs"]:
-        x = [plane.lift(part) for plane, part in zip(planes, torch.split(u, counts), strict=True)]
-        return evaluate(objective, torch.cat(x), grad=False).loss
-
-    below, above = losses(low), losses(high)  # again: a slice may come from another device
-    gaps = [(above - below).abs()]
+    A pair is left as soon as less than half a jump is in either half.
+    """
+    low, high = ends[:, 0], ends[:, 1]
+    below, above = asked.losses(ends, np.ones(len(ends), bool)).T  # again: a slice may come from another device
+    failed = ~np.isfinite(above - below)
+    open_ = np.abs(above - below - trend) >= least / 2
     for _ in range(HALVINGS):
-        middle = (low + high) / 2
-        between = losses(middle)
-        left = (between - below).abs() >= (above - between).abs()
-        high, above = torch.where(left[:, None], middle, high), torch.where(left, between, above)
-        low, below = torch.where(left[:, None], low, middle), torch.where(left, below, between)
-        gaps.append((above - below).abs() + 0 * between)  # NaN once a middle failed
-    halved = torch.split(torch.stack(gaps), counts, dim=1)
-    return list(zip(torch.split(low, counts), torch.split(high, counts), halved, strict=True))
+        middle, trend = (low + high) / 2, trend / 2
+        between = asked.losses(middle, open_)
+        failed |= open_ & ~np.isfinite(between)
+        gaps = np.abs(between - below - trend), np.abs(above - between - trend)
+        left, right = open_ & (gaps[0] >= gaps[1]), open_ & (gaps[0] < gaps[1])
+        high, above = np.where(left[:, None], middle, high), np.where(left, between, above)
+        low, below = np.where(right[:, None], middle, low), np.where(right, between, below)
+        open_ &= np.maximum(*gaps) >= least / 2
+    return low, high, open_, failed
+
+
+class _Batch:
+    """Evaluate places of pairs on several planes in one batch, and count them by plane.
+
+    `owner` is the number of each pair's plane, ascending.
+    """
+
+    def __init__(self, objective: Objective, planes: Sequence[Plane], owner: NDArray[np.intp]) -> None:
+        self.objective, self.planes, self.owner = objective, planes, owner
+        self.counts = np.zeros(len(planes), int)
+
+    def losses(self, u: Float[Values, "pair *places rank"], wanted: NDArray[np.bool_]) -> Values:
+        """Return the losses of some of the pairs, shape (pair, *places), NaN for the others.
+
+        An engine that compiles for each size of batch evaluates all of them.
+        """
+        found = np.full(u.shape[:-1], np.nan)
+        rows = np.ones_like(wanted) if self.objective.own_programs else wanted
+        if wanted.any():
+            numbers = np.unique(self.owner[rows])
+            parts = [(self.planes[one], u[rows & (self.owner == one)].reshape(-1, u.shape[-1])) for one in numbers]
+            x = torch.cat([plane.lift(torch.from_numpy(part)) for plane, part in parts])
+            found[rows] = evaluate(self.objective, x, grad=False).loss.numpy().reshape(found[rows].shape)
+            self.counts += np.bincount(self.owner[rows], minlength=len(self.planes)) * math.prod(u.shape[1:-1])
+        return np.where(wanted.reshape(-1, *(1,) * (found.ndim - 1)), found, np.nan)
 
 
 def _differ(events: Count, low: Float[Tensor, "jumps dim"], high: Float[Tensor, "jumps dim"]) -> Tensor | None:

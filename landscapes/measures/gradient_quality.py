@@ -92,14 +92,29 @@ def compare_differences(
     exact = evaluate(objective, plane.lift(u), grad=True)
     assert exact.grad is not None  # as it was asked for
     slope = plane.slope(exact.grad) * sides
-    steps = torch.eye(plane.rank, dtype=torch.float64) * sides
-    parts = []
-    for scale in scales:
-        ends = torch.stack([u[:, None] + way * scale / 2 * steps for way in (-1, 1)])
-        loss = evaluate(objective, plane.lift(ends.reshape(-1, plane.rank)), grad=False).loss
-        below, above = loss.reshape(2, len(u), plane.rank)
-        parts.append(agreement(slope.numpy(), ((above - below) / scale).numpy(), math.sqrt(2) * deviation / scale))
+    (differences,) = central_differences(objective, [plane], u[None], scales)
+    parts = [
+        agreement(slope.numpy(), difference, math.sqrt(2) * deviation / scale)
+        for scale, difference in zip(scales, differences, strict=True)
+    ]
     return xr.Dataset(_stack(parts, "scale", "point"), {"scale": list(scales), "place": (("point", "axis"), u.numpy())})
+
+
+def central_differences(
+    objective: Objective, planes: Sequence[Plane], u: Float[Tensor, "plane point rank"], scales: Sequence[float]
+) -> Float[Values, "plane scale point rank"]:
+    """Return central differences over parts of the box at points of planes, from one batch [loss unit per side]."""
+    sides = torch.stack([plane.upper - plane.lower for plane in planes])
+    steps = (
+        torch.diag_embed(sides)[:, None, None] * torch.tensor(scales, dtype=torch.float64).reshape(1, -1, 1, 1, 1) / 2
+    )
+    ends = torch.stack(
+        [u[:, None, :, None] - steps, u[:, None, :, None] + steps], dim=1
+    )  # plane way scale point axis u
+    x = [plane.lift(part.reshape(-1, plane.rank)) for plane, part in zip(planes, ends, strict=True)]
+    loss = evaluate(objective, torch.cat(x), grad=False).loss.reshape(ends.shape[:-1]).numpy()
+    found: Values = (loss[:, 1] - loss[:, 0]) / np.reshape(scales, (1, -1, 1, 1))
+    return found
 
 
 def compare_samples(dataset: xr.Dataset, *, deviation: float = 0.0) -> xr.Dataset:
@@ -113,7 +128,7 @@ def compare_samples(dataset: xr.Dataset, *, deviation: float = 0.0) -> xr.Datase
     strides = [stride for stride in STRIDES if 2 * stride < min(loss.shape)]
     parts = []
     for stride in strides:
-        axes = [_central_differences(loss, axis, stride) for axis in range(loss.ndim)][::-1]  # u first
+        axes = [differences_of_samples(loss, axis, stride) for axis in range(loss.ndim)][::-1]  # u first
         widths = np.array([2 * stride / (size - 1) for size in plane.resolution])
         fuzz = math.sqrt(2) * deviation / widths.min()
         parts.append(agreement(box_slopes(dataset), np.stack(axes, axis=-1), fuzz))
@@ -242,7 +257,7 @@ def width_table(found: xr.Dataset) -> tuple[WidthRow, ...]:
     return tuple(rows)
 
 
-def _central_differences(loss: Values, axis: int, stride: int) -> Values:
+def differences_of_samples(loss: Values, axis: int, stride: int) -> Values:
     """Return central differences over 2 * stride samples [loss unit per side of the box]."""
     size = loss.shape[axis]
     moved = np.moveaxis(loss, axis, 0)

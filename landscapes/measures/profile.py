@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -16,22 +16,23 @@ from ..capacity import Need
 from ..convert import NOT_JSON
 from ..identity import errors_of, plane_of
 from ..objective import Evaluation, Objective, ObjectiveWrapper, evaluate, in_box
-from ..statistics import Estimate
+from ..statistics import Estimate, share
 from . import gradient_quality as gradients
-from .classify import Verdict, classify, thresholds
-from .discontinuities import Count, Jumps, find_jumps
-from .doubled_resolution import DoubledResolution, double_resolution, doubling_episodes
+from .discontinuities import EVALUATIONS_PER_PAIR, Count, Jumps
 from .floor import Floor
+from .following import SCALES, WIDTH
 from .lyapunov import GradientGrowth
 from .noise import Noise, noise
-from .ruggedness import Ruggedness, half_step, ruggedness
+from .ruggedness import Ruggedness, ruggedness
 from .slice_floor import counted_from, find_floor, floor_of, split_effort
+from .surface import EVALUATIONS_PER_PLACE, PLACES, WAY_POINTS, WAYS
 from .undersampled import Undersampled, find_undersampled, probes
+from .verdict import POINTS, RANGE_POINTS, Verdict, judge, judge_samples, least_difference, measure_range
 
 PRECISION = {"float32": 2.0**-23, "float64": 2.0**-52}  # relative, of an engine that computes in it
 NOISE_POINTS, REPEATS, PAIRS = 16, 4, 12
 SECONDS, BYTES = (1.0, 4e-5), (80_000_000, 300)  # that a slice takes, and each of its samples (2026-11, one core)
-PAIRS_PER_POINT = 8  # steep pairs of samples that are looked into, for each point of a side of the subgrid
+PAIRS_PER_POINT = 8  # pairs of samples that are looked into, for each point of a side of the subgrid
 
 
 @dataclass(frozen=True)
@@ -46,74 +47,92 @@ class OutsideBounds:
 class Profile:
     """Hold the measures of a slice: of its losses, of its noise, of its jumps and of its gradients at several scales.
 
-    `floor` is what replicas of the objective differ by, None where it has none. No measure of losses counts what is
-    below `losses.floor`, which is that of noise or that of numerics, whichever is larger.
+    The `verdict` has the words, and what they are from: the surface, jumps, how gradients follow, and the numerical
+    floor. No measure of losses counts what is below `losses.floor`, which is that of noise or that of numerics,
+    whichever is larger. `noise` is None where it is not known.
 
-    `differences`, `differences_of_samples` and `smoothing` sum up `quality`, which is drawn. `beyond_the_box` counts
-    the probes that the objective does not allow. `undersampled` and `doubled` say what the samples hide, None where
-    that is not known; `errors` says how many of them raised and what the first of them said. `growth` is that of
-    gradients with the length of episodes, None where it was not measured.
+    `differences`, `differences_of_samples` and `smoothing` sum up `quality`, which is drawn; of samples alone there are
+    but those in the middle. `beyond_the_box` counts the probes that the objective does not allow. `undersampled` says
+    what the samples hide, None where that is not known; `errors` says how many of them raised and what the first of
+    them said. `growth` is that of gradients with the length of episodes, None where it was not measured.
     """
 
     losses: Ruggedness
-    noise: Noise
-    jumps: Jumps
+    noise: Noise | None
+    verdict: Verdict
     differences: tuple[gradients.ScaleRow, ...]
     differences_of_samples: tuple[gradients.ScaleRow, ...]
     smoothing: tuple[gradients.WidthRow, ...]
-    verdict: Verdict
-    thresholds: dict[str, float]
     beyond_the_box: OutsideBounds
     undersampled: Undersampled | None
-    doubled: DoubledResolution | None
     errors: str
     growth: GradientGrowth | None = None
-    floor: Floor | None = None
     quality: gradients.GradientQuality | None = field(default=None, metadata=NOT_JSON, compare=False, repr=False)
 
     @property
     def words(self) -> tuple[str, ...]:
-        """The words for the landscape, in the order of `classify.WORDS`."""
+        """The words for the landscape, in the order of `verdict.WORDS`."""
         return self.verdict.words
+
+    @property
+    def jumps(self) -> Jumps | None:
+        """The jumps that were found, None where they were not searched."""
+        return self.verdict.jumps
+
+    @property
+    def floor(self) -> Floor | None:
+        """What replicas of the objective differ by, None where it has none."""
+        return self.verdict.floor
 
     @property
     def measures(self) -> dict[str, str]:
         """The chief numbers by short names, with 95 % intervals, as a page shows them."""
-        losses, jumps = self.losses, self.jumps
-        near = self.differences_of_samples[0]
-        lacking = losses.missing
+        named = self._measures_of_losses() | self._measures_of_gradients()
+        return {name: text for name, text in named.items() if text}
+
+    def _measures_of_losses(self) -> dict[str, str]:
+        losses, jumps, surface = self.losses, self.jumps, self.verdict.surface
         fewest, most = losses.minima_halved
-        named = {
-            "Samples that failed": _percent(losses.failed / losses.samples) if losses.failed else "",
+        return {
+            "Samples that failed": _shares(share(losses.failed, losses.samples)) if losses.failed else "",
             "Points that raised": self.errors,
-            "Gradients missing beside a loss": _shares(lacking) if lacking and lacking.value else "",
             "Local minima above the noise": f"{losses.minima} ({fewest} to {most} at half the resolution)",
-            "Local minima deeper than 1 % of the range": str(losses.notable),
+            "Local minima deeper than 1 % of the range": _count(surface.minima),
+            "Turns along a side": _along_axes(surface.turns),
+            "Exponent over short distances": _number(surface.holder),
+            "Places between samples that these do not tell": _shares(surface.off),
             "Basin of the lowest sample": _percent(losses.lowest_basin),
             "Noise floor": f"{losses.floor:.2g}{self._describe_source()}",
             "Numerical floor, of the range": _shares(self.floor.share) if self.floor else "",
             "Cosine of gradients of replicas": _number(self.floor.cosine) if self.floor and self.floor.cosine else "",
             "Gradient effectively zero": _shares(losses.flat),
-            "Samples level with their neighbours": _shares(losses.level),
-            "Neighbours with a jump between them": _shares(jumps.share),
-            "Jumps explained by an event": _shares(jumps.explained_by_events),
+            "Level, of the box": _shares(surface.level),
+            "Jumps": jumps.sentence if jumps else "not searched",
+            "Jumps explained by an event": _shares(jumps.explained_by_events) if jumps else "",
             "Correlation length, of the box": ", ".join(map(_shares, losses.correlation_length)),
             "Hölder exponent": _along_axes(losses.holder),
             "Total variation, in ranges": _along_axes(losses.total_variation),
             "Information content": _number(losses.information),
             "Dispersion of the best 5 %": _number(losses.dispersion),
             "Fitness-distance correlation": _number(losses.fitness_distance),
-            f"Cosine of gradient and difference over {near.scale:.1%} of the box": _number(near.cosine),
-            f"Gradients uphill over {near.scale:.1%} of the box": _shares(near.uphill),
             "Undersampled cells": self.undersampled.format_share() if self.undersampled else "",
         }
+
+    def _measures_of_gradients(self) -> dict[str, str]:
+        lacking, following, named = self.losses.missing, self.verdict.following, dict[str, str]()
+        if lacking and lacking.value:
+            named["Gradients missing beside a loss"] = _shares(lacking)
+        for one in following.scales if following else ():
+            said = f"{one.width:.1%} of the box"
+            named[f"Cosine of gradient and slope over {said}"] = _number(one.cosine)
+            named[f"Gradients uphill over {said}"] = _shares(one.uphill)
         if cut := self.beyond_the_box.cut:
             named["Probes beyond the bounds, left out"] = f"{cut} of {self.beyond_the_box.asked}"
         if self.growth:
             named["Growth with the length of episodes"] = self.growth.describe()
         for row in self.smoothing:
             named[f"First order biased, smoothed over {row.width:.0%} of the box"] = _shares(row.biased)
-        return {name: text for name, text in named.items() if text}
+        return named
 
     def _describe_source(self) -> str:
         """Say that the floor is not that of repeats."""
@@ -126,12 +145,12 @@ def effort(rank: int, points: int, shape: Sequence[int] = (), replicas: int = 0)
     Without the `shape` of the slice those are left out that look between its samples, and at its `replicas`.
     """
     places = points**2
-    losses = NOISE_POINTS * (2 + 2 * REPEATS) + PAIRS_PER_POINT * points * 14
-    losses += places * rank * 2 * len(gradients.SCALES)
-    slopes = places * (1 + 2 * PAIRS * len(gradients.WIDTHS))
+    losses = NOISE_POINTS * (2 + 2 * REPEATS) + PAIRS_PER_POINT * points * EVALUATIONS_PER_PAIR + RANGE_POINTS
+    losses += 2 * rank * (places * len(gradients.SCALES) + POINTS * len(SCALES))
+    losses += PLACES * EVALUATIONS_PER_PLACE + WAYS * WAY_POINTS
+    slopes = places * (1 + 2 * PAIRS * len(gradients.WIDTHS)) + POINTS
     if shape:
-        finer = doubling_episodes(shape)
-        losses, slopes = losses + probes(math.prod(shape), grad=True) + finer[0], slopes + finer[1]
+        losses += probes(math.prod(shape), grad=True)
         slopes += math.prod(split_effort(math.prod(shape), replicas)) if replicas else 0
     return losses, slopes
 
@@ -155,11 +174,10 @@ def measure_profile(
     seed: int = 0,
     events: Count | None = None,
 ) -> Profile:
-    """Measure a slice, with new evaluations of its objective at points x points places of it.
+    """Measure a slice, with new evaluations of its objective at points x points places of it and at random ones.
 
     `rounding` is the engine's relative precision: `PRECISION` has that of float32 and of float64. `events` counts what
-    happens in episodes, which explains jumps. Jumps are looked for from half the step on, from sample to sample, of a
-    ramp through the range of the losses. The numerical floor is the slice's own, or else measured now. Where
+    happens in episodes, which explains jumps. The numerical floor is the slice's own, or else measured now. Where
     neighbours or their gradients are compared it does not count, but noise alone: their numerics are the same.
     """
     plane, objective = plane_of(dataset), _Within(objective)
@@ -169,36 +187,68 @@ def measure_profile(
     drawn = plane.lower + (plane.upper - plane.lower) * shares
     fuzz = noise(objective, plane.lift(drawn), rounding=rounding, repeats=REPEATS, seed=seed)
     numerics = floor_of(dataset) or find_floor(objective, dataset, seed=seed)
-    samples = dataset["loss"].size
-    noisy = float(np.nan_to_num(fuzz.floor(samples)))
-    floor = max(noisy, counted_from(numerics))
-    found = ruggedness(dataset, floor=floor, noise=noisy)
-    least = [max(floor, half_step(found.range, plane.resolution))]
-    most = PAIRS_PER_POINT * points
-    (jumps,) = find_jumps(objective, [dataset], least=least, most=most, seed=seed, events=events)
     deviation = float(np.nan_to_num(fuzz.deviation))
     steps = gradients.compare_differences(objective, plane, places, deviation=deviation)
     smooth = gradients.smoothed_slopes(objective, plane, places, pairs=PAIRS, seed=seed)
-    near = gradients.compare_samples(dataset, deviation=deviation)
-    cosine = near["cosine"].isel(scale=0).to_numpy()
+    (verdict,) = judge(
+        objective,
+        [dataset],
+        deviation=deviation,
+        floor=numerics,
+        own_range=measure_range(objective, seed=seed),
+        pairs=PAIRS_PER_POINT * points,
+        smoothed=0,  # which they are here, over several widths
+        seed=seed,
+        events=events,
+    )
+    widths = gradients.width_table(smooth)
+    found = _profile(dataset, fuzz, with_bias(verdict, widths), deviation)
+    floor = found.losses.floor
     between = Undersampled.of(dataset) or find_undersampled(objective, dataset, floor=floor, seed=seed)
-    doubled = double_resolution(objective, dataset, found, jumps, cosine, deviation=deviation, seed=seed)
-    return Profile(
-        losses=found,
-        noise=fuzz,
-        jumps=jumps,
+    return replace(
+        found,
         differences=gradients.scale_table(steps),
-        differences_of_samples=gradients.scale_table(near),
-        smoothing=gradients.width_table(smooth),
-        verdict=classify(found, jumps, cosine),
-        thresholds=thresholds(),
+        smoothing=widths,
         beyond_the_box=OutsideBounds(objective.asked, objective.cut),
         undersampled=between,
-        doubled=doubled,
-        errors=errors_of(dataset),
-        floor=numerics,
-        quality=gradients.GradientQuality(steps, near, smooth),
+        quality=gradients.GradientQuality(steps, gradients.compare_samples(dataset, deviation=deviation), smooth),
     )
+
+
+def profile_samples(dataset: xr.Dataset, *, noise: Noise | None = None, floor: Floor | None = None) -> Profile:
+    """Measure a slice from its samples alone, where its function is not at hand.
+
+    Jumps are not searched, gradients are compared at the scales that the samples allow, and `noise` is what was
+    measured before; None for none. `floor` is by default the slice's own.
+    """
+    deviation = None if noise is None else float(np.nan_to_num(noise.deviation))
+    verdict = judge_samples(dataset, deviation=deviation, floor=floor or floor_of(dataset))
+    return _profile(dataset, noise, verdict, deviation or 0.0)
+
+
+def _profile(dataset: xr.Dataset, fuzz: Noise | None, verdict: Verdict, deviation: float) -> Profile:
+    """Measure what takes the samples alone."""
+    near = gradients.compare_samples(dataset, deviation=deviation) if "grad" in dataset else None
+    floors = [least_difference(dataset, deviation, numerics) for numerics in (verdict.floor, None)]
+    return Profile(
+        losses=ruggedness(dataset, floor=floors[0], noise=floors[1]),
+        noise=fuzz,
+        verdict=verdict,
+        differences=(),
+        differences_of_samples=() if near is None else gradients.scale_table(near),
+        smoothing=(),
+        beyond_the_box=OutsideBounds(0, 0),
+        undersampled=Undersampled.of(dataset),
+        errors=errors_of(dataset),
+    )
+
+
+def with_bias(verdict: Verdict, widths: Sequence[gradients.WidthRow]) -> Verdict:
+    """Return a verdict that knows where the mean of gradients is biased, of the width that its words are by."""
+    biased = next((row.biased for row in widths if row.width == WIDTH), None)
+    if verdict.following is None or biased is None:
+        return verdict
+    return replace(verdict, following=replace(verdict.following, biased=biased))
 
 
 class _Within(ObjectiveWrapper):
@@ -238,5 +288,13 @@ def _with_interval(estimate: Estimate | None, write: Callable[[float], str]) -> 
     return f"{said} ({write(low)} to {write(high)})" if known else said
 
 
-def _percent(share: float) -> str:
-    return f"{100 * share:.1f} %" if math.isfinite(share) else ""
+def _count(estimate: Estimate) -> str:
+    """Write a count, and those by deeper and by less deep ones."""
+    if not math.isfinite(estimate.value):
+        return ""
+    ends = f" ({estimate.low:.0f} to {estimate.high:.0f})" if estimate.low != estimate.high else ""
+    return f"{estimate.value:.0f}{ends}"
+
+
+def _percent(part: float) -> str:
+    return f"{100 * part:.1f} %" if math.isfinite(part) else ""

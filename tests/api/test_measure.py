@@ -26,7 +26,7 @@ def own_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_slice_and_its_folder_have_the_same_report_which_is_read_again(tmp_path: Path) -> None:
     cut = gs.slice("branin", (0, 1), resolution=24, out=tmp_path / "cut")
     told = gs.report(cut, points_per_axis=2, out=tmp_path / "told")
-    assert told.words == ("smooth with local minima", "gradients good")
+    assert told.words == ("smooth with local minima", "gradients follow")
     assert told.profile.losses.notable == 3  # Branin's minima
     assert told.table().loc["Local minima deeper than 1 % of the range", "value"] == "3"
     assert to_json(told) == read_json(tmp_path / "told/report.json")

@@ -15,9 +15,10 @@ from gradscape.gallery.paper import read_paper
 from gradscape.jobs import report as job
 from gradscape.jobs.report import PaperWords, Report, environments_markdown
 from gradscape.landscapes.convert import from_json
-from gradscape.landscapes.measures.classify import Verdict
-from gradscape.landscapes.measures.gradient_quality import ScaleRow
+from gradscape.landscapes.measures.discontinuities import Jump, Jumps
+from gradscape.landscapes.measures.following import Following, ScaleCosine
 from gradscape.landscapes.measures.slice_comparison import exactly
+from gradscape.landscapes.statistics import Estimate
 from gradscape.landscapes.storage.records import read_json, write_record
 
 from ..command import Run, make
@@ -40,7 +41,7 @@ def test_a_slice_is_reported_in_numbers_and_words(run: Run, cut: Path, tmp_path:
     record = done.json
     assert record == {**read_json(tmp_path / "told/report.json"), "folder": "told"}
     assert record["profile"]["losses"]["notable"] == 3  # Branin's minima
-    assert record["profile"]["verdict"]["words"] == ["smooth with local minima", "gradients good"]
+    assert record["profile"]["verdict"]["words"] == ["smooth with local minima", "gradients follow"]
     assert record["profile"]["noise"]["again"] == record["profile"]["noise"]["batch"] == 0
     assert record["paper"] is None
     assert "with gradients: about" in done.stderr
@@ -50,7 +51,8 @@ def test_a_slice_is_reported_in_numbers_and_words(run: Run, cut: Path, tmp_path:
     assert (tmp_path / "told/gradient-quality.png").read_bytes().startswith(b"\x89PNG")
     again = run("report cut --points-per-axis 2 --out told")
     assert "there already" in again.stderr
-    assert "smooth with local minima: minima deeper than 1 % of the range: 3" in again.stdout
+    assert "smooth with local minima: 3 minima and " in again.stdout
+    assert "a loss at every sample\n" in again.stdout
     run.refuse("report cut --points-per-axis 3 --out told", said="holds another report (points 2 there, 3 here)")
 
 
@@ -131,32 +133,32 @@ def test_a_report_beside_its_slice_is_copied_unless_it_is_another(run: Run, cut:
     assert json.loads((tmp_path / "other/report.json").read_text())["key"]["points"] == 3
 
 
+def judged(known: Report, minima: float, cosine: float, jump: float, word: str | None) -> Report:
+    """Return a report with other numbers, held against words of the paper's."""
+    interval, one = Estimate(cosine, cosine, cosine), exactly(0.0)
+    scales = tuple(ScaleCosine(scale, scale, 36, 36, interval, (0.0, 0.0, 0.0), one) for scale in (0.01, 0.05))
+    jumps = Jumps((Jump((0.0, 0.0), jump, None),) if jump else (), 0.02, 2.0, 24, 1, 24, 0, 0, 0, 1, 0, 20)
+    surface = replace(
+        known.profile.verdict.surface, minima=exactly(minima), turns=(exactly(1.5), exactly(minima / 2)),
+        level=exactly(0.0), word=word, at_least=False,
+    )  # fmt: skip
+    following = Following(scales, 36, one, one, one, one)
+    verdict = replace(known.profile.verdict, surface=surface, jumps=jumps, following=following)
+    paper = PaperWords(verdict.compare_words(("rugged", "gradients follow")), "")
+    return replace(known, profile=replace(known.profile, verdict=verdict), paper=paper)
+
+
 def test_a_row_of_an_environment_spans_its_slices_and_says_whether_the_paper_agrees() -> None:
     known = Report.read(DATA / "fluid-0-1")
-
-    def report(notable: int, cosine: float, words: list[str]) -> Report:
-        def scale(points: int, value: float) -> ScaleRow:
-            return replace(known.profile.differences[0], points=points, cosine=exactly(value))
-
-        profile = replace(
-            known.profile,
-            losses=replace(known.profile.losses, notable=notable, flat=exactly(notable / 100)),
-            jumps=replace(known.profile.jumps, found=(), steep=3, neighbours=0),
-            differences=(scale(3, -1.0), scale(20, cosine), scale(36, 0.0)),  # the first: few show any slope
-            differences_of_samples=(scale(30, cosine / 2),),
-            verdict=Verdict(dict.fromkeys(words, "")),
-        )
-        paper = PaperWords(profile.verdict.compare_words(("rugged", "gradients good")), "")
-        return replace(known, profile=profile, paper=paper)
-
-    two = [report(2, 0.5, ["rugged"]), report(12, -0.25, ["rugged", "gradients good"])]
+    two = [judged(known, 2, 0.75, 0.0, "rugged"), judged(known, 12, 0.95, 0.5, "rugged")]
     row = environments_markdown(two).splitlines()[2]
     assert row == (
-        "| `fluid` | 2 | 2 to 12 | 2 to 12 % |  | −0.25 to 0.50 | −0.12 to 0.25 | "
-        "rugged, gradients good (1 of 2) | rugged, gradients good (1 of 2) | in part |"
+        "| `fluid` | 2 | 2 to 12 | 1.5 to 6.0 | 0 to 25 % | 0.75 to 0.95 | 0.75 to 0.95 | "
+        "rugged, discontinuous (1 of 2), gradients follow (1 of 2), gradients follow loosely (1 of 2) | "
+        "rugged, gradients follow (1 of 2) | in part |"
     )
     assert environments_markdown(two[1:]).endswith("| yes |\n")
-    assert environments_markdown([report(0, 0.0, [])]).endswith("| no |\n")
+    assert environments_markdown([judged(known, 0, 0.0, 0.0, None)]).endswith("| no |\n")
 
 
 def test_a_stopped_report_says_what_is_kept(run: Run, cut: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from docs.pages import tables
-from docs.pages.tables import COLUMNS, MISSING, UNMEASURED, faint_share, kept, scenes, settle, studies
+from docs.pages.tables import COLUMNS, MISSING, UNMEASURED, kept, scenes, settle, studies
 
 from gradscape.envs.registry import entries, environment_class
 from gradscape.gallery.files import DATA
@@ -121,7 +121,3 @@ def test_shares_of_a_column_count_no_slice_twice() -> None:
     for path in sorted((DATA / "census").glob("*.json")):
         for words in COLUMNS.values():
             assert all(len(set(words) & set(one["words"])) < 2 for one in read_json(path)["slices"])
-
-
-def test_slices_along_which_losses_hardly_move_are_counted() -> None:
-    assert faint_share([{"range": one} for one in ([0.0, 0.009], [0.3, 0.9], [0.0, 1.0], [None, None])]) == 0.25

@@ -19,8 +19,8 @@ from gradscape.gallery.site.build import build_site
 from gradscape.jobs.card import save_slices
 from gradscape.jobs.report import PaperWords, Report
 from gradscape.landscapes.convert import to_json
-from gradscape.landscapes.measures.classify import Verdict
-from gradscape.landscapes.measures.gradient_quality import ScaleRow
+from gradscape.landscapes.measures.following import Following, ScaleCosine
+from gradscape.landscapes.measures.slice_comparison import exactly
 from gradscape.landscapes.objective import Evaluation, Objective
 from gradscape.landscapes.plane import Plane
 from gradscape.landscapes.sampling.fill import sample
@@ -68,19 +68,17 @@ MEASURES = {"local minima": 7, "noise floor": "none"}
 def kept_report() -> Report:
     """Return the report of a shipped slice with other words and other gradients."""
     known = Report.read(DATA / "fluid-0-1")
-    row, width = known.profile.differences[0], known.profile.smoothing[0]
-
-    def cosine(scale: float, points: int, value: float) -> ScaleRow:
-        return replace(row, scale=scale, points=points, of=36, cosine=Estimate(value, value, value))
-
-    profile = replace(
-        known.profile,
-        verdict=Verdict({"rugged": "minima: 12", "gradients noisy": "0.5"}),
-        differences=(cosine(1e-6, 2, 0.1), cosine(1e-5, 30, 0.99)),
-        differences_of_samples=(cosine(0.04, 36, -0.5),),
-        smoothing=(replace(width, width=0.01, points=36, biased=Estimate(0.25, 0.1, 0.5)),),
-    )
-    paper = PaperWords(profile.verdict.compare_words(("rugged", "gradients good")), "A.2.1")
+    verdict, width = known.profile.verdict, known.profile.smoothing[0]
+    surface = replace(
+        verdict.surface, range=2.0, depth=0.02, minima=exactly(12.0), turns=(exactly(7.5), exactly(3.0)), level=exactly(0.0),
+        holder=exactly(0.9), word="rugged", at_least=False, unresolved="",
+    )  # fmt: skip
+    none, cosine = Estimate(0.0, 0.0, 0.1), Estimate(0.25, 0.1, 0.4)
+    scales = (ScaleCosine(0.01, 0.01, 36, 36, cosine, (0.0, 0.2, 0.5), none),)
+    verdict = replace(verdict, surface=surface, jumps=None, following=Following(scales, 36, none, none, none, none))
+    smoothing = (replace(width, width=0.01, points=36, biased=Estimate(0.25, 0.1, 0.5)),)
+    profile = replace(known.profile, verdict=verdict, smoothing=smoothing)
+    paper = PaperWords(profile.verdict.compare_words(("rugged", "gradients follow")), "A.2.1")
     return replace(known, profile=profile, paper=paper)
 
 
@@ -188,7 +186,9 @@ def league(folder: Path) -> None:
 
 def census(folder: Path) -> None:
     """Leave what many slices of an environment are like."""
-    shares = {"rugged": 0.75, "discontinuous": 0.5, "very smooth": 0.0, "gradients noisy": 0.9, "gradients good": 0.1}
+    shares = {
+        "rugged": 0.75, "discontinuous": 0.5, "very smooth": 0.0, "gradients do not follow": 0.9, "gradients follow": 0.1
+    }  # fmt: skip
     each = {"axes": ["speed [m/s]", "force [N]"], "range": [0.5, 2.5], "failed": 0.0, "measures": [0.4, None]}
     about = {"fidelity": "standard", "other": "", "loss_unit": "J", "along": "pairs", "resolution": 24, "gradients": 1}
     unknown = {"value": None, "low": None, "high": None}
@@ -197,7 +197,7 @@ def census(folder: Path) -> None:
         "slices": [{"base": k, "cut": 0, **each, "words": ["rugged", "discontinuous"]} for k in range(2)],
         "words": {word: {"value": one, "low": one / 2, "high": (1 + one) / 2} for word, one in shares.items()},
         "spreads": {name: {"quantiles": [None] * 5, "median": unknown} for name in ("turns", "minima")},
-        "parts": {}, "identity": {}, "provenance": {},
+        "parts": {}, "exhausted": [False, False], "identity": {}, "provenance": {},
     }  # fmt: skip
     (folder / "census").mkdir()
     write_record(folder / "census/fluid-cuda.json", record)

@@ -130,7 +130,7 @@ def test_the_front_page_is_filtered_by_word_number_and_engine_and_a_link_keeps_t
 
     assert left() == (["bounce", "fluid"], 3)
     assert page.locator("#word option").all_inner_texts() == [
-        "any", "rugged", "discontinuous", "gradients noisy"
+        "any", "rugged", "discontinuous", "gradients do not follow"
     ]  # fmt: skip
     page.select_option("#word", "discontinuous")  # of the census of fluid, and of no slice
     assert left() == (["fluid"], 0)

@@ -177,17 +177,21 @@ def test_without_races_there_is_no_league(data: Path, tmp_path: Path) -> None:
     assert "league.html" not in (tmp_path / "site/index.html").read_text()
 
 
+MINIMA = "12 minima and 7.5 turns along a side, deeper than 1 % of the range; exponent over short distances 0.90"
+COSINE = "mean cosine of gradient and slope over 1 % of the box: 0.25 (0.10 to 0.40), not"
+
+
 def test_words_are_beside_the_papers_and_a_trade_off_is_ranked(site: Path) -> None:
     manifest = json.loads((site / "manifest.json").read_text())
     bare, full = manifest["figures"][1:]
     assert (bare["report"], manifest["studies"]["bounce"]) == (None, [])
     agreed = {one["word"]: (one["measured"], one["agree"]) for one in full["report"]["words"]}
     assert agreed == {
-        "rugged": (True, True), "gradients good": (False, False), "gradients noisy": (True, None)
+        "rugged": (True, True), "gradients follow": (False, False), "gradients do not follow": (True, None)
     }  # fmt: skip
     assert full["report"]["picture"] == (
-        "Gradient quality over the slice: mean cosine of gradient and difference 0.99 over 1e-05 of the box; "
-        "mean cosine of gradient and difference −0.50 over 0.04 of the box; "
+        "Gradient quality over the slice: mean cosine of gradient and slope, by parts of the box: "
+        "1 %: 0.25 (0.10 to 0.40), not; "
         "smoothed over 1% of it, first order is biased at 9 of 36"
     )
     trade, another = (one for one in manifest["studies"]["fluid"] if one["kind"] == "fidelity")
@@ -254,9 +258,10 @@ def test_a_page_says_what_it_has_and_nothing_of_what_it_has_not(site: Path) -> N
     assert [section in bare for section in sections] == [False, False, False, False, True]
     words = re.findall(r'<th scope="row">([\w ]+)</th>\s*<td>([^<]*)</td>\s*<td>([^<]*)</td></tr>', bare_cells(full))
     assert words[:3] == [
-        ("rugged", "yes: minima: 12", "agrees"), ("gradients good", "no", "disagrees: it says so"),
-        ("gradients noisy", "yes: 0.5", "says nothing of it"),
+        ("rugged", f"yes: {MINIMA}", "agrees"), ("gradients follow", "no", "disagrees: it says so"),
+        ("gradients do not follow", f"yes: {COSINE}", "says nothing of it"),
     ]  # fmt: skip
+    assert "<li>jumps not searched</li>" in full
     assert '<th scope="row">local minima</th><td>7</td>' in full
     assert bare_cells(full).count("<td>9 (4.5 to 18)</td> <td>0.987</td> <td>0.654</td> <td>25 %</td>") == 2
     assert re.findall(r"<h3>(On .*?)</h3>", full) == ["On cuda", "On cpu"]

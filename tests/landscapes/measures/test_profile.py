@@ -8,8 +8,8 @@ import torch
 
 from gradscape import ParameterSpace, Plane, from_torch, sample
 from gradscape.landscapes.convert import to_json
-from gradscape.landscapes.measures.classify import WORDS, QuotedWord
 from gradscape.landscapes.measures.profile import Profile, effort, measure_profile
+from gradscape.landscapes.measures.verdict import WORDS, QuotedWord
 from gradscape.landscapes.objective import Evaluation, Objective, Status
 
 Function = Callable[[torch.Tensor], torch.Tensor]
@@ -34,14 +34,14 @@ def scrambled(x: torch.Tensor) -> torch.Tensor:
 @pytest.mark.parametrize(
     ("fn", "box", "words"),
     [
-        (lambda x: x.square().sum(1), (-1, 1), {"very smooth", "gradients good"}),
+        (lambda x: x.square().sum(1), (-1, 1), {"very smooth", "gradients follow"}),
         (
             lambda x: (x[:, 0] ** 2 + x[:, 1] - 11) ** 2 + (x[:, 0] + x[:, 1] ** 2 - 7) ** 2,
             (-5, 5),
-            {"smooth with local minima", "gradients good"},
+            {"smooth with local minima", "gradients follow"},
         ),
-        (rastrigin, (-5.12, 5.12), {"rugged", "gradients good"}),
-        (scrambled, (-1, 1), {"extremely rugged", "discontinuous", "gradients noisy", "gradients opposite"}),
+        (rastrigin, (-5.12, 5.12), {"rugged", "gradients follow"}),
+        (scrambled, (-1, 1), {"extremely rugged", "gradients do not follow", "gradients exploding"}),
         (
             lambda x: 1.0 * (x[:, 0] > 0.1) + 0 * x.sum(1),
             (-1, 1),
@@ -50,9 +50,9 @@ def scrambled(x: torch.Tensor) -> torch.Tensor:
         (
             lambda x: -torch.relu(0.5 - x.square().sum(1)),
             (-1, 1),
-            {"very smooth", "large flat regions", "gradients zero", "gradients good"},
+            {"very smooth", "large flat regions", "gradients zero", "gradients follow"},
         ),
-        (lambda x: (x**2 + 1e-3 * torch.sin(3000 * x)).sum(1), (-1, 1), {"very smooth", "gradients noisy"}),
+        (lambda x: (x**2 + 1e-3 * torch.sin(3000 * x)).sum(1), (-1, 1), {"very smooth", "gradients do not follow"}),
     ],
     ids=["bowl", "himmelblau", "rastrigin", "noise", "step", "plateau", "ripples"],
 )
@@ -85,7 +85,7 @@ class Partly(Objective):
 def test_gradients_that_are_missing_are_said_to_be_and_losses_beside_them_count() -> None:
     half = Partly(0.5, 0.0).profile()
     assert set(half.words) == {"very smooth", "gradients missing"}
-    assert half.verdict.reasons["gradients missing"] == "gradient missing at 50.0% of the points that have a loss"
+    assert half.verdict.reasons["gradients missing"] == "no gradient at 52 % (42 to 62) of the points that have a loss"
     named = half.measures
     assert named["Gradients missing beside a loss"].startswith("50.0 %")
     assert "Samples that failed" not in named
@@ -96,10 +96,10 @@ def test_gradients_that_are_missing_are_said_to_be_and_losses_beside_them_count(
         whole.losses.range,
         whole.losses.level,
     )
-    assert set(whole.words) == {"very smooth", "gradients good"}
+    assert set(whole.words) == {"very smooth", "gradients follow"}
     few = Partly(0.1, 0.0).profile()
-    assert set(few.words) == {"very smooth", "gradients good"}
-    assert "gradient missing at 12.5% of the points that have a loss" in few.verdict.reasons["gradients good"]
+    assert set(few.words) == {"very smooth", "gradients follow"}
+    assert few.measures["Gradients missing beside a loss"].startswith("12.5 %")
 
 
 def test_a_slice_that_mostly_failed_is_called_nothing_else() -> None:
@@ -144,6 +144,5 @@ def test_no_more_is_evaluated_than_is_announced() -> None:
     dataset = sample(objective, Plane.through(space, space.center, (0, 1), resolution=10))
     counts.update({True: 0, False: 0})
     measure_profile(objective, dataset, rounding=2**-52, points=3)
-    blocks = 3  # of each of which one gradient is the slice's own
-    assert counts[True] == effort(2, 3, (10, 10))[1] - blocks
-    assert effort(2, 3)[0] < counts[False] <= effort(2, 3, (10, 10))[0]
+    assert counts[True] == effort(2, 3, (10, 10))[1]
+    assert 0.4 * effort(2, 3, (10, 10))[0] < counts[False] <= effort(2, 3, (10, 10))[0]

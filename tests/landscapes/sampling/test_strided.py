@@ -16,7 +16,6 @@ import gradscape as gs
 from gradscape import ParameterSpace, Plane, from_torch
 from gradscape.jobs.slice import SliceJob
 from gradscape.landscapes.draw.figures.contour import arrows_along, landscape_figure
-from gradscape.landscapes.measures.doubled_resolution import DoubledResolution, double_resolution
 from gradscape.landscapes.measures.gradient_quality import compare_samples
 from gradscape.landscapes.measures.ruggedness import ruggedness
 from gradscape.landscapes.measures.undersampled import find_undersampled
@@ -266,16 +265,6 @@ def test_what_is_finer_than_the_samples_is_looked_for_as_without_gradients() -> 
     plane, objective = Plane.through(SPACE, SPACE.center, (0, 1), resolution=41), from_torch(waves, SPACE)
     _, strided = both_of(4)
     assert find_undersampled(objective, strided) == find_undersampled(objective, sample(objective, plane, gradients=0))
-
-
-def test_twice_the_resolution_is_measured_as_with_all_gradients() -> None:
-    objective = from_torch(waves, SPACE)
-    dense, strided = both_of(4)
-    found, cosine = ruggedness(dense, floor=0.0), compare_samples(dense)["cosine"].isel(scale=0).to_numpy()
-    one, other = (double_resolution(objective, data, found, None, cosine, deviation=0.0) for data in (dense, strided))
-    assert isinstance(one, DoubledResolution)
-    assert isinstance(other, DoubledResolution)
-    assert one.measures == other.measures
 
 
 def test_gradients_are_held_against_the_losses_of_all_samples() -> None:

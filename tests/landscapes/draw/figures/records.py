@@ -5,6 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 import xarray as xr
+from gradscape.landscapes.measures.verdict import WORDS
 
 from gradscape.envs.records import Fidelity
 from gradscape.jobs.check import CheckReport
@@ -16,7 +17,6 @@ from gradscape.landscapes.checks.usefulness import UNKNOWN, Usefulness
 from gradscape.landscapes.draw import style
 from gradscape.landscapes.measures.card import Card, CardSlice, ClosedFormError, FailedCheck, Grade
 from gradscape.landscapes.measures.census import MEASURES, Census, CensusDesign, SurveyedSlice, conclude
-from gradscape.landscapes.measures.classify import WORDS
 from gradscape.landscapes.measures.floor import Floor
 from gradscape.landscapes.measures.hessian import Eigenpair, Hessian
 from gradscape.landscapes.space import ParameterSpace

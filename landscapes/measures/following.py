@@ -1,0 +1,255 @@
+"""How gradients follow a landscape at fixed scales: parts of the box, whatever the samples of a slice are.
+
+At random points of the plane the gradient is held against central differences over each scale. A scale at which the
+loss has no slope above the noise at a point does not count there. Gradients of zero have no direction and are counted
+apart, as are those that are missing, exploding, or biased.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+import torch
+import xarray as xr
+from jaxtyping import Float
+from torch import Tensor
+
+from ..objective import Objective, Status, evaluate
+from ..plane import Plane
+from ..statistics import Estimate, Values, mean, share
+from .gradient_quality import agreement, central_differences, differences_of_samples, find_bias, smoothed_slopes
+from .ruggedness import box_slopes, span
+
+SCALES = (0.001, 0.01, 0.05)  # of the box
+CHIEF = 0.01  # the scale whose grade is the word, and over which other faults of gradients show
+FOLLOW, LOOSELY, NOT = "follow", "loosely", "not"
+WORD_OF = {FOLLOW: "gradients follow", LOOSELY: "gradients follow loosely", NOT: "gradients do not follow"}
+OPPOSITE, ZERO, EXPLODING = "gradients opposite", "gradients zero", "gradients exploding"
+BIASED, MISSING = "gradients biased", "gradients missing"
+FOLLOWING_WORDS = (*WORD_OF.values(), OPPOSITE, ZERO, EXPLODING, BIASED, MISSING)
+
+FOLLOWS, FOLLOWS_LOOSELY = 0.9, 0.5  # mean cosines from which on gradients follow, and follow loosely
+FEWEST = 5  # points that show a slope, without which there is no grade
+MOSTLY = 0.5  # share uphill beyond which gradients are opposite: random directions are uphill as often as downhill
+NOTABLE = 0.1  # share of gradients that are zero, biased or missing beyond which it is worth a word
+RARE = 0.01  # share of gradients that explode beyond which it is: one of them undoes many steps
+SHOWN = 4  # deviations of a difference by noise alone, beyond which it is a slope: it is one by chance at 1 in 3000
+VANISHING = 1e-9  # ranges per side of the box, up to which a gradient is zero
+EXPLODES = 100  # times the slope over 1 % of the box, and ranges per side of the box, beyond which a gradient explodes
+WIDTH = 0.01  # of the box: the standard deviation of the Gaussian under which means of gradients are held to slopes
+UNKNOWN = Estimate(math.nan, math.nan, math.nan)
+NEAR = 2  # times a scale, or its part, that differences of samples may be over instead
+
+
+@dataclass(frozen=True)
+class ScaleCosine:
+    """Hold how gradients follow differences over one `scale`, a part of the box.
+
+    `width` is the part that the differences are really over, which the samples of a stored slice decide. Of `of` points
+    that have a gradient and show a slope above the noise, `points` have one that is not zero. Of these are the mean
+    `cosine` of the two, its three `quartiles`, and the share that is `uphill` (below zero).
+    """
+
+    derived: ClassVar = ("grade",)
+
+    scale: float
+    width: float
+    points: int
+    of: int
+    cosine: Estimate
+    quartiles: tuple[float, float, float]
+    uphill: Estimate
+
+    @property
+    def grade(self) -> str | None:
+        """How gradients follow over this scale; None where the interval of the mean cosine straddles a threshold."""
+        low, high = self.cosine.low, self.cosine.high
+        if self.points < FEWEST:
+            return None
+        if low >= FOLLOWS:
+            return FOLLOW
+        if low >= FOLLOWS_LOOSELY and high < FOLLOWS:
+            return LOOSELY
+        return NOT if high < FOLLOWS_LOOSELY else None
+
+    def describe(self) -> str:
+        """Say what the mean cosine is, and its grade."""
+        if not self.points:
+            return "all gradients zero" if self.of else "no slope above the noise"
+        value, low, high = (f"{one:z.2f}" for one in (self.cosine.value, self.cosine.low, self.cosine.high))
+        interval = f" ({low} to {high})" if low != high and math.isfinite(self.cosine.low) else ""
+        return f"{value}{interval}, {self.grade or 'not resolved'}".replace("-", "\N{MINUS SIGN}")
+
+
+@dataclass(frozen=True)
+class Following:
+    """Hold how gradients follow the landscape at several `scales`, and where they are of no use.
+
+    Shares are of `points`, NaN where they are not known: of those with a loss, the gradient is `missing`; of those with
+    a gradient, it is `zero`, or `exploding`; of some more closely looked at, its mean over a Gaussian is `biased`.
+    """
+
+    derived: ClassVar = ("stuck", "words", "reasons", "sentence")
+
+    scales: tuple[ScaleCosine, ...]
+    points: int
+    missing: Estimate
+    zero: Estimate
+    exploding: Estimate
+    biased: Estimate
+
+    def at(self, scale: float) -> ScaleCosine | None:
+        """Return how gradients follow over one of `SCALES`, None where the samples do not allow it."""
+        return next((one for one in self.scales if one.scale == scale), None)
+
+    @property
+    def stuck(self) -> Estimate:
+        """Share of gradients that are zero nevertheless among the points that show a slope over 1 % of the box."""
+        chief = self.at(CHIEF)
+        return UNKNOWN if chief is None else share(chief.of - chief.points, chief.of)
+
+    @property
+    def words(self) -> tuple[str, ...]:
+        """The words for the gradients, in the order of `FOLLOWING_WORDS`."""
+        return tuple(word for word in FOLLOWING_WORDS if word in self.reasons)
+
+    @property
+    def reasons(self) -> dict[str, str]:
+        """Each word with the measure that it comes from.
+
+        Shares are worth a word where their whole interval says so. What is missing or stuck at zero does not follow.
+        Whether means are biased is no news of gradients that are zero, opposite or exploding.
+        """
+        reasons, chief = dict[str, str](), self.at(CHIEF)
+        if self.missing.low > NOTABLE:
+            reasons[MISSING] = f"no gradient at {_share(self.missing)} of the points that have a loss"
+        if self.zero.low > NOTABLE:
+            beside = f", and at {_share(self.stuck)} of those with a slope over 1 %" if self.stuck.value > 0 else ""
+            reasons[ZERO] = f"zero at {_share(self.zero)} of the points{beside}"
+        if self.exploding.low > RARE:
+            reasons[EXPLODING] = f"over {EXPLODES} times the slope over 1 % of the box at {_share(self.exploding)}"
+        if chief is not None and chief.uphill.low > MOSTLY:
+            reasons[OPPOSITE] = f"{_share(chief.uphill)} of the gradients point up the slope over 1 % of the box"
+        if self.biased.low > NOTABLE and not reasons.keys() & {ZERO, EXPLODING, OPPOSITE}:
+            reasons[BIASED] = f"their mean is not the slope of the mean loss at {_share(self.biased)} of the points"
+        useless = self.missing.low > NOTABLE or self.stuck.low > NOTABLE
+        if chief is not None and chief.grade and not (useless and chief.grade != NOT):
+            others = any(one.grade not in (None, chief.grade) for one in self.scales)
+            about = "mean cosine of gradient and slope over 1 % of the box"
+            reasons[WORD_OF[chief.grade]] = self.sentence if others else f"{about}: {chief.describe()}"
+        return reasons
+
+    @property
+    def sentence(self) -> str:
+        """Say in a line how gradients follow at each scale."""
+        said = [f"{100 * one.width:.2g} %: {one.describe()}" for one in self.scales]
+        return "mean cosine of gradient and slope, by parts of the box: " + ("; ".join(said) or "not known")
+
+
+def measure_following(
+    objective: Objective,
+    planes: Sequence[Plane],
+    *,
+    ranges: Sequence[float],
+    deviation: float = 0.0,
+    points: int = 100,
+    smoothed: int = 36,
+    pairs: int = 12,
+    seed: int = 0,
+) -> list[Following]:
+    """Hold gradients against slopes at random points of planes of one rank; those of all planes are in one batch.
+
+    `ranges` are those of the losses on each plane, `deviation` is that of the losses' noise [loss unit]. At `smoothed`
+    of the points means of gradients are held against the slope of the mean loss, with `pairs` of samples each; with 0
+    that is not known. Points keep so far from the border that no difference leaves the box.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    inner = 1 - max(SCALES)
+    places = max(SCALES) / 2 + inner * torch.rand(points, planes[0].rank, generator=generator, dtype=torch.float64)
+    u = torch.stack([plane.lower + places * (plane.upper - plane.lower) for plane in planes])
+    lifted = torch.cat([plane.lift(part) for plane, part in zip(planes, u, strict=True)])
+    exact = evaluate(objective, lifted, grad=True)
+    assert exact.grad is not None  # as it was asked for
+    differences = central_differences(objective, planes, u, SCALES)
+    found = []
+    for number, (plane, whole) in enumerate(zip(planes, ranges, strict=True)):
+        rows = slice(number * points, (number + 1) * points)
+        slope = (plane.slope(exact.grad[rows]) * (plane.upper - plane.lower)).numpy()
+        over = [(scale, scale, one) for scale, one in zip(SCALES, differences[number], strict=True)]
+        biased = _biased(objective, plane, u[number, :smoothed], pairs, seed) if smoothed else UNKNOWN
+        found.append(_conclude(slope, exact.loss[rows].numpy(), over, whole, deviation, biased))
+    return found
+
+
+def follow_samples(
+    dataset: xr.Dataset, *, deviation: float = 0.0, points: int = 100, seed: int = 0
+) -> Following | None:
+    """Hold gradients of a stored slice against differences of its own losses, at some samples: no evaluation.
+
+    Only scales are there that the samples allow within a factor of two. None of a slice without gradients.
+    """
+    if "grad" not in dataset:
+        return None
+    loss = dataset["loss"].transpose("v", "u", missing_dims="ignore").to_numpy()
+    slope, status = box_slopes(dataset), dataset["status"].transpose("v", "u", missing_dims="ignore").to_numpy()
+    asked = np.flatnonzero(np.isfinite(slope).all(axis=-1) | (status == Status.NO_GRADIENT))
+    chosen = np.unravel_index(np.sort(np.random.default_rng(seed).permutation(asked)[:points]), loss.shape)
+    over = []
+    for scale in SCALES:
+        strides = [max(1, round(scale * (size - 1) / 2)) for size in loss.shape]
+        widths = [2 * stride / (size - 1) for stride, size in zip(strides, loss.shape, strict=True)]
+        if all(scale / NEAR <= width <= scale * NEAR and width < 1 for width in widths):
+            axes = [differences_of_samples(loss, axis, stride) for axis, stride in enumerate(strides)][::-1]  # u first
+            over.append((scale, float(np.mean(widths)), np.stack(axes, axis=-1)[chosen]))
+    return _conclude(slope[chosen], loss[chosen], over, span(loss), deviation, UNKNOWN)
+
+
+def _conclude(
+    slope: Float[Values, "point axis"],
+    loss: Float[Values, " point"],
+    over: Sequence[tuple[float, float, Values]],
+    whole: float,
+    deviation: float,
+    biased: Estimate,
+) -> Following:
+    """Sum up slopes by gradients [loss unit per side] and differences `over` scales, each with its width."""
+    size = np.linalg.norm(slope, axis=-1)
+    having, zero = np.isfinite(size), size <= VANISHING * whole
+    scales, exploding = list[ScaleCosine](), UNKNOWN
+    for scale, width, difference in over:
+        noise = math.sqrt(2) * deviation / width
+        shown = having & (np.linalg.norm(difference, axis=-1) > SHOWN * noise)
+        cosine = agreement(slope, difference, noise)["cosine"][shown & ~zero]
+        quartiles = np.quantile(cosine, (0.25, 0.5, 0.75)) if len(cosine) else np.full(3, np.nan)
+        average, uphill = mean(cosine, least=-1, most=1), share(int((cosine < 0).sum()), len(cosine))
+        scales.append(
+            ScaleCosine(scale, width, len(cosine), int(shown.sum()), average, tuple(quartiles.tolist()), uphill)
+        )
+        if scale == CHIEF:
+            known = having & np.isfinite(difference).all(axis=-1)
+            too_large = (size > EXPLODES * np.linalg.norm(difference, axis=-1)) & (size > EXPLODES * whole)
+            exploding = share(int((known & too_large).sum()), int(known.sum()))
+    there = np.isfinite(loss)
+    return Following(
+        scales=tuple(scales),
+        points=len(loss),
+        missing=share(int((there & ~having).sum()), int(there.sum())),
+        zero=share(int((having & zero).sum()), int(having.sum())),
+        exploding=exploding,
+        biased=biased,
+    )
+
+
+def _biased(objective: Objective, plane: Plane, u: Float[Tensor, "point rank"], pairs: int, seed: int) -> Estimate:
+    found = smoothed_slopes(objective, plane, u, widths=(WIDTH,), pairs=pairs, seed=seed)
+    known = np.isfinite(found["bias"].to_numpy()).all(axis=-1)
+    return share(int(find_bias(found).to_numpy()[known].sum()), int(known.sum()))
+
+
+def _share(estimate: Estimate) -> str:
+    value, low, high = (100 * part for part in (estimate.value, estimate.low, estimate.high))
+    return f"{value:.0f} % ({low:.0f} to {high:.0f})"
