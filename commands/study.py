@@ -220,7 +220,8 @@ def _error_cells(found: Comparison) -> list[str]:
 
 
 def _failed(found: Comparison) -> str:
-    return "" if found.diverged is None else f"{found.diverged:.0%}"
+    one = found.failed
+    return "" if one is None else f"{one.value:.0%} ({100 * one.low:.0f}-{100 * one.high:.0f})"
 
 
 def _percent(found: Bootstrap) -> str:

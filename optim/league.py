@@ -290,10 +290,10 @@ def _overall(ranks: Iterable[Standing | MeanRank]) -> list[OverallRank]:
     by: dict[str, list[float]] = {}
     for one in ranks:
         by.setdefault(one.method, []).append(one.rank)
-    found = [
-        OverallRank(method, float(np.mean(values)), *map(float, interval(np.array(values))), len(values))
-        for method, values in by.items()
-    ]
+    found = list[OverallRank]()
+    for method, values in by.items():
+        low, high = map(float, interval(np.array(values)))
+        found.append(OverallRank(method, float(np.mean(values)), low, high, len(values)))
     return sorted(found, key=lambda one: (one.rank, one.method))
 
 

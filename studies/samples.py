@@ -17,7 +17,7 @@ from torch import Tensor
 from ..landscapes.cost import measure_seconds
 from ..landscapes.objective import Evaluation, Objective, Status, evaluate, has_loss
 from ..landscapes.plain import finite
-from ..landscapes.statistics import CONFIDENCE, gradient_error, median_of, p95_of, spearman
+from ..landscapes.statistics import CONFIDENCE, Estimate, gradient_error, median_of, p95_of, share, spearman
 
 REPETITION, TURNS = 0.04, 4  # least seconds that repetitions of a quick batch take, each way, and how often
 LARGEST = 60.0  # most seconds that a batch larger than the study's points may take
@@ -358,6 +358,11 @@ class Comparison:
     seconds: Seconds
     batch: int
     missing: float | None = None
+
+    @property
+    def failed(self) -> Estimate | None:
+        """The share that failed with its exact interval, None where nothing was compared."""
+        return None if self.diverged is None else share(round(self.diverged * self.compared), self.compared)
 
     def columns(self) -> dict[str, float | None]:
         """Return what tables have of it: errors are shares of the spread, with the ends of 95 % intervals."""

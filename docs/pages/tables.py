@@ -11,7 +11,7 @@ from __future__ import annotations
 import argparse
 import math
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -155,7 +155,13 @@ def short_league() -> str:
     (budget,), (forwards,) = {one.budget for one in scenes}, {f"{one.equal_cost.forwards:.0f}" for one in scenes}
     ahead = "is ahead of"
     costs = (f"best mean rank, {budget} episodes", ahead, f"best mean rank, {forwards} forward equivalents", ahead)
-    return table(("environment", "fidelity", *costs, "not told from random search"), rows)
+    return table(("environment", "fidelity", *costs, "not told from random search"), rows) + _changed(scenes)
+
+
+def _changed(scenes: Sequence[SceneStandings]) -> str:
+    """Say which scenes have another model since they were raced, nothing where none has."""
+    names = [f"`{one.env}`" for one in scenes if not present({"identity": one.identity})]
+    return f"\nRaced with a model that has changed since: {', '.join(names)}.\n" if names else ""
 
 
 def _lead(lead: Lead, ranks: Mapping[str, float]) -> list[str]:
@@ -175,7 +181,7 @@ def league() -> str:
     ]
     cost = {one.method: one.rank for one in found.overall_at_equal_cost}
     rows.append(["all scenes", "", *(f"{one.rank:.2f} / {cost[one.method]:.2f}" for one in found.overall)])
-    return table(("environment", "fidelity", *found.methods), rows)
+    return table(("environment", "fidelity", *found.methods), rows) + _changed(found.scenes)
 
 
 def _ranks(scene: SceneStandings, method: str) -> str:

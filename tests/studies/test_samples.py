@@ -42,6 +42,10 @@ def test_an_episode_that_failed_is_infinitely_far_off_and_a_failed_reference_is_
     assert few.compared == many.compared == 18
     assert (few.diverged, few.loss_error.p95.value) == (0, 1.0)
     assert many.diverged == pytest.approx(1 / 18)
+    assert few.failed is not None
+    assert many.failed is not None
+    assert (many.failed.low, many.failed.high) == pytest.approx((0.0014, 0.2729), abs=1e-4)  # of 1 in 18
+    assert few.failed.high == pytest.approx(1 - 0.025 ** (1 / 18))  # none in 18
     assert many.loss_error.p95.value is None
     assert many.loss_error.median.value == 1.0
 

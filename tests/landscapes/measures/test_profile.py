@@ -128,7 +128,7 @@ def test_a_character_is_the_same_again_and_has_plain_names() -> None:
     assert (
         named["Local minima deeper than 1 % of the range"] == "25"
     )  # and at the borders, where it is lower than inside
-    assert named["Gradient effectively zero"] == "0.0 %"
+    assert named["Gradient effectively zero"] == "0.0 % (0.0 % to 0.2 %)"
     assert "Jumps explained by an event" not in named
 
 
