@@ -36,6 +36,7 @@ from .ruggedness import box_slopes, span
 
 LEAST = 0.01  # of the slice's range, from which on a difference is a jump
 HALVINGS = 12  # a gap between samples is looked into down to 1/4096 of it
+ALIKE = 3  # halvings running in which both halves change alike, after which it is a slope
 SIDES = (1, 2, 4, 8, 16, 32)  # widths of what is left of a gap, at which both sides of it are evaluated
 EVALUATIONS_PER_PAIR = 2 + HALVINGS + 2 * (1 + len(SIDES))  # at most
 APART = 2  # times what the losses vary on one side of a jump is its height at least
@@ -84,18 +85,19 @@ class Jumps:
 
     @property
     def share(self) -> Estimate:
-        """Share of the lines that cross a jump; its interval counts what is not known of the lines drawn both ways."""
+        """Share of the lines that cross a jump; drawn lines that are neither hit nor clear may or may not."""
         if not self.lines:
             return Estimate(math.nan, math.nan, math.nan)
-        sure, others = self.crossed - self.hit, self.lines - self.settled
-        most = self.drawn - self.clear
+        others, most = self.lines - self.settled, self.drawn - self.clear
         if self.drawn == others:  # no chance is left
-            parts = (self.hit, self.hit, most)
-        else:
+            rest = Estimate(self.hit, self.hit, most)
+        elif self.drawn:
             low, high = share(self.hit, self.drawn), share(most, self.drawn)
-            parts = (others * low.value, others * low.low, others * high.high) if self.drawn else (0, 0, others)
-        value, low_, high_ = ((sure + part) / self.lines for part in parts)
-        return Estimate(value, low_, high_)
+            rest = Estimate(others * low.value, others * low.low, others * high.high)
+        else:
+            rest = Estimate(0, 0, others)
+        parts = (self.crossed - self.hit + part for part in (rest.value, rest.low, rest.high))
+        return Estimate(*(part / self.lines for part in parts))
 
     @property
     def unseen(self) -> float:
@@ -127,8 +129,9 @@ class Jumps:
             unseen = f"; up to {math.ceil(100 * self.unseen)} % of lines could have one" if self.unseen > 0 else ""
             return said + unseen
         value, low, high = (round(100 * part) for part in (self.share.value, self.share.low, self.share.high))
-        interval = f" ({low} to {high})" if low < high else ""
-        return f"jumps up to {_percent(self.largest)} of the range; {value} %{interval} of lines cross one"
+        known = self.drawn == self.hit + self.clear and (self.drawn or self.settled == self.lines)
+        interval = f"{low} to {high} %" if not known else f"{value} %" + (f" ({low} to {high})" if low < high else "")
+        return f"jumps up to {_percent(self.largest)} of the range; {interval} of lines cross one"
 
 
 def _percent(part: float) -> str:
@@ -230,8 +233,9 @@ class _Search:
         left = self.most - int((~unseen).sum())
         each = np.bincount(self.line[unseen], minlength=self.lines)[order]
         self.drawn = order[:left] if (self.state == JUMP).any() else order[np.cumsum(each) <= left]
-        fits = np.isin(self.line, self.drawn) if len(self.drawn) else True  # else at least the next strongest traces
-        return self._first(np.flatnonzero(unseen & fits), left)
+        if len(self.drawn):
+            return self._first(np.flatnonzero(unseen & np.isin(self.line, self.drawn)), left)
+        return np.sort(self.generator.permutation(np.flatnonzero(unseen))[:left])  # no line fits: traces at random
 
     def _first(self, pairs: NDArray[np.intp], most: int) -> NDArray[np.intp]:
         """Return so many pairs: the strongest of each line, then the second of each, and so on."""
@@ -326,10 +330,9 @@ def _look(objective: Objective, slices: Sequence[_Search], chosen: Sequence[NDAr
     within = np.ptp(around, axis=-1).max(axis=1)
     jump = open_ & ~failed & (height >= least) & (height > APART * within)
     state = np.where(failed, FAILED, np.where(jump, JUMP, NO_JUMP)).astype(np.int8)
-    return [
-        _Look(*(values[owner == number] for values in (low, high, state, height)), int(count))
-        for number, count in enumerate(asked.counts)
-    ]
+    of = [owner == number for number in range(len(slices))]
+    counts = asked.counts.tolist()
+    return [_Look(low[at], high[at], state[at], height[at], count) for at, count in zip(of, counts, strict=True)]
 
 
 def _bisect(
@@ -337,21 +340,23 @@ def _bisect(
 ) -> tuple[Values, Values, NDArray[np.bool_], NDArray[np.bool_]]:
     """Halve pairs towards the larger unexplained difference; return their last ends, which persist, which failed.
 
-    A pair is left as soon as less than half a jump is in either half.
+    A pair is left where less than half a jump is in either half, or both change alike for the third time running: a
+    jump is in one of them, and only steps in a regular row are alike so often.
     """
     low, high = ends[:, 0], ends[:, 1]
     below, above = asked.losses(ends, np.ones(len(ends), bool)).T  # again: a slice may come from another device
     failed = ~np.isfinite(above - below)
-    open_ = np.abs(above - below - trend) >= least / 2
+    open_, alike = np.abs(above - below - trend) >= least / 2, np.zeros(len(ends), int)
     for _ in range(HALVINGS):
         middle, trend = (low + high) / 2, trend / 2
         between = asked.losses(middle, open_)
         failed |= open_ & ~np.isfinite(between)
         gaps = np.abs(between - below - trend), np.abs(above - between - trend)
+        alike = np.where(np.abs(above + below - 2 * between) < least / 2, alike + 1, 0)
         left, right = open_ & (gaps[0] >= gaps[1]), open_ & (gaps[0] < gaps[1])
         high, above = np.where(left[:, None], middle, high), np.where(left, between, above)
         low, below = np.where(right[:, None], middle, low), np.where(right, between, below)
-        open_ &= np.maximum(*gaps) >= least / 2
+        open_ &= (np.maximum(*gaps) >= least / 2) & (alike < ALIKE)
     return low, high, open_, failed
 
 

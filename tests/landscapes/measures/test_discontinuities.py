@@ -11,10 +11,10 @@ import torch
 import xarray as xr
 
 from gradscape import ParameterSpace, Plane, from_numpy, from_torch, sample
-from gradscape.landscapes.measures.discontinuities import EVALUATIONS_PER_PAIR, HALVINGS, LEAST, Jumps, find_jumps
+from gradscape.landscapes.measures.discontinuities import EVALUATIONS_PER_PAIR, HALVINGS, LEAST, Jump, Jumps, find_jumps
 from gradscape.landscapes.measures.noise import noise
 from gradscape.landscapes.objective import Objective
-from gradscape.landscapes.statistics import Estimate
+from gradscape.landscapes.statistics import Estimate, share
 
 SPACE = ParameterSpace.box(("x", "y"), -1.0, 1.0)
 EDGE = 0.2371
@@ -161,7 +161,6 @@ def test_a_fractal_surface_does_not_jump() -> None:
 
 
 def test_the_power_of_a_search_is_that_of_the_lines_that_were_drawn() -> None:
-    """In 300 lines, 1.5 % of which jump where traces are everywhere, 95 % of the bounds are at or above that."""
     record = Jumps(
         (), 1.0, 100.0, 100, crossed=0, settled=40, drawn=20, hit=0, clear=20, checked=0, undecided=0, evaluations=0
     )
@@ -170,6 +169,12 @@ def test_the_power_of_a_search_is_that_of_the_lines_that_were_drawn() -> None:
     assert replace(record, drawn=60, clear=60).unseen == 0
     assert replace(record, drawn=0, clear=0).unseen == 0.6
     assert replace(record, drawn=60, clear=57).unseen == pytest.approx(0.03)
+    found = replace(record, found=(Jump((0.0,), 30.0, None),), crossed=12, hit=10, clear=10)
+    assert found.sentence == "jumps up to 30 % of the range; 32 % (18 to 46) of lines cross one"
+    assert found.share.low == pytest.approx((2 + 60 * share(10, 20).low) / 100)
+    assert math.isnan(found.unseen)
+    vague = replace(found, clear=0)
+    assert vague.sentence == "jumps up to 30 % of the range; 18 to 62 % of lines cross one"
 
 
 def test_shares_of_lines_hold_in_most_of_many_searches() -> None:
