@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 import xarray as xr
-from gradscape.landscapes.measures.verdict import FLAT
 from torch import Tensor
 
 import gradscape as gs
@@ -17,6 +16,7 @@ from gradscape.jobs.slice import SliceJob
 from gradscape.jobs.watch import Stopped
 from gradscape.landscapes.draw.figures.contour import landscape_figure
 from gradscape.landscapes.measures.slice_floor import split_effort
+from gradscape.landscapes.measures.verdict import FLAT
 from gradscape.landscapes.objective import Evaluation, Objective
 from gradscape.landscapes.storage.floor_map import FLOOR
 from gradscape.landscapes.storage.store import open_slice
