@@ -75,7 +75,7 @@ def look_between(
     pass.
     """
     planes, losses = [plane_of(one) for one in datasets], [_loss(one) for one in datasets]
-    drawn = [_draw(plane.rank, places, (seed, number)) for number, plane in enumerate(planes)]
+    drawn = [_draw(plane.rank, places, seed) for plane in planes]
     ways = [_ways(loss, floor) for loss, floor in zip(losses, floors, strict=True)]
     x = []
     for plane, part, way in zip(planes, drawn, ways, strict=True):
@@ -92,7 +92,7 @@ def _between(plane: Plane, drawn: Values, ways: _Ways, found: torch.Tensor) -> B
     return Between(drawn[:places] * steps, values[:places], rises, ways.prominences(values[len(drawn) :]))
 
 
-def _draw(rank: int, places: int, seed: tuple[int, int]) -> Values:
+def _draw(rank: int, places: int, seed: int) -> Values:
     """Return random places in shares of the box, and those at `DISTANCES` from each, along a random axis."""
     generator = np.random.default_rng(seed)
     start = generator.random((places, rank))
@@ -168,10 +168,9 @@ class Surface:
     @property
     def large_flat(self) -> bool | None:
         """Whether there are large flat regions, None where that is not resolved."""
-        if self.flat or not math.isfinite(self.level.value):
+        if self.flat:
             return None
-        low = self.level.low if math.isfinite(self.level.low) else self.level.value
-        high = self.level.high if math.isfinite(self.level.high) else self.level.value
+        low, high = (end if math.isfinite(end) else self.level.value for end in (self.level.low, self.level.high))
         if low >= LARGE:
             return True
         return False if high < LARGE and not self.off.value > UNDERSAMPLED else None
@@ -327,17 +326,16 @@ def turning_points(loss: Values, axis: int, depth: float) -> float:
 def level_share(loss: Values, floor: float) -> Estimate:
     """Return the share of the box in regions that are level over 2 % of it, or over a sample's width if that is more.
 
-    NaN where noise hides it.
+    Where noise hides that only an upper bound is known.
     """
     widths = [max(1, round(SIDE * (points - 1))) for points in loss.shape]
     widest = max(width / (points - 1) / SIDE for width, points in zip(widths, loss.shape, strict=True))
     bound = LEVEL * span(loss) * max(1.0, widest)
-    if floor > bound:
-        return Estimate(math.nan, math.nan, math.nan)
     windows = np.lib.stride_tricks.sliding_window_view(loss, [width + 1 for width in widths])
     ranges = np.ptp(windows, axis=tuple(range(-loss.ndim, 0)))
-    levels = np.where(np.isfinite(ranges), (ranges <= bound).astype(float), np.nan)
-    return jackknife(lambda part: _known_mean(part), levels, least=0.0, most=1.0)
+    levels = np.where(np.isfinite(ranges), (ranges <= max(bound, floor)).astype(float), np.nan)
+    found = jackknife(_known_mean, levels, least=0.0, most=1.0)
+    return Estimate(math.nan, math.nan, found.high) if floor > bound else found
 
 
 def short_exponent(between: Between, floor: float) -> Estimate:

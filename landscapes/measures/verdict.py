@@ -106,9 +106,12 @@ class Verdict:
 
     @property
     def lines(self) -> tuple[str, ...]:
-        """What limits every word: noise, failed samples, and the numerical floor."""
+        """What limits every word: jumps that were not found, noise, failed samples, and the numerical floor."""
         numerics = self.floor.sentence() if self.floor is not None else "numerical floor not measured"
-        return self._noise(), _failed(self.failed, self.samples), numerics
+        always = self._noise(), _failed(self.failed, self.samples), numerics
+        if self.jumps is None or self.jumps.found or self.surface.flat:
+            return always
+        return f"jumps: {self.jumps.sentence}", *always
 
     @property
     def noise(self) -> float | None:

@@ -14,7 +14,6 @@ import pytest
 from docs.pages import commands, extension, pictures, reproduction, scenes
 from docs.pages.kept import NOT_MEASURED, Kept, KeptFigure
 from docs.pages.text import prose
-from gradscape.landscapes.measures.verdict import WORDS
 from hypothesis import given
 from hypothesis import strategies as st
 from markdown_it import MarkdownIt
@@ -27,6 +26,7 @@ from gradscape.gallery.figures import read_figures
 from gradscape.gallery.files import DATA
 from gradscape.gallery.paper import read_paper
 from gradscape.jobs.report import Report
+from gradscape.landscapes.measures.verdict import WORDS
 from gradscape.optim.claims import ClaimVerdict
 from gradscape.optim.league import League
 

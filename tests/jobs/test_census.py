@@ -116,18 +116,15 @@ def test_the_verb_and_python_say_the_same(run: Callable[..., Said], tmp_path: Pa
         assert json.loads(said.stdout)[name] == to_json(found)[name]
 
 
-def test_gradients_at_every_second_sample_change_what_is_said_of_gradients_alone(tmp_path: Path) -> None:
+def test_gradients_at_every_second_sample_change_no_measure(tmp_path: Path) -> None:
     scene = replace(SCENE, name="levy")  # of which, other than of Ackley's, even samples do not mirror odd ones
     every = CensusJob.open(scene, **HOW, out=tmp_path / "every").run()
     job = CensusJob.open(scene, **HOW, gradients=2, out=tmp_path / "second")
     assert job.design.samples == (48, 16)
     second = job.run()
     assert np.array_equal(second.losses, every.losses)
-    of_gradients = {MEASURES.index(name) for name in ("gradient zero", "cosine", "uphill")}
     for one, other in zip(second.slices, every.slices, strict=True):
-        differing = {k for k in range(len(MEASURES)) if one.measures[k] != other.measures[k]}
-        assert differing <= of_gradients
-        assert differing & of_gradients
+        assert one.measures == other.measures
         assert one.measures[MEASURES.index("cosine")] is not None
     assert open_census(tmp_path / "second").gradients == 2
     with pytest.raises(ValueError, match="gradients"):
@@ -160,7 +157,10 @@ def test_slices_surveyed_abreast_are_those_surveyed_alone_in_fewer_batches(monke
     assert [piece for piece, _ in together] == [piece for piece, _ in group]
     assert batches < len(asked) / 3
     for (_, found), (_, wanted) in zip(together, alone, strict=True):
-        assert all(np.array_equal(found[key], wanted[key], equal_nan=found[key].dtype.kind == "f") for key in wanted)
+        same = set(wanted) - {"episodes"}  # of which each slice has an even share
+        assert all(np.array_equal(found[key], wanted[key], equal_nan=found[key].dtype.kind == "f") for key in same)
+    sums = [sum(int(one["episodes"]) for _, one in pieces) for pieces in (together, alone)]
+    assert sums[0] == sums[1]
 
 
 def test_what_a_slice_raises_ends_all_of_its_group() -> None:

@@ -70,8 +70,8 @@ def kept_report() -> Report:
     known = Report.read(DATA / "fluid-0-1")
     verdict, width = known.profile.verdict, known.profile.smoothing[0]
     surface = replace(
-        verdict.surface, range=2.0, depth=0.02, minima=exactly(12.0), turns=(exactly(7.5), exactly(3.0)), level=exactly(0.0),
-        holder=exactly(0.9), word="rugged", at_least=False, unresolved="",
+        verdict.surface, range=2.0, depth=0.02, minima=exactly(12.0), turns=(exactly(7.5), exactly(3.0)),
+        level=exactly(0.0), holder=exactly(0.9), word="rugged", at_least=False, unresolved="",
     )  # fmt: skip
     none, cosine = Estimate(0.0, 0.0, 0.1), Estimate(0.25, 0.1, 0.4)
     scales = (ScaleCosine(0.01, 0.01, 36, 36, cosine, (0.0, 0.2, 0.5), none),)
@@ -187,7 +187,8 @@ def league(folder: Path) -> None:
 def census(folder: Path) -> None:
     """Leave what many slices of an environment are like."""
     shares = {
-        "rugged": 0.75, "discontinuous": 0.5, "very smooth": 0.0, "gradients do not follow": 0.9, "gradients follow": 0.1
+        "rugged": 0.75, "discontinuous": 0.5, "very smooth": 0.0, "gradients do not follow": 0.9,
+        "gradients follow": 0.1,
     }  # fmt: skip
     each = {"axes": ["speed [m/s]", "force [N]"], "range": [0.5, 2.5], "failed": 0.0, "measures": [0.4, None]}
     about = {"fidelity": "standard", "other": "", "loss_unit": "J", "along": "pairs", "resolution": 24, "gradients": 1}

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 import xarray as xr
-from gradscape.landscapes.measures.verdict import FLAT
 from torch import Tensor
 
 import gradscape as gs
@@ -17,6 +16,7 @@ from gradscape.jobs.slice import SliceJob
 from gradscape.jobs.watch import Stopped
 from gradscape.landscapes.draw.figures.contour import landscape_figure
 from gradscape.landscapes.measures.slice_floor import split_effort
+from gradscape.landscapes.measures.verdict import FLAT
 from gradscape.landscapes.objective import Evaluation, Objective
 from gradscape.landscapes.storage.floor_map import FLOOR
 from gradscape.landscapes.storage.store import open_slice
@@ -51,7 +51,8 @@ def test_ripples_of_the_grid_are_minima_without_replicas_and_none_with_them() ->
     before, after = (one.report(points=2) for one in (bare, whole))
     assert (before.losses.notable, after.losses.notable) == (2, 1)
     assert (before.losses.minima, after.losses.minima) == (5, 1)
-    assert [one.words[0] for one in (before, after)] == ["smooth with local minima", "very smooth"]
+    assert [one.verdict.surface.minima.value for one in (before, after)] == [2, 1]
+    assert after.words[0] == "very smooth"
     assert after.losses.level.value == before.losses.level.value == 0  # however finely it is sampled
     assert whole.floor == after.floor is not None
     assert after.losses.floor == pytest.approx(4 * after.floor.deviation)

@@ -17,7 +17,6 @@ from gradscape import ParameterSpace, Plane, from_torch
 from gradscape.jobs.slice import SliceJob
 from gradscape.landscapes.draw.figures.contour import arrows_along, landscape_figure
 from gradscape.landscapes.measures.gradient_quality import compare_samples
-from gradscape.landscapes.measures.ruggedness import ruggedness
 from gradscape.landscapes.measures.undersampled import find_undersampled
 from gradscape.landscapes.objective import Evaluation, Objective, Status
 from gradscape.landscapes.sampling.distribution import equal_groups

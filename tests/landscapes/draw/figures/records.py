@@ -5,7 +5,6 @@ from itertools import pairwise
 
 import numpy as np
 import xarray as xr
-from gradscape.landscapes.measures.verdict import WORDS
 
 from gradscape.envs.records import Fidelity
 from gradscape.jobs.check import CheckReport
@@ -19,6 +18,7 @@ from gradscape.landscapes.measures.card import Card, CardSlice, ClosedFormError,
 from gradscape.landscapes.measures.census import MEASURES, Census, CensusDesign, SurveyedSlice, conclude
 from gradscape.landscapes.measures.floor import Floor
 from gradscape.landscapes.measures.hessian import Eigenpair, Hessian
+from gradscape.landscapes.measures.verdict import WORDS
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.landscapes.statistics import Estimate, share
 from gradscape.optim.registry import methods
