@@ -23,6 +23,7 @@ def report(
     env: Of = None,
     all: Annotated[bool, Parameter(name="--all")] = False,
     points_per_axis: Annotated[int, at_least(2)] = 6,
+    features: bool = False,
     seed: Seed = 0,
     data: Data = None,
     figure_width_mm: FigureWidth = (),
@@ -50,6 +51,9 @@ def report(
         Report on every figure of the gallery that is sampled.
     points_per_axis
         Number of points along each axis at which new evaluations test gradients.
+    features
+        Also measure landscape features over all parameters, from 50 new points for each. A report that is there
+        already gets them added.
     """
     _refuse_words(what, all, keywords, env)
     from ..gallery.files import data_folder
@@ -64,7 +68,7 @@ def report(
     job = ReportJob.open(
         subjects, what=name, single=single, out=as_path(out), points=points_per_axis, seed=seed,
         device=keywords.get("device", "auto"), prints=as_widths(figure_width_mm), paper=read_paper().words,
-        command=call.command, env=env,
+        command=call.command, env=env, features=features,
     )  # fmt: skip
     found = job.run(call.watch)
     if single:
