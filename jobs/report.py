@@ -514,7 +514,8 @@ class Report:
     """Hold what was measured of a slice, as `report.json` has it.
 
     `paper` has the words that the paper has for the scene, None where it has none, and `seconds` is what the measuring
-    took. `features` are those over all parameters, None where nobody asked for them. `folder` is where its files are, and `store` the slice's.
+    took. `features` are those over all parameters, None where nobody asked for them. `folder` is where its files are,
+    and `store` the slice's.
     """
 
     name: str

@@ -7,9 +7,9 @@ does not determine it. Fields are called as pflacco calls features, with undersc
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import astuple, dataclass, fields
-from typing import get_type_hints
+from typing import Any, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
@@ -94,8 +94,8 @@ class Dispersion:
     def of(cls, distances: Array, y: Array) -> Dispersion:
         """Compare distances, shape (point, point)."""
         best = [distances[np.ix_(low, low)] for low in (y <= np.quantile(y, BEST)[:, None])]
-        found = []
-        for middle in (np.mean, np.median):
+        found, middles = [], (np.mean, np.median)
+        for middle in middles:
             whole, parts = float(middle(_pairs(distances))), [_middle(part, middle) for part in best]
             found.append(([part / whole for part in parts], [part - whole for part in parts]))
         (mean_ratios, mean_differences), (median_ratios, median_differences) = found
@@ -255,10 +255,10 @@ class PrincipalComponents:
     expl_var_cor_x: float
     expl_var_cov_init: float
     expl_var_cor_init: float
-    expl_var_PC1_cov_x: float
-    expl_var_PC1_cor_x: float
-    expl_var_PC1_cov_init: float
-    expl_var_PC1_cor_init: float
+    expl_var_pc1_cov_x: float
+    expl_var_pc1_cor_x: float
+    expl_var_pc1_cov_init: float
+    expl_var_pc1_cor_init: float
 
     @classmethod
     def of(cls, x: Array, y: Array) -> PrincipalComponents:
@@ -287,7 +287,7 @@ class Exploratory:
 
     @classmethod
     def of(cls, x: Array, y: Array) -> Exploratory:
-        """Measure points `x`, shape (point, dim), with losses `y`, shape (point,): the first 4096 where there are more."""
+        """Measure the first 4096 of the points `x`, shape (point, dim), with losses `y`, shape (point,)."""
         x, y = x[:MAX_POINTS], y[:MAX_POINTS]
         return cls._of(x, y, distances_of(x))
 
@@ -378,7 +378,7 @@ def _pairs(distances: Array) -> Array:
     return found[found > 0]
 
 
-def _middle(distances: Array, middle: type[np.mean]) -> float:
+def _middle(distances: Array, middle: Callable[[Array], Any]) -> float:
     known = _pairs(distances)
     return float(middle(known)) if len(known) else math.nan
 
@@ -421,10 +421,13 @@ def _misclassified(x: Array, low: NDArray[np.bool_]) -> tuple[float, float]:
     """Return the share of points in the wrong class by linear and by quadratic discriminants, held out by tenths."""
     if min(low.sum(), (~low).sum()) < FOLDS:
         return math.nan, math.nan
-    fold, wrong = _stratify(low), list[tuple[float, float]]()
-    for one in range(FOLDS):
-        train, test = fold != one, fold == one
-        said = [_discriminate(x[train], low[train], x[test], pooled=pooled) for pooled in (True, False)]
+    x, fold, wrong = x - x.mean(axis=0), _stratify(low), list[tuple[float, float]]()
+    parts = [[_Moments.of(x[(fold == one) & (low == side)]) for one in range(FOLDS)] for side in (False, True)]
+    for one, test in enumerate(fold == np.arange(FOLDS)[:, None]):
+        classes = [_Moments.total(part[:one] + part[one + 1 :]) for part in parts]
+        pooled = sum(each.scatter for each in classes) / (sum(each.count for each in classes) - 2)
+        separate = [each.scatter / (each.count - 1) for each in classes]
+        said = [_likelier(classes, tables, x[test]) for tables in ([pooled, pooled], separate)]
         wrong.append(tuple(math.nan if a is None else float((a != low[test]).mean()) for a in said))  # type: ignore[arg-type]
     linear, quadratic = np.mean(wrong, axis=0)
     return float(linear), float(quadratic)
@@ -443,23 +446,51 @@ def _stratify(low: NDArray[np.bool_]) -> NDArray[np.int_]:
     return fold
 
 
-def _discriminate(x: Array, low: NDArray[np.bool_], at: Array, *, pooled: bool) -> NDArray[np.bool_] | None:
-    """Say which points `at` are more probably low, by a Gaussian of each class; None where one is degenerate.
+@dataclass(frozen=True, eq=False)
+class _Moments:
+    """Count, sum and sum of squares of points of one class, shapes (), (dim,) and (dim, dim)."""
 
-    `pooled`: both have one covariance (linear discriminants).
-    """
-    means = [x[low == side].mean(axis=0) for side in (False, True)]
-    off = [x[low == side] - mean for side, mean in zip((False, True), means, strict=True)]
-    tables = [part.T @ part / (len(part) - 1) for part in off]
-    if pooled:
-        tables = [sum(part.T @ part for part in off) / (len(x) - 2)] * 2
+    count: int
+    sum: Array
+    squares: Array
+
+    @classmethod
+    def of(cls, x: Array) -> _Moments:
+        """Sum up points."""
+        return cls(len(x), x.sum(axis=0), x.T @ x)
+
+    @classmethod
+    def total(cls, parts: Sequence[_Moments]) -> _Moments:
+        """Add parts of the points."""
+        squares = np.sum([part.squares for part in parts], axis=0)
+        return cls(sum(part.count for part in parts), np.sum([part.sum for part in parts], axis=0), squares)
+
+    @property
+    def mean(self) -> Array:
+        """The mean point."""
+        return self.sum / self.count
+
+    @property
+    def scatter(self) -> Array:
+        """Sum of squares about the mean."""
+        found: Array = self.squares - np.outer(self.sum, self.mean)
+        return found
+
+
+def _likelier(classes: Sequence[_Moments], tables: Sequence[Array], at: Array) -> NDArray[np.bool_] | None:
+    """Say which points are more probably of the second class, by Gaussians of these covariances; None if degenerate."""
+    from scipy.linalg import solve_triangular
+
     scores = []
-    for side, mean, table in zip((False, True), means, tables, strict=True):
-        size, vectors = np.linalg.eigh(table)
-        if size[0] <= 1e-12 * size[-1]:
+    for each, table in zip(classes, tables, strict=True):
+        if each.count <= at.shape[1]:
             return None
-        away = (((at - mean) @ vectors) ** 2 / size).sum(axis=1)
-        scores.append(-(away + np.log(size).sum()) / 2 + math.log((low == side).mean()))
+        try:
+            root = np.linalg.cholesky(table)
+        except np.linalg.LinAlgError:
+            return None
+        away = np.square(solve_triangular(root, (at - each.mean).T, lower=True)).sum(axis=0)
+        scores.append(math.log(each.count) - away / 2 - np.log(np.diag(root)).sum())
     return np.asarray(scores[1] > scores[0])
 
 
