@@ -123,8 +123,9 @@ class InformationContent:
         order = _tour(distances)
         slopes = np.diff(y[order]) / distances[order[:-1], order[1:]]
         signs, sizes = np.sign(slopes).astype(np.int8), np.abs(slopes)
-        found = np.array([_information(np.where(sizes < size, 0, signs)) for size in SIZES])
-        entropy, partial = found.T
+        _, first, same = np.unique(np.searchsorted(np.sort(sizes), SIZES), return_index=True, return_inverse=True)
+        found = np.array([_information(np.where(sizes < size, 0, signs)) for size in SIZES[first]])
+        entropy, partial = found[same].T
         settled, half = SIZES[entropy < SETTLED], SIZES[partial > HALF * partial[0]]
         largest = float(entropy.max())
         eps_max = float(np.median(SIZES[entropy == largest]))

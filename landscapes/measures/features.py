@@ -25,7 +25,7 @@ BASE = 128  # points from which every parameter is varied for Sobol' indices
 BLOCKS = 100  # groups of points that are resampled for an active subspace
 SHOWN, NAMED, ENOUGH = 10, 5, 0.95  # eigenvalues kept, parameters named, share of the squared gradients
 ROUNDINGS, RATE = 100.0, 1e10  # that losses have to differ by; floating-point operations a second (one core)
-UNDETERMINED, WORTHLESS = "not determined", -100.0  # [%]
+UNDETERMINED, UNRESOLVED, WORTHLESS = "not determined", "not resolved", -100.0  # [%]
 
 
 @dataclass(frozen=True)
@@ -304,7 +304,7 @@ class _Words:
     def resolved(self, name: str) -> str:
         """Write a ratio as a number, unless its interval reaches down to zero."""
         value, reach = attrgetter(name)(self.found), attrgetter(name)(self.reach)
-        return "not resolved" if reach >= value else self.number(name)
+        return UNRESOLVED if reach >= value else self.number(name)
 
 
 def _model_rows(words: _Words, dim: int, points: int) -> list[FeatureRow]:
@@ -353,7 +353,8 @@ def _sobol_rows(found: SobolIndices) -> list[FeatureRow]:
     for name in sorted(found.total, key=lambda one: -found.total[one].value)[:NAMED]:
         rows.append(FeatureRow(f"Variance by {name}", _share(found.total[name]), f"alone {_share(found.first[name])}"))
     source = f"Sobol' indices, {found.points} base points, {found.failed} points failed"
-    rows.append(FeatureRow("Variance by interactions", _share(found.interaction), source))
+    resolved = found.interaction.high - found.interaction.low <= 1
+    rows.append(FeatureRow("Variance by interactions", _share(found.interaction) if resolved else UNRESOLVED, source))
     if found.bound:
         more = ", ".join(found.unexplained[:NAMED]) or "of no parameter"
         rows.append(FeatureRow("More variance than gradients allow", more, "jumps, or wrong gradients"))
