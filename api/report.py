@@ -62,7 +62,9 @@ def report(
     from ..jobs.report import ReportJob
 
     call, root = current(), data_folder(data)
-    subjects, env = (_figures(root), env) if what is None else _subjects(what, root, env, points_per_axis, keywords)
+    subjects, env = (
+        (_figures(root), env) if what is None else _subjects(what, root, env, points_per_axis, features, keywords)
+    )
     single = what is not None and len(subjects) == 1
     name = subjects[0].name if single else Path(str(what or "all")).name
     job = ReportJob.open(
@@ -106,7 +108,7 @@ def _figures(root: Path) -> list[ReportedSlice]:
 
 
 def _subjects(
-    what: Any, root: Path, env: Scene, points: int, keywords: SceneKeywords
+    what: Any, root: Path, env: Scene, points: int, features: bool, keywords: SceneKeywords
 ) -> tuple[list[ReportedSlice], Scene]:
     """Return a slice, or an environment's figures, or a slice sampled now for want of any; and its simulator."""
     from ..gallery.figures import read_figures
@@ -126,7 +128,7 @@ def _subjects(
         if found := [ReportedSlice.of(root / one.id) for one in figures if _is_finished(root / one.id)]:
             return found, env
     made = environment(what, keywords)
-    return [sample_subject(made, points, call.command, call.watch)], made
+    return [sample_subject(made, points, call.command, call.watch, features=features)], made
 
 
 def _is_finished(folder: Path) -> bool:

@@ -75,7 +75,9 @@ class ReportedSlice:
         return cls(folder.name or folder.resolve().name, store_in(path, SLICE_STORE))
 
 
-def sample_subject(env: Environment, points: int, command: str, watch: Watch) -> ReportedSlice:
+def sample_subject(
+    env: Environment, points: int, command: str, watch: Watch, *, features: bool = False
+) -> ReportedSlice:
     """Sample the slice that a scene without any is reported on by: its first two parameters, through the centre.
 
     Raises TooLargeError for more points than a report has memory for, and as `SliceJob.run` does.
@@ -86,7 +88,8 @@ def sample_subject(env: Environment, points: int, command: str, watch: Watch) ->
     dims = list(range(min(2, env.space.dim)))
     refuse_too_many(points, len(dims), env.space.dim)
     plane = plane_through(env, dims, through="center", window=None, resolution=RESOLUTION)
-    watch.plan([slice_work(env, plane.resolution, 1), report_work(env, plane.resolution, points)])
+    works = [slice_work(env, plane.resolution, 1), report_work(env, plane.resolution, points)]
+    watch.plan([*works, features_work(env)] if features else works)
     job = SliceJob.of(env, plane, command=command)
     job.run(watch)
     return ReportedSlice.of(job.folder)
@@ -170,7 +173,8 @@ class ReportJob:
 
     def work(self) -> Iterator[Work]:
         """Yield what measuring each slice takes that has no report yet."""
-        known, bare = dict[str, Environment](), dict[str, Environment]()
+        known: dict[str, Environment] = {}
+        bare: dict[str, Environment] = {}
         for subject in self.subjects:
             dataset = _open(subject)
             env = environment_of(dataset, self.device, self.env)

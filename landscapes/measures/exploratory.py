@@ -426,7 +426,7 @@ def _misclassified(x: Array, low: NDArray[np.bool_]) -> tuple[float, float]:
     parts = [[_Moments.of(x[(fold == one) & (low == side)]) for one in range(FOLDS)] for side in (False, True)]
     for one, test in enumerate(fold == np.arange(FOLDS)[:, None]):
         classes = [_Moments.total(part[:one] + part[one + 1 :]) for part in parts]
-        pooled = sum(each.scatter for each in classes) / (sum(each.count for each in classes) - 2)
+        pooled = (classes[0].scatter + classes[1].scatter) / (classes[0].count + classes[1].count - 2)
         separate = [each.scatter / (each.count - 1) for each in classes]
         said = [_likelier(classes, tables, x[test]) for tables in ([pooled, pooled], separate)]
         wrong.append(tuple(math.nan if a is None else float((a != low[test]).mean()) for a in said))  # type: ignore[arg-type]

@@ -71,10 +71,16 @@ def _hold_out(model: _Polynomial, y: Array, slopes: Array, rng: np.random.Genera
         off_mean[test] = y[test] - y[~test].mean()
         slope_off[test], slope_mean[test] = (slopes - model.slopes(both))[test], (slopes - slopes[~test].mean(0))[test]
         weights.append(weight)
-    of_losses = [_explained(np.square(one), np.square(off_mean), rng) for one in (off_alone, off)]
+    alone_explains, both_explain = (_explained(np.square(one), np.square(off_mean), rng) for one in (off_alone, off))
     of_slopes = _explained(np.square(slope_off).sum(axis=1), np.square(slope_mean).sum(axis=1), rng)
     return GradientModel(
-        model.degree, model.separable, model.values.shape[1], *of_losses, of_slopes, float(np.median(weights))
+        degree=model.degree,
+        separable=model.separable,
+        coefficients=model.values.shape[1],
+        losses_alone=alone_explains,
+        with_gradients=both_explain,
+        of_gradients=of_slopes,
+        weight=float(np.median(weights)),
     )
 
 
