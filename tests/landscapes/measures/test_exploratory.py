@@ -3,6 +3,7 @@
 import json
 import math
 from dataclasses import asdict
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -63,8 +64,7 @@ def test_peaks_differ_from_pflacco_where_it_adds_what_is_to_be_multiplied() -> N
         density = kernel(at)
         valleys = (density[1:-2] < density[:-3]) & (density[1:-2] < density[2:-1])
         ends = [0, *(np.flatnonzero(valleys) + 1), 512]
-        parts = zip(ends, ends[1:], strict=False)
-        return sum(density[low : high - 1].mean() + at[high - 1] - at[low] > 0.1 for low, high in parts)
+        return sum(density[low : high - 1].mean() + at[high - 1] - at[low] > 0.1 for low, high in pairwise(ends))
 
     assert all(theirs(np.array(case["y"])) == case["features"][OURS_ALONE] for case in CASES)
 
