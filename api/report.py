@@ -23,6 +23,7 @@ def report(
     env: Of = None,
     all: Annotated[bool, Parameter(name="--all")] = False,
     points_per_axis: Annotated[int, at_least(2)] = 6,
+    features: bool = False,
     seed: Seed = 0,
     data: Data = None,
     figure_width_mm: FigureWidth = (),
@@ -50,6 +51,9 @@ def report(
         Report on every figure of the gallery that is sampled.
     points_per_axis
         Number of points along each axis at which new evaluations test gradients.
+    features
+        Also measure landscape features over all parameters, from 50 new points for each. A report that is there
+        already gets them added.
     """
     _refuse_words(what, all, keywords, env)
     from ..gallery.files import data_folder
@@ -58,13 +62,15 @@ def report(
     from ..jobs.report import ReportJob
 
     call, root = current(), data_folder(data)
-    subjects, env = (_figures(root), env) if what is None else _subjects(what, root, env, points_per_axis, keywords)
+    subjects, env = (
+        (_figures(root), env) if what is None else _subjects(what, root, env, points_per_axis, features, keywords)
+    )
     single = what is not None and len(subjects) == 1
     name = subjects[0].name if single else Path(str(what or "all")).name
     job = ReportJob.open(
         subjects, what=name, single=single, out=as_path(out), points=points_per_axis, seed=seed,
         device=keywords.get("device", "auto"), prints=as_widths(figure_width_mm), paper=read_paper().words,
-        command=call.command, env=env,
+        command=call.command, env=env, features=features,
     )  # fmt: skip
     found = job.run(call.watch)
     if single:
@@ -102,7 +108,7 @@ def _figures(root: Path) -> list[ReportedSlice]:
 
 
 def _subjects(
-    what: Any, root: Path, env: Scene, points: int, keywords: SceneKeywords
+    what: Any, root: Path, env: Scene, points: int, features: bool, keywords: SceneKeywords
 ) -> tuple[list[ReportedSlice], Scene]:
     """Return a slice, or an environment's figures, or a slice sampled now for want of any; and its simulator."""
     from ..gallery.figures import read_figures
@@ -122,7 +128,7 @@ def _subjects(
         if found := [ReportedSlice.of(root / one.id) for one in figures if _is_finished(root / one.id)]:
             return found, env
     made = environment(what, keywords)
-    return [sample_subject(made, points, call.command, call.watch)], made
+    return [sample_subject(made, points, call.command, call.watch, features=features)], made
 
 
 def _is_finished(folder: Path) -> bool:

@@ -7,7 +7,10 @@ from typing import TYPE_CHECKING
 from .terminal import Console, table
 
 if TYPE_CHECKING:
+    from rich.table import Table
+
     from ..jobs.report import Report, Reports
+    from ..landscapes.measures.features import Features
 
 
 def show(report: Report, console: Console) -> None:
@@ -18,6 +21,16 @@ def show(report: Report, console: Console) -> None:
     console.print(found)
     for line in report.verdict_lines():
         console.print(line)
+    if report.features:
+        console.print(_features_table(report.features))
+
+
+def _features_table(features: Features) -> Table:
+    """Return the features over all parameters, a row each."""
+    found = table("feature over all parameters", "value, 95 % interval", "what it says")
+    for row in features.rows():
+        found.add_row(*row)
+    return found
 
 
 def show_several(found: Reports, console: Console) -> int:

@@ -22,6 +22,7 @@ from ..landscapes.capacity import Need, require, size
 from ..landscapes.convert import NOT_JSON, from_json, to_json
 from ..landscapes.cost import duration
 from ..landscapes.identity import MODEL_VERSION, digest_of, plane_of, stored_identity
+from ..landscapes.measures.features import Features
 from ..landscapes.measures.following import CHIEF, SCALES
 from ..landscapes.measures.profile import Profile
 from ..landscapes.measures.verdict import QuotedWord, Verdict
@@ -30,6 +31,7 @@ from ..landscapes.plain import digest
 from ..landscapes.storage.files import is_full, make_folder, other_files, replacing, tidy, write_json
 from ..landscapes.storage.records import read_json, reading, write_record
 from ..landscapes.verification import RESAMPLE, verify_dataset
+from .features import features_of, features_work
 from .folder import REPORT, REPORTS, ROOT, SLICE_FILE, SLICE_STORE, folder_named, store_in
 from .plan import simulation_seconds
 from .scene import environment_of
@@ -71,7 +73,9 @@ class ReportedSlice:
         return cls(folder.name or folder.resolve().name, store_in(path, SLICE_STORE))
 
 
-def sample_subject(env: Environment, points: int, command: str, watch: Watch) -> ReportedSlice:
+def sample_subject(
+    env: Environment, points: int, command: str, watch: Watch, *, features: bool = False
+) -> ReportedSlice:
     """Sample the slice that a scene without any is reported on by: its first two parameters, through the centre.
 
     Raises TooLargeError for more points than a report has memory for, and as `SliceJob.run` does.
@@ -82,7 +86,8 @@ def sample_subject(env: Environment, points: int, command: str, watch: Watch) ->
     dims = list(range(min(2, env.space.dim)))
     refuse_too_many(points, len(dims), env.space.dim)
     plane = plane_through(env, dims, through="center", window=None, resolution=RESOLUTION)
-    watch.plan([slice_work(env, plane.resolution, 1), report_work(env, plane.resolution, points)])
+    works = [slice_work(env, plane.resolution, 1), report_work(env, plane.resolution, points)]
+    watch.plan([*works, features_work(env)] if features else works)
     job = SliceJob.of(env, plane, command=command)
     job.run(watch)
     return ReportedSlice.of(job.folder)
@@ -106,6 +111,7 @@ class ReportJob:
     prints: Sequence[float] = ()
     command: str = ""
     env: Any = None  # of the slices, where it is not registered by their name for it
+    features: bool = False  # whether features over all parameters are measured, too
 
     @classmethod
     def open(
@@ -138,6 +144,7 @@ class ReportJob:
         cannot be reported on, or where another report is there.
         """
         watch, done, failed = watch or Watch(), list[Report](), dict[str, str]()
+        known = dict[str, Features]()
         watch.plan(self.work())
 
         def say_kept() -> str:
@@ -148,7 +155,8 @@ class ReportJob:
                 if len(self.subjects) > 1:
                     watch.note(f"slice {number + 1} of {len(self.subjects)}: {subject.name}")
                 try:
-                    done.append(self.report(subject, watch))
+                    report = self.report(subject, watch)
+                    done.append(self._add_features(report, subject, known, watch) if self.features else report)
                 except Exception as error:  # whatever one slice meets, the others are not lost by it
                     if is_full(error) or len(self.subjects) == 1:
                         raise
@@ -164,13 +172,18 @@ class ReportJob:
     def work(self) -> Iterator[Work]:
         """Yield what measuring each slice takes that has no report yet."""
         known: dict[str, Environment] = {}
+        bare: dict[str, Environment] = {}
         for subject in self.subjects:
             dataset = _open(subject)
             env = environment_of(dataset, self.device, self.env)
             env = known.setdefault(digest(env.identity()), env)
             key = ReportKey(self.points, self.seed, digest_of(dataset), env.version_on(env.engine))
-            if not any(_holds(folder, key) for folder in (self._place(subject), self._beside(subject)) if folder):
+            held = [one for one in (self._place(subject), self._beside(subject)) if one and _holds(one, key)]
+            if not held:
                 yield report_work(env, dataset["loss"].shape, self.points)
+            if self.features and not any(Report.read(one).features for one in held):
+                bare[digest(env.identity())] = env
+        yield from map(features_work, bare.values())
 
     def report(self, subject: ReportedSlice, watch: Watch) -> Report:
         """Return the report of a slice that is there, or else measure it now and leave it there."""
@@ -178,6 +191,18 @@ class ReportJob:
         report = replace(self._find(subject, folder, watch), folder=folder, store=subject.store)
         self._print(report, watch)
         tidy(folder)
+        return report
+
+    def _add_features(self, report: Report, subject: ReportedSlice, known: dict[str, Features], watch: Watch) -> Report:
+        """Return a report with the features of its environment, measured once for all of its slices."""
+        if report.features is not None or report.folder is None:
+            return report
+        env = environment_of(_open(subject), self.device, self.env)
+        name = digest(env.identity())
+        if name not in known:
+            known[name] = features_of(env, self.seed, watch)
+        report = replace(report, features=known[name])
+        write_record(report.folder / RECORD, to_json(report))
         return report
 
     def _place(self, subject: ReportedSlice) -> Path:
@@ -493,7 +518,8 @@ class Report:
     """Hold what was measured of a slice, as `report.json` has it.
 
     `paper` has the words that the paper has for the scene, None where it has none, and `seconds` is what the measuring
-    took. `folder` is where its files are, and `store` the slice's.
+    took. `features` are those over all parameters, None where nobody asked for them. `folder` is where its files are,
+    and `store` the slice's.
     """
 
     name: str
@@ -506,6 +532,7 @@ class Report:
     seconds: float
     command: str
     key: ReportKey
+    features: Features | None = None
     folder: Path | None = field(default=None, metadata=NOT_JSON, compare=False, repr=False)
     store: Path | None = field(default=None, metadata=NOT_JSON, compare=False, repr=False)
 

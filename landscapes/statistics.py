@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 Values = NDArray[np.float64]
 CONFIDENCE = 0.95
+RESAMPLES = 200  # of a bootstrap
 BLOCKS = {1: (16,), 2: (4, 4)}  # parts of a line, or of a plane, that are left out one at a time
 
 
@@ -159,6 +160,12 @@ def mean(values: Values, *, least: float = -np.inf, most: float = np.inf) -> Est
         return Estimate(value, math.nan, math.nan)
     reach = float(known.std(ddof=1)) / math.sqrt(len(known)) * float(student(len(known) - 1))
     return Estimate(value, max(least, value - reach), min(most, value + reach))
+
+
+def middle_95(value: float, drawn: ArrayLike) -> Estimate:
+    """Return a number with the middle 95 % of what a bootstrap drew, shape (resample,)."""
+    low, high = np.quantile(np.asarray(drawn), ((1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2))
+    return Estimate(value, float(low), float(high))
 
 
 def gradient_error(grad: Values, reference: Values) -> tuple[Values, Values]:

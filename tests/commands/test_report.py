@@ -56,6 +56,24 @@ def test_a_slice_is_reported_in_numbers_and_words(run: Run, cut: Path, tmp_path:
     run.refuse("report cut --points-per-axis 3 --out told", said="holds another report (points 2 there, 3 here)")
 
 
+def test_features_over_all_parameters_are_added_to_a_report_that_is_there(run: Run, cut: Path, tmp_path: Path) -> None:
+    words = "report cut --points-per-axis 2 --out told"
+    first = run.json(words)
+    assert first["features"] is None
+    without, planned = (run.json(f"plan {words}{more}") for more in ("", " --features"))
+    assert (planned["gradients"] - without["gradients"], planned["episodes"] - without["episodes"]) == (100, 612)
+    done = run.ok(f"{words} --features")
+    assert "features over all 2 parameters: 512 episodes and 100 with gradients: about" in done.stderr
+    assert re.search(r"A linear model explains +│ 19 ± 23 %", done.stdout)
+    kept = read_json(tmp_path / "told/report.json")
+    assert kept["profile"] == first["profile"]
+    assert kept["features"]["points"] == 100
+    assert kept["features"]["exploratory"]["ela_meta"]["quad_w_interact_adj_r2"] == pytest.approx(0.98, abs=0.01)
+    again = run.ok(f"{words} --features")
+    assert "episodes" not in again.stderr
+    assert "A linear model explains" in again.stdout
+
+
 def test_an_environment_without_figures_is_sampled_first(run: Run, tmp_path: Path) -> None:
     done = run.ok("report beale --points-per-axis 2 --json")
     record = done.json
