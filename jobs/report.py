@@ -201,9 +201,9 @@ class ReportJob:
         name = digest(env.identity())
         if name not in known:
             known[name] = features_of(env, self.seed, watch)
-        report = replace(report, features=known[name])
-        write_record(report.folder / RECORD, to_json(report))
-        return report
+        whole = replace(report, features=known[name])
+        write_record(report.folder / RECORD, to_json(whole))
+        return whole
 
     def _place(self, subject: ReportedSlice) -> Path:
         return self.folder if self.single else self.folder / subject.name
@@ -563,7 +563,7 @@ class Report:
         lines = [f"{word}: {verdict.reasons[word]}" for word in self.words]
         lines += [*verdict.open, *verdict.lines]
         if self.paper:
-            said = "; ".join(f"{one.word}: {'yes' if one.measured else 'no'}" for one in self.paper.words)
+            said = "; ".join(f"{one.word}: {one.answer}" for one in self.paper.words)
             lines.append(f"the paper's words ({self.paper.where}), measured too? {said}")
         return lines
 
@@ -621,11 +621,28 @@ class Reports:
 
 @dataclass
 class EnvironmentCounts:
-    """In how many `slices` of an environment each word was measured, and each of the paper's."""
+    """In how many `slices` of an environment each word was measured, and each of the paper's.
+
+    In so many slices a word of the paper's is `unresolved`.
+    """
 
     slices: int = 0
     measured: dict[str, int] = field(default_factory=dict)
     paper: dict[str, int] = field(default_factory=dict)
+    unresolved: dict[str, int] = field(default_factory=dict)
+
+    def quoted(self) -> str:
+        """Return the paper's words, and in how many of the slices that tell they were measured."""
+        return ", ".join(_of(word, hits, self.slices, self.unresolved[word]) for word, hits in self.paper.items())
+
+    def agreement(self) -> str:
+        """Say whether all of the paper's words were measured in all slices, none in any, or some."""
+        told = [(hits, self.slices - self.unresolved[word]) for word, hits in self.paper.items()]
+        if not told or not any(of for _, of in told):
+            return "not resolved" if told else ""
+        if not any(hits for hits, _ in told):
+            return "no"
+        return "yes" if all(hits == self.slices for hits, _ in told) else "in part"
 
 
 def by_environment(reports: Sequence[Report]) -> dict[str, EnvironmentCounts]:
@@ -637,7 +654,8 @@ def by_environment(reports: Sequence[Report]) -> dict[str, EnvironmentCounts]:
         for word in report.words:
             entry.measured[word] = entry.measured.get(word, 0) + 1
         for one in report.paper.words if report.paper else ():
-            entry.paper[one.word] = entry.paper.get(one.word, 0) + one.measured
+            entry.paper[one.word] = entry.paper.get(one.word, 0) + bool(one.measured)
+            entry.unresolved[one.word] = entry.unresolved.get(one.word, 0) + (one.measured is None)
     return found
 
 
@@ -671,8 +689,8 @@ def _environment(env: str, reports: Sequence[Report]) -> tuple[str, ...]:
         _span([None if one.jumps is None else 100 * one.jumps.largest for one in verdicts], "{:.2g} %"),
         *(_span([_cosine(one, scale) for one in verdicts], "{:z.2f}") for scale in SCALES[1:]),
         ", ".join(measured),
-        ", ".join(_of(word, hits, count) for word, hits in words.paper.items()),
-        _agreement(list(words.paper.values()), count),
+        words.quoted(),
+        words.agreement(),
     )
 
 
@@ -700,21 +718,19 @@ def _span(values: Iterable[float | None], form: str) -> str:
     return high if low == high else f"{low.removesuffix(' %')} to {high}"
 
 
-def _of(word: str, hits: int, count: int) -> str:
-    return word if hits == count else f"{word} ({hits} of {count})"
-
-
-def _agreement(hits: Sequence[int], count: int) -> str:
-    """Say whether all of the paper's words were measured in all slices, none in any, or some."""
-    if not hits:
-        return ""
-    return "yes" if min(hits) == count else "in part" if max(hits) else "no"
+def _of(word: str, hits: int, count: int, unresolved: int = 0) -> str:
+    """Write a word, and of how many slices it is true where these are not all."""
+    if hits == count:
+        return word
+    if unresolved == count:
+        return f"{word} (not resolved)"
+    return f"{word} ({hits} of {count}{f', {unresolved} not resolved' if unresolved else ''})"
 
 
 def _slice(report: Report) -> tuple[str, ...]:
     verdict = report.profile.verdict
     words = report.paper.words if report.paper else ()
-    hits = sum(one.measured for one in words)
+    hits = sum(one.measured is True for one in words)
     return (
         report.name,
         _span([_value(verdict.surface.minima)], "{:.0f}"),

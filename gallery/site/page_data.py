@@ -165,12 +165,19 @@ class Nodes:
 
 @dataclass(frozen=True)
 class Word:
-    """A word that was measured, or that the paper says: `agree` is None where the paper is silent."""
+    """A word that was measured, or that the `paper` says; `measured` is None where that is not resolved."""
 
     word: str
-    measured: bool
+    measured: bool | None
     reason: str
-    agree: bool | None
+    paper: bool
+
+    @property
+    def comparison(self) -> str:
+        """How the paper's word compares."""
+        if not self.paper:
+            return "says nothing of it"
+        return {True: "agrees", False: "disagrees: it says so", None: "says so"}[self.measured]
 
 
 @dataclass(frozen=True)
@@ -390,9 +397,9 @@ def enter_report(report: Report) -> ReportEntry:
 def _words(report: Report) -> list[Word]:
     """Return every word that was measured or that the paper says."""
     reasons = report.profile.verdict.reasons
-    paper = [one.word for one in report.paper.words] if report.paper else []
+    paper = {one.word: one.measured for one in report.paper.words} if report.paper else {}
     return [
-        Word(word, word in reasons, reasons.get(word, ""), word in reasons if word in paper else None)
+        Word(word, word in reasons or paper.get(word, False), reasons.get(word, ""), word in paper)
         for word in WORDS
         if word in reasons or word in paper
     ]

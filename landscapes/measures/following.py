@@ -144,6 +144,18 @@ class Following:
         return reasons
 
     @property
+    def undecided(self) -> frozenset[str]:
+        """The words of which nobody can say whether they fit: what they are from is not known, or not resolved."""
+        shares = {MISSING: self.missing, ZERO: self.zero, EXPLODING: self.exploding, BIASED: self.biased}
+        unknown = {word for word, one in shares.items() if math.isnan(one.value)}
+        chief = self.at(CHIEF)
+        if chief is None:
+            unknown |= {*WORD_OF.values(), OPPOSITE}
+        elif chief.grade is None:
+            unknown |= {*WORD_OF.values()}
+        return frozenset(unknown)
+
+    @property
     def sentence(self) -> str:
         """Say in a line how gradients follow at each scale."""
         said = [f"{100 * one.width:.2g} %: {one.describe()}" for one in self.scales]

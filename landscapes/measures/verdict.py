@@ -42,10 +42,15 @@ POINTS, SMOOTHED = 100, 36  # where gradients are held against slopes, and again
 
 @dataclass(frozen=True)
 class QuotedWord:
-    """Hold a word of somebody else's for a landscape, and whether it was measured too."""
+    """Hold a word of somebody else's for a landscape, and whether it was measured too, None where nobody can tell."""
 
     word: str
-    measured: bool
+    measured: bool | None
+
+    @property
+    def answer(self) -> str:
+        """Whether it was measured, in a word or two."""
+        return "not resolved" if self.measured is None else "yes" if self.measured else "no"
 
 
 @dataclass(frozen=True)
@@ -122,7 +127,26 @@ class Verdict:
 
     def compare_words(self, said: Sequence[str]) -> tuple[QuotedWord, ...]:
         """Return each word of somebody else's, and whether it was measured."""
-        return tuple(QuotedWord(word, word in self.reasons) for word in said)
+        fits, unknown = self.reasons, self.undecided
+        return tuple(QuotedWord(word, True if word in fits else None if word in unknown else False) for word in said)
+
+    @property
+    def undecided(self) -> frozenset[str]:
+        """The words of which nobody can say whether they fit: their measure is not resolved, or was not taken."""
+        if self.failed > MOSTLY * self.samples or self.surface.flat:
+            return frozenset()
+        unknown = set(FOLLOWING_WORDS if self.following is None else self.following.undecided)
+        if self.surface.word is None:
+            unknown |= {VERY_SMOOTH, SMOOTH, RUGGED, EXTREME}
+        if self.surface.at_least:
+            unknown.add(EXTREME)
+        if self.surface.large_flat is None:
+            unknown.add(LARGE_FLAT)
+        if self.jumps is None:
+            unknown.add(DISCONTINUOUS)
+        if self.deviation is None:
+            unknown.add(NOISY)
+        return frozenset(unknown)
 
     def _surface(self) -> dict[str, str]:
         found = self.surface
