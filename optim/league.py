@@ -141,9 +141,10 @@ class SceneStandings:
 
     @property
     def moved_to(self) -> tuple[str, ...]:
-        """The methods that have or share the best mean rank at equal forward equivalents alone."""
+        """The methods that share the best mean rank at equal forward equivalents; none where it is the same method."""
         best = self.equal_cost.ranks[0].rank
-        return tuple(one.method for one in self.equal_cost.ranks if one.rank == best and one.method != self.lead.method)
+        found = tuple(one.method for one in self.equal_cost.ranks if one.rank == best)
+        return () if found == (self.lead.method,) else found
 
     @property
     def not_told_from_random(self) -> tuple[str, ...]:

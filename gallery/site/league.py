@@ -73,7 +73,7 @@ class LeaguePage:
     def moves(self) -> Sequence[str]:
         """The scenes in which the best mean rank moves, or is shared, at equal forward equivalents, and with whom."""
         return [
-            f"{scene.env} ({scene.lead.method} after all episodes, {', '.join(scene.moved_to)} within the same cost)"
+            f"{scene.env} ({scene.lead.method} after all episodes, {' and '.join(scene.moved_to)} within the same cost)"
             for scene in self.league.scenes
             if scene.moved_to
         ]

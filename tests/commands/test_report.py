@@ -167,7 +167,7 @@ def judged(known: Report, minima: float, cosine: float, jump: float, word: str |
 
 
 def test_a_row_of_an_environment_spans_its_slices_and_says_whether_the_paper_agrees() -> None:
-    known = Report.read(DATA / "fluid-0-1")
+    known = Report.read(DATA / "fluid-8-9")
     two = [judged(known, 2, 0.75, 0.0, "rugged"), judged(known, 12, 0.95, 0.5, "rugged")]
     row = environments_markdown(two).splitlines()[2]
     assert row == (

@@ -122,3 +122,18 @@ def test_shares_of_a_column_count_no_slice_twice() -> None:
     for path in sorted((DATA / "census").glob("*.json")):
         for words in COLUMNS.values():
             assert all(len(set(words) & set(one["words"])) < 2 for one in read_json(path)["slices"])
+
+
+def test_what_readme_and_the_page_on_races_say_of_the_league_is_what_its_records_say() -> None:
+    """Sentences are written by hand: of whom is first, where that moves, and how many races are at draft."""
+    league = tables.kept_league()
+    first = [scene.env for scene in league.scenes if scene.lead.is_first]
+    at_cost = [scene.env for scene in league.scenes if scene.equal_cost.lead.is_first]
+    moved = {scene.env: scene.moved_to for scene in league.scenes if scene.moved_to}
+    assert first == ["cartpole", "pinball-16", "swing-stiffness", "torus"]
+    assert set(at_cost) - set(first) == {"pinch"}
+    assert moved == {"swing-velocity": ("adam",), "table": ("turbo",), "triple-move": ("adam", "l-bfgs-b")}
+    assert sum(scene.fidelity == "draft" for scene in league.scenes) == 12
+    ours, cost = (one[0] for one in (league.overall, league.overall_at_equal_cost))
+    said = [f"{one.rank:.1f} {one.low:.1f} {one.high:.1f}" for one in (ours, cost)]
+    assert (ours.method, cost.method, said) == ("l-bfgs-b", "l-bfgs-b", ["2.5 1.8 3.4", "2.9 1.9 3.9"])

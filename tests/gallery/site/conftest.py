@@ -67,7 +67,7 @@ MEASURES = {"local minima": 7, "noise floor": "none"}
 
 def kept_report() -> Report:
     """Return the report of a shipped slice with other words and other gradients."""
-    known = Report.read(DATA / "fluid-0-1")
+    known = Report.read(DATA / "fluid-8-9")
     verdict, width = known.profile.verdict, known.profile.smoothing[0]
     surface = replace(
         verdict.surface, range=2.0, depth=0.02, minima=exactly(12.0), turns=(exactly(7.5), exactly(3.0)),
