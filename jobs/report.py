@@ -197,14 +197,15 @@ class ReportJob:
 
     def _add_features(self, report: Report, subject: ReportedSlice, known: dict[str, Features], watch: Watch) -> Report:
         """Return a report with the features of its environment, measured once for all of its slices."""
-        if report.features is not None or report.folder is None:
+        folder = report.folder
+        if report.features is not None or folder is None:
             return report
         env = environment_of(_open(subject), self.device, self.env)
         name = digest(env.identity())
         if name not in known:
             known[name] = features_of(env, self.seed, watch)
         report = replace(report, features=known[name])
-        write_record(report.folder / RECORD, to_json(report))
+        write_record(folder / RECORD, to_json(report))
         return report
 
     def _place(self, subject: ReportedSlice) -> Path:
