@@ -195,15 +195,16 @@ class ReportJob:
 
     def _add_features(self, report: Report, subject: ReportedSlice, known: dict[str, Features], watch: Watch) -> Report:
         """Return a report with the features of its environment, measured once for all of its slices."""
-        if report.features is not None or report.folder is None:
+        folder = report.folder
+        if report.features is not None or folder is None:
             return report
         env = environment_of(_open(subject), self.device, self.env)
         name = digest(env.identity())
         if name not in known:
             known[name] = features_of(env, self.seed, watch)
-        whole = replace(report, features=known[name])
-        write_record(report.folder / RECORD, to_json(whole))
-        return whole
+        report = replace(report, features=known[name])
+        write_record(folder / RECORD, to_json(report))
+        return report
 
     def _place(self, subject: ReportedSlice) -> Path:
         return self.folder if self.single else self.folder / subject.name

@@ -428,7 +428,12 @@ def _misclassified(x: Array, low: NDArray[np.bool_]) -> tuple[float, float]:
         classes = [_Moments.total(part[:one] + part[one + 1 :]) for part in parts]
         pooled = (classes[0].scatter + classes[1].scatter) / (classes[0].count + classes[1].count - 2)
         separate = [each.scatter / (each.count - 1) for each in classes]
-        said = [_likelier(classes, tables, x[test]) for tables in ([pooled, pooled], separate)]
+        said = (
+            _likelier(classes, [pooled, pooled], x[test])
+            if sum(each.count for each in classes) > x.shape[1] + 1
+            else None,
+            _likelier(classes, separate, x[test]) if min(each.count for each in classes) > x.shape[1] else None,
+        )
         wrong.append(tuple(math.nan if a is None else float((a != low[test]).mean()) for a in said))  # type: ignore[arg-type]
     linear, quadratic = np.mean(wrong, axis=0)
     return float(linear), float(quadratic)
@@ -484,8 +489,6 @@ def _likelier(classes: Sequence[_Moments], tables: Sequence[Array], at: Array) -
 
     scores = []
     for each, table in zip(classes, tables, strict=True):
-        if each.count <= at.shape[1]:
-            return None
         try:
             root = np.linalg.cholesky(table)
         except np.linalg.LinAlgError:

@@ -119,6 +119,15 @@ def test_a_level_set_behind_a_plane_and_one_within_a_circle() -> None:
     assert circle.mmce_qda_50 < 0.15 < 0.35 < circle.mmce_lda_50
 
 
+def test_a_class_with_fewer_points_than_parameters_has_no_quadratic_discriminant() -> None:
+    """Of 200 points in 40 parameters a tenth is low; the linear discriminant has the covariance of all."""
+    x = sobol(200, 40, seed=0).numpy()
+    found = LevelSets.of(x, x[:, 0])
+    assert math.isnan(found.mmce_qda_10)
+    assert math.isfinite(found.mmce_lda_10)
+    assert found.mmce_qda_50 > found.mmce_lda_50
+
+
 def test_one_funnel_attracts_more_than_noise() -> None:
     x, noise = points(2), np.random.default_rng(0).normal(size=100)
     bowl, rough = (NearestBetter.of(distances_of(x), y) for y in (np.square(x - 0.5).sum(axis=1), noise))
