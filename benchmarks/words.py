@@ -15,6 +15,7 @@ import argparse
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import groupby
 
 import torch
 from torch import Tensor
@@ -374,16 +375,21 @@ def _denies(found: Jumps, other: Jumps) -> bool:
 
 
 def table(rows: Sequence[Row]) -> str:
-    """Return a Markdown table: the words at each resolution, and what is wrong of them."""
-    counts = list(rows[0].verdicts)
-    lines = ["| function | " + " | ".join(f"{n}" for n in counts) + " | wrong | changes | missing |"]
-    lines.append("|---" * (len(counts) + 4) + "|")
+    """Return a Markdown table: the words by the number of samples along a side, and what is wrong of them."""
+    lines = ["| function | said, by samples along a side | wrong | changes | missing |", "|---" * 5 + "|"]
     for row in rows:
-        said = [", ".join(_shown(one)) or "\N{EN DASH}" for one in row.verdicts.values()]
+        said = {n: ", ".join(_shown(one)) or "nothing" for n, one in row.verdicts.items()}
         wrong = ", ".join(f"{word} ({n})" for n, word in row.wrong)
         missing = ", ".join(f"{word} ({n})" for n, word in row.missing)
-        lines.append(f"| {row.known.name} | {' | '.join(said)} | {wrong} | {', '.join(row.changed)} | {missing} |")
+        lines.append(f"| {row.known.name} | {grouped(said)} | {wrong} | {', '.join(row.changed)} | {missing} |")
     return "\n".join(lines)
+
+
+def grouped(said: Mapping[int, str]) -> str:
+    """Say once what is said at several resolutions that follow each other."""
+    runs = [list(run) for _, run in groupby(said, key=said.__getitem__)]
+    ends = [f"{run[0]} to {run[-1]}" if len(run) > 1 else f"{run[0]}" for run in runs]
+    return "; ".join(f"{end}: {said[run[0]]}" for end, run in zip(ends, runs, strict=True))
 
 
 def _shown(one: Verdict) -> list[str]:

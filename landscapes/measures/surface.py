@@ -396,12 +396,15 @@ def _nearest(errors: Sequence[Values], depth: float) -> Values:
 
 
 def _predictions(loss: Values, slope: Values | None, places: Values) -> list[Values]:
-    """Return losses at places between samples: by straight lines and, with gradients, by cubics (Hermite)."""
+    """Return losses at places between samples: by straight lines, and by cubics (Hermite).
+
+    Their slopes are those of the samples around and, where there are gradients, these.
+    """
     linear = _interpolate(loss, None, places)
-    if slope is None:
-        return [linear]
-    cubic = _interpolate(loss, slope, places)
-    return [linear, np.where(np.isfinite(cubic), cubic, linear)]
+    order = 2 if min(loss.shape) > 2 else 1  # of the differences at the border
+    around = np.stack([np.gradient(loss, axis=axis, edge_order=order) for axis in range(loss.ndim)], axis=-1)
+    cubics = [_interpolate(loss, one, places) for one in (around, slope) if one is not None]
+    return [linear, *(np.where(np.isfinite(cubic), cubic, linear) for cubic in cubics)]
 
 
 def _interpolate(loss: Values, slope: Values | None, places: Values) -> Values:
