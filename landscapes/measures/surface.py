@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import numpy as np
 import torch
@@ -25,7 +25,7 @@ from ..identity import plane_of
 from ..lattice import lift_between
 from ..objective import Objective, evaluate
 from ..plane import Plane
-from ..statistics import Estimate, Values, fit_line, jackknife, share, student
+from ..statistics import Estimate, Values, exact_share, fit_line, jackknife, share, student
 from .ruggedness import box_slopes, minima, span
 
 VERY_SMOOTH, SMOOTH, RUGGED, EXTREME = "very smooth", "smooth with local minima", "rugged", "extremely rugged"
@@ -334,7 +334,8 @@ def level_share(loss: Values, floor: float) -> Estimate:
     windows = np.lib.stride_tricks.sliding_window_view(loss, [width + 1 for width in widths])
     ranges = np.ptp(windows, axis=tuple(range(-loss.ndim, 0)))
     levels = np.where(np.isfinite(ranges), (ranges <= max(bound, floor)).astype(float), np.nan)
-    found = jackknife(_known_mean, levels, least=0.0, most=1.0)
+    apart = math.prod(points // (width + 1) for points, width in zip(loss.shape, widths, strict=True))
+    found = exact_share(jackknife(_known_mean, levels, least=0.0, most=1.0), apart)
     return Estimate(math.nan, math.nan, found.high) if floor > bound else found
 
 
@@ -401,7 +402,7 @@ def _predictions(loss: Values, slope: Values | None, places: Values) -> list[Val
     Their slopes are those of the samples around and, where there are gradients, these.
     """
     linear = _interpolate(loss, None, places)
-    order = 2 if min(loss.shape) > 2 else 1  # of the differences at the border
+    order: Literal[1, 2] = 2 if min(loss.shape) > 2 else 1  # of the differences at the border
     around = np.stack([np.gradient(loss, axis=axis, edge_order=order) for axis in range(loss.ndim)], axis=-1)
     cubics = [_interpolate(loss, one, places) for one in (around, slope) if one is not None]
     return [linear, *(np.where(np.isfinite(cubic), cubic, linear) for cubic in cubics)]
