@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import numpy as np
 import torch
@@ -401,7 +401,7 @@ def _predictions(loss: Values, slope: Values | None, places: Values) -> list[Val
     Their slopes are those of the samples around and, where there are gradients, these.
     """
     linear = _interpolate(loss, None, places)
-    order = 2 if min(loss.shape) > 2 else 1  # of the differences at the border
+    order: Literal[1, 2] = 2 if min(loss.shape) > 2 else 1  # of the differences at the border
     around = np.stack([np.gradient(loss, axis=axis, edge_order=order) for axis in range(loss.ndim)], axis=-1)
     cubics = [_interpolate(loss, one, places) for one in (around, slope) if one is not None]
     return [linear, *(np.where(np.isfinite(cubic), cubic, linear) for cubic in cubics)]
