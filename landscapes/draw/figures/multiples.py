@@ -108,8 +108,8 @@ FOOT = 4  # words that the legend has, the most frequent first
 def census_figure(census: Census, *, width: float | None = None) -> page.Picture:
     """Draw the losses of every slice on one scale, the least rugged first, row by row.
 
-    Slices are ordered by how often lines turn back along a side. What failed or lies outside the box is grey. The legend
-    says which share of the slices each word fits.
+    Slices are ordered by how often lines turn back along a side. What failed or lies outside the box is grey. The
+    legend says which share of the slices each word fits.
 
     Raises ValueError where the page is too narrow or too wide.
     """
