@@ -29,6 +29,7 @@ from . import page
 if TYPE_CHECKING:
     from ...measures.card import Card, CardSlice, Grade
     from ...measures.census import Census
+    from ...statistics import Estimate
 
 
 PITCH, MIN_PANEL = 3.6, 40.0  # room of a panel: on a screen [inch], and at least in print [mm]
@@ -107,8 +108,8 @@ FOOT = 4  # words that the legend has, the most frequent first
 def census_figure(census: Census, *, width: float | None = None) -> page.Picture:
     """Draw the losses of every slice on one scale, the least rugged first, row by row.
 
-    Slices are ordered by the share of steps that turn back. What failed or lies outside the box is grey. The legend
-    says which share of the slices each word fits.
+    Slices are ordered by how often lines turn back along a side. What failed or lies outside the box is grey. The
+    legend says which share of the slices each word fits.
 
     Raises ValueError where the page is too narrow or too wide.
     """
@@ -138,13 +139,14 @@ def census_figure(census: Census, *, width: float | None = None) -> page.Picture
 
 def _words(census: Census) -> list[Patch]:
     """Return legend entries without a sign that say how often each word fits, the most frequent first."""
-    shares = sorted(census.words.items(), key=lambda one: -one[1].value)
-    said = [
-        f"{word}: {100 * share.value:.0f} % ({100 * share.low:.0f} to {100 * share.high:.0f})"
-        for word, share in shares
-        if share.value > 0
-    ]
+    shares = [(word, share) for word, share in census.words.items() if share.value > 0]
+    said = [f"{word}: {_share(share)}" for word, share in sorted(shares, key=lambda one: -one[1].value)]
     return [Patch(visible=False, label=text) for text in said[: 2 * FOOT]]
+
+
+def _share(share: Estimate) -> str:
+    value, low, high = (100 * one for one in (share.value, share.low, share.high))
+    return f"{value:.0f} % ({low:.0f} to {high:.0f})" if math.isfinite(low) else f"{value:.0f} % of all"
 
 
 WALL_PITCH, WALL_ACROSS, MIN_LANDSCAPE = 2.2, 6, 28.0  # room of a landscape [inch]; so many in a row; in print [mm]

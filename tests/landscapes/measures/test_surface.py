@@ -132,7 +132,8 @@ def test_lines_have_a_word_too() -> None:
     u = np.linspace(-1, 1, 40)
     assert measure_surface(data(u**2)).word == "very smooth"
     assert measure_surface(data((u**2 - 0.4) ** 2)).word == "smooth with local minima"
-    step = measure_surface(data(u**2 + (u > 0.3)))
+    fine = np.linspace(-1, 1, 160)
+    step = measure_surface(data(fine**2 + (fine > 0.3)))
     assert step.word is None
     assert "may be a jump, of " in step.unresolved
 
