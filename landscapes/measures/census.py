@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 PAIRS, RANDOM = "pairs", "random"
 ALONG = (PAIRS, RANDOM)  # what cuts are: pairs of parameters, or pairs of random directions
-STEEP = 16  # pairs of neighbouring samples of a slice that are bisected for jumps
+STEEP = 48  # pairs of neighbouring samples of a slice that are bisected for jumps
 PLACES, POINTS = 48, 48  # between the samples of a slice, and where gradients are held against slopes
 MEASURES = (
     "turns",

@@ -185,9 +185,9 @@ def test_words_are_beside_the_papers_and_a_trade_off_is_ranked(site: Path) -> No
     manifest = json.loads((site / "manifest.json").read_text())
     bare, full = manifest["figures"][1:]
     assert (bare["report"], manifest["studies"]["bounce"]) == (None, [])
-    agreed = {one["word"]: (one["measured"], one["agree"]) for one in full["report"]["words"]}
+    agreed = {one["word"]: (one["measured"], one["paper"]) for one in full["report"]["words"]}
     assert agreed == {
-        "rugged": (True, True), "gradients follow": (False, False), "gradients do not follow": (True, None)
+        "rugged": (True, True), "gradients follow": (False, True), "gradients do not follow": (True, False)
     }  # fmt: skip
     assert full["report"]["picture"] == (
         "Gradient quality over the slice: mean cosine of gradient and slope, by parts of the box: "
