@@ -8,10 +8,13 @@ import gradscape as gs
 from gradscape.jobs import plan as module
 from gradscape.jobs.report import ReportedSlice, ReportJob
 from gradscape.jobs.watch import Watch
+from gradscape.landscapes.measures.census import judging_effort
 from gradscape.landscapes.measures.undersampled import probes
+from gradscape.landscapes.measures.verdict import RANGE_POINTS
 
 from ..command import Run
 
+JUDGED = judging_effort()  # losses, at most, and gradients, of a slice of a census
 FLOOR = 4  # evaluations of a replica of bounce, at least
 EACH = {False: 0.5, True: 2.0}  # seconds of a loss and of a gradient
 
@@ -36,7 +39,7 @@ def priced(monkeypatch: pytest.MonkeyPatch) -> None:
         ("optimize branin --method descents --budget 30", 0, 30),
         ("race branin --methods random,descents --budget 20 --seeds 3", 60, 60),
         ("league branin beale --methods random --budget 20 --seeds 2", 80, 0),
-        ("census ackley --slices 1 --resolution 6", 16 * 5, 36),
+        ("census ackley --slices 1 --resolution 6", 16 * 5 + RANGE_POINTS + JUDGED[0], 36 + JUDGED[1]),
         ("hessian branin", 18, 1 + 9 * 4 + 2 * 4 + 2 * 4),
         ("replay bounce --no-film", 2, 0),
     ],

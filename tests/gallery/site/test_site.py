@@ -263,7 +263,7 @@ def test_a_page_says_what_it_has_and_nothing_of_what_it_has_not(site: Path) -> N
     ]  # fmt: skip
     assert "<li>jumps not searched</li>" in full
     assert '<th scope="row">local minima</th><td>7</td>' in full
-    assert bare_cells(full).count("<td>9 (4.5 to 18)</td> <td>0.987</td> <td>0.654</td> <td>25 %</td>") == 2
+    assert bare_cells(full).count("<td>9 (4.5 to 18)</td> <td>0.987</td> <td>0.654</td> <td>25 % (15 to 37)</td>") == 2
     assert re.findall(r"<h3>(On .*?)</h3>", full) == ["On cuda", "On cpu"]
     assert "2 J from the 5th to the 95th percentile" in full.replace("\n", " ")
     assert "Mass from −10 to 10: 12 slices" in full.replace("\n", " ")
