@@ -31,9 +31,9 @@ NAMED = 3  # eigenvalues that a warning names
 class Eigenpair:
     """Hold an eigenvalue [loss unit, in box units], which is at most `error` off, and its place, 1 the largest.
 
-    The error is made of `residual`, ``|Hv - value v|``; of `difference`, by how much Hv changes from the step to a quarter
-    of it; and of what losses say otherwise. `by_losses` is the curvature of the losses along the direction, NaN where
-    it was not measured. `along` names the largest components of the unit vector.
+    The error is made of `residual`, the norm of Hv - value v; of `difference`, by how much Hv changes from the step to
+    a quarter of it; and of what losses say otherwise. `by_losses` is the curvature of the losses along the direction,
+    NaN where it was not measured. `along` names the largest components of the unit vector.
     """
 
     place: int
