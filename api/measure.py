@@ -253,7 +253,7 @@ def hessian(
     eigenpairs
         Number of eigenvalues to examine at each end of the spectrum, with their directions.
     probes
-        Number of random directions by which the spectrum of more than 100 parameters is sampled.
+        Number of random directions that sample the spectrum of more than 100 parameters.
     """
     spec = spec_of(scene, keywords)
     from ..jobs.hessian import HessianJob

@@ -386,7 +386,7 @@ def table(rows: Sequence[Row]) -> str:
 
 
 def grouped(said: Mapping[int, str]) -> str:
-    """Say once what is said at several resolutions that follow each other."""
+    """Write neighbouring resolutions that have the same words as one range."""
     runs = [list(run) for _, run in groupby(said, key=said.__getitem__)]
     ends = [f"{run[0]} to {run[-1]}" if len(run) > 1 else f"{run[0]}" for run in runs]
     return "; ".join(f"{end}: {said[run[0]]}" for end, run in zip(ends, runs, strict=True))

@@ -50,11 +50,14 @@ class Task:
 
 
 @dataclass(frozen=True)
-class _Scale:
-    """Hold the standard deviation of the losses' noise and their range over the box [loss unit]."""
+class _Judging:
+    """Hold what `survey` samples and judges every slice of a census with, by its names."""
 
     deviation: float
-    range: float
+    own_range: float | None
+    floor: Floor | None
+    seed: int
+    gradients: int
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,6 +99,7 @@ class CensusJob(CheckpointedJob["Census"]):
         StoreMismatchError where the folder holds another census.
         """
         from ..landscapes.measures.census import CensusDesign
+        from ..landscapes.measures.verdict import WORDS
         from ..landscapes.storage.checkpoint import Checkpoint
 
         env = scene.make()
@@ -117,6 +121,7 @@ class CensusJob(CheckpointedJob["Census"]):
         if gradients > 1:  # a census that was begun when all had them continues
             identity["gradients"] = gradients
         identity["other"] = other.identity()["settings"] if other else None
+        identity["words"] = WORDS  # slices that were judged by others are not mixed with these
         folder = out or folder_named(["census", env.name, env.fidelity.name, slices], identity, root)
         checkpoint = Checkpoint.open(folder, identity, what="census", force=force)
         return cls(
@@ -161,16 +166,11 @@ class CensusJob(CheckpointedJob["Census"]):
 
     def compute(self, watch: Watch) -> Census:
         """Survey what is missing, and return the census."""
-        noise, replicas = self._noise(watch), self._replicas(watch)
+        (deviation, own_range), replicas = self._scales(watch), self._replicas(watch)
         self._announce(watch)
-        how = {
-            "deviation": noise.deviation,
-            "own_range": noise.range,
-            "floor": self._floor(replicas, None) if replicas else None,
-            "seed": self.seed,
-            "gradients": self.design.gradients,
-        }
-        return self._conclude(self._survey(how, watch), replicas)
+        floor = self._floor(replicas, None) if replicas else None
+        judging = _Judging(deviation, own_range, floor, self.seed, self.design.gradients)
+        return self._conclude(self._survey(judging, watch), replicas)
 
     def write(self, found: Census) -> list[str]:
         """Draw and write the census, the losses in a file of their own."""
@@ -190,13 +190,13 @@ class CensusJob(CheckpointedJob["Census"]):
         """Return what is not surveyed yet."""
         return [task for task in self.tasks if self.checkpoint.load(task.piece) is None]
 
-    def _noise(self, watch: Watch) -> _Scale:
-        """Return how large the losses' noise and range are, measured at random points of the box."""
+    def _scales(self, watch: Watch) -> tuple[float, float]:
+        """Return the deviation of the losses' noise and their range, at random points of the box [loss unit]."""
         from ..landscapes.measures.noise import noise
         from ..landscapes.measures.profile import PRECISION
         from ..landscapes.measures.verdict import measure_range
 
-        if (kept := self.checkpoint.load("noise")) is None or "range" not in kept:
+        if (kept := self.checkpoint.load("noise")) is None:
             with watch.busy(f"{self.env.name}: {PREPARING}, then its noise"):
                 self.env.prepare()
                 x = self.env.space.uniform(NOISE_POINTS, seed=self.seed)
@@ -205,7 +205,7 @@ class CensusJob(CheckpointedJob["Census"]):
                 whole = measure_range(self.env, seed=self.seed)
             kept = {"deviation": np.array(found.deviation), "range": np.array(whole)}
             self.checkpoint.save("noise", **kept)
-        return _Scale(float(np.nan_to_num(kept["deviation"])), float(kept["range"]))
+        return float(np.nan_to_num(kept["deviation"])), float(kept["range"])
 
     def _replicas(self, watch: Watch) -> dict[str, Evaluation]:
         """Return what the environment and its replicas are at random points, by name; nothing where it has none."""
@@ -251,20 +251,20 @@ class CensusJob(CheckpointedJob["Census"]):
             seconds = len(left) * (each + MEASURING_SECONDS) + PICTURE_SECONDS
             watch.announce(f"about {duration(seconds)} here; {lower} change it", seconds)
 
-    def _survey(self, how: Mapping[str, Any], watch: Watch) -> dict[str, SurveyedSlice]:
+    def _survey(self, judging: _Judging, watch: Watch) -> dict[str, SurveyedSlice]:
         from ..landscapes.measures.census import SurveyedSlice
 
         left = self.left()
         with watch.progress(len(self.tasks), "slices") as advance:
             done = len(self.tasks) - len(left)
             advance(done)
-            for piece, arrays in self._do(left, how):
+            for piece, arrays in self._do(left, judging):
                 self.checkpoint.save(piece, **arrays)
                 advance(done := done + 1)
         pieces = {task.piece: self.checkpoint.load(task.piece) for task in self.tasks}
         return {name: SurveyedSlice.of_arrays(arrays) for name, arrays in pieces.items() if arrays is not None}
 
-    def _do(self, tasks: Sequence[Task], how: Mapping[str, Any]) -> Iterator[tuple[str, Mapping[str, Any]]]:
+    def _do(self, tasks: Sequence[Task], judging: _Judging) -> Iterator[tuple[str, Mapping[str, Any]]]:
         """Survey slices, here or by workers, so many abreast as fill a batch, and yield what each one's piece holds."""
         workers = workers_of(self.executor) if self.executor else 1
         for other in (False, True):
@@ -277,10 +277,10 @@ class CensusJob(CheckpointedJob["Census"]):
             groups = [todo[start : start + size] for start in range(0, len(todo), size)]
             if self.executor is None:
                 for group in groups:
-                    yield from _survey(env, group, how)
+                    yield from _survey(env, group, judging)
                 continue
             sent = PortableObjective.of(env, recipe(env))
-            for found in run_tasks(self.executor, _survey_there, [(sent, group, how) for group in groups]):
+            for found in run_tasks(self.executor, _survey_there, [(sent, group, judging) for group in groups]):
                 yield from found
 
     def _conclude(self, found: Mapping[str, SurveyedSlice], replicas: Mapping[str, Evaluation]) -> Census:
@@ -328,14 +328,14 @@ def _abreast(env: Environment) -> int:
     return -(-env.preferred_batch // STEEP)
 
 
-def _survey(env: Any, group: Sequence[tuple[str, Plane]], how: Mapping[str, Any]) -> list[Piece]:
+def _survey(env: Any, group: Sequence[tuple[str, Plane]], judging: _Judging) -> list[Piece]:
     """Survey slices, their points simulated in one batch, and return what their pieces hold."""
     from ..landscapes.measures.census import survey
 
-    found = survey(MemoryBound(env), [plane for _, plane in group], **how)
+    found = survey(MemoryBound(env), [plane for _, plane in group], **vars(judging))
     return [(piece, one.arrays()) for (piece, _), one in zip(group, found, strict=True)]
 
 
-def _survey_there(sent: PortableObjective, group: Sequence[tuple[str, Plane]], how: Mapping[str, Any]) -> list[Piece]:
+def _survey_there(sent: PortableObjective, group: Sequence[tuple[str, Plane]], judging: _Judging) -> list[Piece]:
     """Survey slices on a worker, which keeps the environment that it has made."""
-    return _survey(sent.objective.objective, group, how)
+    return _survey(sent.objective.objective, group, judging)

@@ -398,7 +398,7 @@ class _Krylov:
 
 
 def _lanczos(curvature: Curvature, step: float, starts: Array, first: Array) -> _Krylov:
-    """Run Lanczos' method from all starts abreast, orthogonalising twice; `first` are the first products.
+    """Run Lanczos' method from all starts at the same time, and orthogonalise twice; `first` are the first products.
 
     Ritz values weigh the squares of the first components of their vectors (Ubaru, Chen & Saad 2017).
     """

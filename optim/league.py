@@ -135,6 +135,11 @@ class SceneStandings:
         return [one.method for one in self.standings]
 
     @property
+    def ranks(self) -> tuple[MeanRank, ...]:
+        """The mean ranks after the whole budget of episodes, the best first."""
+        return tuple(MeanRank(one.method, one.rank, one.rank_low, one.rank_high) for one in self.standings)
+
+    @property
     def lead(self) -> Lead:
         """Who leads after the whole budget of episodes."""
         return Lead.of(self.methods, self.pairs)

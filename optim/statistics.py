@@ -240,7 +240,7 @@ class MeanRank:
 
 @dataclass(frozen=True)
 class EqualCost:
-    """How methods come off within the same cost `forwards` [forward equivalents]: ranks, the best first, and pairs.
+    """Compare methods at the same cost, `forwards` [forward equivalents]: their ranks, the best first, and pairs.
 
     Pairs are those of `Superiority`, corrected among themselves.
     """

@@ -32,7 +32,7 @@ from gradscape.landscapes.storage.records import read_json
 from gradscape.optim.league import League, SceneStandings
 from gradscape.optim.options import OURS, PAPER, defaults
 from gradscape.optim.registry import methods, optimizer_class
-from gradscape.optim.statistics import Lead
+from gradscape.optim.statistics import Lead, MeanRank
 from gradscape.studies.claims import CLAIMS, Claim, Shortfall
 from gradscape.studies.extremes import ExtremesRecord, Limit
 from gradscape.studies.fidelity import FidelityRecord
@@ -146,8 +146,8 @@ def short_league() -> str:
         [
             f"`{scene.env}`",
             scene.fidelity,
-            *_lead(scene.lead, {one.method: one.rank for one in scene.standings}),
-            *_lead(scene.equal_cost.lead, {one.method: one.rank for one in scene.equal_cost.ranks}),
+            *_lead(scene.lead, scene.ranks),
+            *_lead(scene.equal_cost.lead, scene.equal_cost.ranks),
             f"{len(scene.not_told_from_random)} of {len(scene.methods) - 1}",
         ]
         for scene in scenes
@@ -164,10 +164,10 @@ def _changed(scenes: Sequence[SceneStandings]) -> str:
     return f"\nRaced with a model that has changed since: {', '.join(names)}.\n" if names else ""
 
 
-def _lead(lead: Lead, ranks: Mapping[str, float]) -> list[str]:
+def _lead(lead: Lead, ranks: Sequence[MeanRank]) -> list[str]:
     """Return the cells of the methods of the best mean rank: in bold only where there is one, and it is first."""
-    others, best = len(ranks) - 1, min(ranks.values())
-    name = f"{', '.join(f'`{method}`' for method, rank in ranks.items() if rank == best)} {best:.2f}"
+    others, best = len(ranks) - 1, ranks[0].rank
+    name = f"{', '.join(f'`{one.method}`' for one in ranks if one.rank == best)} {best:.2f}"
     if lead.is_first:
         return [f"**{name}, first**", f"all {others} (p at most {lead.p:.2g})"]
     return [name, f"{others - len(lead.rivals)} of {others}"]

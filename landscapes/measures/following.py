@@ -115,7 +115,8 @@ class Following:
     @property
     def words(self) -> tuple[str, ...]:
         """The words for the gradients, in the order of `FOLLOWING_WORDS`."""
-        return tuple(word for word in FOLLOWING_WORDS if word in self.reasons)
+        reasons = self.reasons
+        return tuple(word for word in FOLLOWING_WORDS if word in reasons)
 
     @property
     def reasons(self) -> dict[str, str]:

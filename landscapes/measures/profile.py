@@ -201,8 +201,8 @@ def measure_profile(
         seed=seed,
         events=events,
     )
-    widths = gradients.width_table(smooth)
-    found = _profile(dataset, fuzz, with_bias(verdict, widths), deviation)
+    widths, near = gradients.width_table(smooth), gradients.compare_samples(dataset, deviation=deviation)
+    found = _profile(dataset, fuzz, with_bias(verdict, widths), deviation, near)
     floor = found.losses.floor
     between = Undersampled.of(dataset) or find_undersampled(objective, dataset, floor=floor, seed=seed)
     return replace(
@@ -211,7 +211,7 @@ def measure_profile(
         smoothing=widths,
         beyond_the_box=OutsideBounds(objective.asked, objective.cut),
         undersampled=between,
-        quality=gradients.GradientQuality(steps, gradients.compare_samples(dataset, deviation=deviation), smooth),
+        quality=gradients.GradientQuality(steps, near, smooth),
     )
 
 
@@ -221,14 +221,16 @@ def profile_samples(dataset: xr.Dataset, *, noise: Noise | None = None, floor: F
     Jumps are not searched, gradients are compared at the scales that the samples allow, and `noise` is what was
     measured before; None for none. `floor` is by default the slice's own.
     """
-    deviation = None if noise is None else float(np.nan_to_num(noise.deviation))
-    verdict = judge_samples(dataset, deviation=deviation, floor=floor or floor_of(dataset))
-    return _profile(dataset, noise, verdict, deviation or 0.0)
-
-
-def _profile(dataset: xr.Dataset, fuzz: Noise | None, verdict: Verdict, deviation: float) -> Profile:
-    """Measure what takes the samples alone."""
+    known = None if noise is None else float(np.nan_to_num(noise.deviation))
+    verdict, deviation = judge_samples(dataset, deviation=known, floor=floor or floor_of(dataset)), known or 0.0
     near = gradients.compare_samples(dataset, deviation=deviation) if "grad" in dataset else None
+    return _profile(dataset, noise, verdict, deviation, near)
+
+
+def _profile(
+    dataset: xr.Dataset, fuzz: Noise | None, verdict: Verdict, deviation: float, near: xr.Dataset | None
+) -> Profile:
+    """Measure what takes the samples alone; `near` is what `compare_samples` says of their gradients."""
     floors = [least_difference(dataset, deviation, numerics) for numerics in (verdict.floor, None)]
     return Profile(
         losses=ruggedness(dataset, floor=floors[0], noise=floors[1]),

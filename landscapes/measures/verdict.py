@@ -74,7 +74,8 @@ class Verdict:
     @property
     def words(self) -> tuple[str, ...]:
         """The words, in the order of `WORDS`."""
-        return tuple(word for word in WORDS if word in self.reasons)
+        reasons = self.reasons
+        return tuple(word for word in WORDS if word in reasons)
 
     @property
     def reasons(self) -> dict[str, str]:

@@ -18,7 +18,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
 
 
 def follow(clock: Clock, *, said: float, each: float, resumed: int = 0) -> list[str]:
-    """Announce a job of 100 episodes, some of them done before, and return what is said of its delay."""
+    """Announce a job of 100 episodes, of which some are done, and return what it says of its delay."""
     shown = StringIO()
     bars = Bars(Console(file=shown, soft_wrap=True))
     bars.announce("100 episodes", said)

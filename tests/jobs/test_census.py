@@ -5,6 +5,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -141,7 +142,7 @@ def test_slices_surveyed_abreast_are_those_surveyed_alone_in_fewer_batches(monke
     env, asked = scene.make(), list[int]()
     design = CensusDesign.draw(env.space, 4, along="pairs", resolution=8, seed=0)
     group = [(f"slice-{number}", design.plane(*place)) for number, place in enumerate(design.places)]
-    how = {"deviation": 0.0, "seed": 0, "gradients": 2}
+    how = module._Judging(deviation=0.0, own_range=None, floor=None, seed=0, gradients=2)
     alone = [module._survey(env, [one], how)[0] for one in group]
     evaluate = type(env).evaluate
 
@@ -168,4 +169,4 @@ def test_what_a_slice_raises_ends_all_of_its_group() -> None:
     design = CensusDesign.draw(env.space, 4, along="pairs", resolution=8, seed=0)
     group = [(f"slice-{number}", design.plane(*place)) for number, place in enumerate(design.places)]
     with pytest.raises(TypeError, match="deviation"):
-        module._survey(env, group, {"seed": 0})
+        module._survey(env, group, SimpleNamespace(seed=0))

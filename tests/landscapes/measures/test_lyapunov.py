@@ -60,7 +60,7 @@ def test_what_stays_or_shrinks_does_not_diverge() -> None:
 
 
 def shapes(draw: Callable[[np.random.Generator], np.ndarray], count: int = 300) -> Counter[Shape]:
-    """Count what is said of so many curves, shape (horizon,), with 16 points that share it and are a third apart."""
+    """Count the answers for many curves of shape (horizon,). Each has 16 points, which differ from it by a third."""
     rng = np.random.default_rng(2)
     apart = (np.exp(0.3 * rng.standard_normal((5, 16))) for _ in range(count))
     return Counter(measure_growth(TIME, draw(rng)[:, None] * one).shape for one in apart)

@@ -8,7 +8,7 @@ import torch
 
 from gradscape import ParameterSpace, Plane, from_torch, sample
 from gradscape.landscapes.convert import to_json
-from gradscape.landscapes.measures.profile import Profile, effort, measure_profile
+from gradscape.landscapes.measures.profile import Profile, effort, measure_profile, profile_samples
 from gradscape.landscapes.measures.verdict import WORDS, QuotedWord
 from gradscape.landscapes.objective import Evaluation, Objective, Status
 
@@ -29,6 +29,18 @@ def rastrigin(x: torch.Tensor) -> torch.Tensor:
 def scrambled(x: torch.Tensor) -> torch.Tensor:
     mixed = torch.sin(x[:, 0] * 12989.8 + x[:, 1] * 78233.0) * 43758.5453
     return mixed - mixed.floor()
+
+
+def test_a_slice_whose_function_is_gone_is_judged_from_its_samples() -> None:
+    space = ParameterSpace.box(("x", "y"), -1, 1)
+    bowl = from_torch(lambda x: x.square().sum(1), space)
+    found = profile_samples(sample(bowl, Plane.through(space, space.center, (0, 1), resolution=48)))
+    assert found.words[:1] == ("very smooth",)
+    assert (found.jumps, found.noise, found.differences, found.smoothing) == (None, None, (), ())
+    assert found.measures["Jumps"] == "not searched"
+    assert found.verdict.compare_words(["discontinuous", "rugged"]) == (
+        QuotedWord("discontinuous", None), QuotedWord("rugged", False),
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize(
