@@ -71,6 +71,7 @@ ADDED = {
 }
 SCENES = {verb: {"fluid": "bounce", "flip": "bounce"} for verb in ("race", "optimize", "study")}
 SCENES["league"] = {"fluid@standard": "branin"}
+SCENES["report"] = {"cartpole": "bounce", "SLICE": "branin"}
 SCENES["--tolerance"] = {"fluid": "bounce", "6": "0", "8": "1"}
 SHORT = {
     "slice": {"fluid", "assembly"},
@@ -148,7 +149,7 @@ def test_forms_name_verbs_and_options_there_are() -> None:
             assert option in {name for verb in named for one in verb.options for name in one.names}, command
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")  # whose own environments are known to the whole process
 def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a slice, a run, its points as a table, somebody's own class, two figures, and a site to serve."""
     folder = tmp_path_factory.mktemp("desk")
