@@ -13,7 +13,7 @@ from matplotlib import colormaps
 from matplotlib.axis import Axis
 from matplotlib.colors import Colormap, ListedColormap, LogNorm, Normalize
 from matplotlib.patheffects import withStroke
-from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, MaxNLocator, NullFormatter
+from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, MaxNLocator
 from numpy.typing import NDArray
 
 from ..large import refuse_large
@@ -37,15 +37,15 @@ FLOOR_MAP: Colormap = colormaps["cividis"]
 SLOPE_MAP_DARK: Colormap = ListedColormap(colormaps["magma"](np.linspace(0.42, 1.0, 256)), "magma, legible on black")
 
 FAILURES = {Status.NONFINITE: "not finite", Status.ESCAPED: "outside the domain", Status.ERROR: "error"}
+ENDED = FAILURES | {Status.MISSING: "not sampled yet", Status.NO_GRADIENT: "no gradient"}
 _FAILED: dict[str, Any] = {"facecolor": "white", "edgecolor": QUIET, "linewidth": 0.0}
-STATUS_LOOKS: dict[Status, dict[str, Any]] = {  # of every sample that has no loss
+STATUS_LOOKS: dict[Status, dict[str, Any]] = {  # of every sample that lacks its loss or its gradient
     Status.MISSING: {"facecolor": UNSAMPLED, "linewidth": 0.0},
     Status.NONFINITE: _FAILED | {"hatch": "////"},
     Status.ESCAPED: _FAILED | {"hatch": "\\\\\\\\"},
     Status.ERROR: _FAILED | {"hatch": "xxxx"},
+    Status.NO_GRADIENT: {"facecolor": BAND[0], "edgecolor": QUIET, "linewidth": 0.0, "hatch": ".."},
 }
-NO_GRADIENT = "no gradient"
-NO_GRADIENT_LOOK: dict[str, Any] = {"facecolor": BAND[0], "edgecolor": QUIET, "linewidth": 0.0, "hatch": ".."}
 
 ARROWS = 32  # most arrows per axis
 LONGEST_ARROW = 0.055  # as a fraction of a side
@@ -143,8 +143,7 @@ OUTCOMES: dict[str, dict[str, Any]] = {  # of a setting on a stability map; thos
     "inaccurate": {"facecolor": "#f2cf7e", "linewidth": 0.0},
     "not judged": {"facecolor": "#c9d3e0", "linewidth": 0.0},
     "refused": {"facecolor": UNSAMPLED, "edgecolor": QUIET, "linewidth": 0.0, "hatch": ".."},
-    **{kind.name: STATUS_LOOKS[kind] for kind in FAILURES},
-    Status.NO_GRADIENT.name: NO_GRADIENT_LOOK,
+    **{kind.name: STATUS_LOOKS[kind] for kind in (*FAILURES, Status.NO_GRADIENT)},
 }
 _BOUNDARY: dict[str, Any] = {"color": INK, "linewidth": 1.4, "markersize": 3.6, "markerfacecolor": "white", "zorder": 3}
 BOUNDARIES: tuple[dict[str, Any], dict[str, Any]] = (  # of accuracy, of stability
@@ -199,7 +198,6 @@ NAME_TEXT: dict[str, Any] = {"color": INK, "zorder": 6, "path_effects": [withStr
 LEADER: dict[str, Any] = {"arrowstyle": "-", "color": QUIET, "linewidth": 0.5, "shrinkA": 0.0, "shrinkB": 2.0}
 
 EXTEND = {(False, False): "neither", (True, False): "min", (False, True): "max", (True, True): "both"}
-SUBS = ((6.0, (1, 1.5, 2, 3, 4, 5, 7)), (2e3, (1, 2, 5)))  # ticks of a decade, by the axis' span
 INCH = 25.4  # [mm]
 SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 NARROWEST, WIDEST = 80.0, 400.0  # of a picture for print [mm]
@@ -345,17 +343,6 @@ def _span(values: NDArray[np.float64]) -> tuple[float, float, str]:
         pad = 0.5 * abs(low) or 0.5
         low, high = low - pad, high + pad
     return low, high, EXTEND[below, above]
-
-
-def log_axis(axis: Axis) -> None:
-    """Make an axis of what is drawn already logarithmic, with plain numbers at 1, 2 and 5 where decades are few."""
-    scale = axis.axes.set_xscale if axis is axis.axes.xaxis else axis.axes.set_yscale
-    scale("log")
-    low, high = sorted(axis.get_view_interval())
-    subs = next((subs for span, subs in SUBS if high < span * low), (1,))
-    axis.set_major_locator(LogLocator(subs=subs, numticks=9))
-    axis.set_major_formatter(FuncFormatter(lambda value, _: power(value)))
-    axis.set_minor_formatter(NullFormatter())
 
 
 def stroke(points: int) -> dict[str, Any]:

@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
+import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
-from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import MultipleLocator
+from numpy.typing import NDArray
 
 from ...checks.examination import percent
 from ...checks.slopes import BAD, STEPS, Kind
-from ...checks.usefulness import LONGEST, OPTIMISER_STEPS, SHORTEST, Usefulness
-from ...statistics import Estimate
+from ...checks.usefulness import LONGEST, OPTIMISER_STEPS, SHORTEST, UNKNOWN, Usefulness
 from .. import style
 from . import page
 
@@ -61,12 +60,12 @@ def check_figure(found: CheckReport, *, width: float | None = None) -> page.Pict
         curves, bars = picture.add_subplot(rows[0]), picture.add_subplot(rows[1])
         bars.set_box_aspect(BARS)
     curves.set_box_aspect(SHAPE)
-    entries = _draw_curves(curves, found.usefulness)
+    more = _draw_curves(curves, found.usefulness)
     _draw_kinds(bars, found.kinds)
     page.entitle(picture, f"{found.env} · {found.fidelity} · {_verdict(found)}")
     page.remark(curves, _causes(found))
     heading = " · ".join(filter(None, (found.device, found.engine, found.command)))
-    page.finish(picture, entries, columns=2, heading=heading)
+    page.finish(picture, more, heading=heading)
     return picture
 
 
@@ -95,108 +94,84 @@ def _causes(found: CheckReport) -> str:
     return "; ".join(said)
 
 
-@dataclass(frozen=True)
-class _Curve:
-    """One quantity over steps: a point for each step of the ladder, None where nothing could be compared."""
-
-    name: str
-    points: Sequence[tuple[float, Estimate | None]]
-    compared: bool
-
-    @classmethod
-    def of(cls, name: str, curve: Sequence[Usefulness]) -> _Curve:
-        """Return one of `cosine` and `sign`."""
-        known = {one.step: getattr(one, name) for one in curve if one.compared}
-        steps = sorted({*known, *(step for step in STEPS if SHORTEST <= step <= LONGEST)})
-        found = [(step, known.get(step)) for step in steps]
-        points = [(step, one if one and math.isfinite(one.value) else None) for step, one in found]
-        return cls(name, points, bool(known))
-
-    def runs(self) -> Iterator[list[tuple[float, Estimate]]]:
-        """Yield the parts of it without gaps."""
-        run: list[tuple[float, Estimate]] = []
-        for step, one in self.points:
-            if one is not None:
-                run.append((step, one))
-            elif run:
-                yield run
-                run = []
-        if run:
-            yield run
+def _curve(name: str, curve: Sequence[Usefulness]) -> tuple[page.Grid, page.Grid]:
+    """Return steps and the cosine or the sign at each, as `page.ends_of` has them, NaN where none is compared."""
+    known = {one.step: getattr(one, name) for one in curve if one.compared}
+    steps = sorted({*known, *(step for step in STEPS if SHORTEST <= step <= LONGEST)})
+    ends = page.ends_of(known.get(step, UNKNOWN) for step in steps)
+    return np.array(steps), np.where(np.isfinite(ends[:, :1]), ends, np.nan)
 
 
-def _draw_curves(ax: Axes, curve: Sequence[Usefulness]) -> list[Artist]:
-    """Draw all curves; return the entries of the legend."""
+def _draw_curves(ax: Axes, curve: Sequence[Usefulness]) -> list[Artist | str]:
+    """Draw all curves; return what else the legend has."""
     page.dress(ax)
     ax.set_xlim(SHORTEST / REACH, LONGEST * REACH)
-    cosine, sign = (_Curve.of(name, curve) for name in ("cosine", "sign"))
-    smoothed = [(one.step, _kept(one.bias)) for one in curve if math.isfinite(one.bias.value)]
-    known = [one for _, one in (*cosine.points, *sign.points, *smoothed) if one is not None]
-    ends = [end for one in known for end in (one.value, one.low, one.high) if math.isfinite(end)]
+    (steps, cosine), (_, sign) = (_curve(name, curve) for name in ("cosine", "sign"))
+    biased = [one for one in curve if math.isfinite(one.bias.value)]
+    kept = 1 - page.ends_of(one.bias for one in biased)[:, [0, 2, 1]]  # what means of gradients have of the slope
+    known = np.concatenate([cosine, sign, kept])
+    ends = known[np.isfinite(known)].tolist()
     low, high = max(LOWEST, min([-PAD, *(end - PAD for end in ends)])), min(HIGHEST, max([1.0, *ends]) + PAD)
     ax.set_ylim(low, high)
     ax.yaxis.set_major_locator(MultipleLocator(WIDE_TICKS if high - low > WIDE else TICKS))
     _draw_levels(ax)
-    entries = [entry for one in (cosine, sign) for entry in _draw_curve(ax, one)] + _draw_smoothed(ax, smoothed)
-    entries += [Patch(facecolor=style.FAINT, linewidth=0.0, label="bands and bars: 95 % intervals")] if known else []
-    entries += [*_draw_gaps(ax, sign), *_draw_steps(ax)]
+    for name, values in (("cosine", cosine), ("sign", sign)):
+        _draw_curve(ax, name, steps, values)
+    _draw_smoothed(ax, [one.step for one in biased], kept)
+    _draw_gaps(ax, steps, np.isnan(sign[:, 0]))
+    _draw_steps(ax)
     page.log_axis(ax.xaxis)
     page.name_axes(ax, "length of a step [share of the box]", "gradient against the loss: 1 is right")
-    if not known:
+    if not ends:
         size = page.sheet_of(ax).label
         ax.text(0.32, 0.5, NOTHING, transform=ax.transAxes, size=size, ha="center", va="center", **style.NAME_TEXT)
-    return entries
+        return []
+    flat = np.isnan(cosine).all() and not np.isnan(sign).all()
+    bands = Patch(facecolor=style.FAINT, linewidth=0.0, label="bands and bars: 95 % intervals")
+    return ["no cosine: all gradients, or all slopes, are 0", bands] if flat else [bands]
 
 
-def _kept(bias: Estimate) -> Estimate:
-    """Return the share of the smoothed slope that means of gradients have, from that which they lack."""
-    return Estimate(1 - bias.value, 1 - bias.high, 1 - bias.low)
+def _draw_curve(ax: Axes, name: str, steps: page.Grid, ends: page.Grid) -> None:
+    """Draw a curve with its band, which break where nothing could be compared; a point alone has a line."""
+    look, (value, low, high) = style.CHECKED[name], ends.T
+    known = np.isfinite(value)
+    if not known.any():
+        return
+    beside = np.pad(known, 1)
+    alone = known & ~beside[:-2] & ~beside[2:]
+    about = {"color": look["color"], "gid": f"{name}-interval"}
+    ax.fill_between(steps, low, high, **about, **style.CHECKED_BAND)
+    ax.vlines(steps[alone], low[alone], high[alone], **about, alpha=0.4)
+    ax.plot(steps, value, **page.sheet_of(ax).look(look), clip_on=False, gid=name, label=LABELS[name])
 
 
-def _draw_curve(ax: Axes, curve: _Curve) -> list[Artist]:
-    sheet, look = page.sheet_of(ax), style.CHECKED[curve.name]
-    drawn = False
-    for run in curve.runs():
-        steps = [step for step, _ in run]
-        low, high = [one.low for _, one in run], [one.high for _, one in run]
-        if len(run) > 1:
-            ax.fill_between(steps, low, high, color=look["color"], **style.CHECKED_BAND, gid=f"{curve.name}-interval")
-        else:
-            ax.plot(steps * 2, [low[0], high[0]], color=look["color"], alpha=0.4, gid=f"{curve.name}-interval")
-        ax.plot(steps, [one.value for _, one in run], **sheet.look(look), clip_on=False, gid=curve.name)
-        drawn = True
-    if drawn or curve.name == "sign":
-        return [Line2D([], [], **sheet.look(look), label=LABELS[curve.name])] if drawn else []
-    return [Patch(visible=False, label="no cosine: all gradients, or all slopes, are 0")] if curve.compared else []
-
-
-def _draw_smoothed(ax: Axes, points: Sequence[tuple[float, Estimate]]) -> list[Artist]:
+def _draw_smoothed(ax: Axes, steps: Sequence[float], kept: page.Grid) -> None:
     """Draw what means of gradients have of the smoothed slope; an arrow says that it goes on beyond the panel."""
-    sheet = page.sheet_of(ax)
-    look, (low, high) = sheet.look(style.CHECKED["smoothed"]), ax.get_ylim()
+    look, (low, high) = page.sheet_of(ax).look(style.CHECKED["smoothed"]), ax.get_ylim()
     line = look | {"marker": "", "linestyle": "solid"}
-    for step, one in points:
-        ends = [min(max(end, low), high) for end in (one.low, one.high)]
+    beyond = []
+    for step, (value, *whole) in zip(steps, kept.tolist(), strict=True):
+        ends = [min(max(end, low), high) for end in whole]
         ax.plot([step, step], ends, **line, gid="smoothed-interval")
-        for side, (end, whole) in enumerate(zip(ends, (one.low, one.high), strict=True)):
-            mark = EDGE_MARKS["within" if end == whole else "beyond"][side]
-            ax.plot([step], [end], **look | {"marker": mark, "markerfacecolor": look["color"]}, clip_on=False)
-        if low <= one.value <= high:
-            ax.plot([step], [one.value], **look, clip_on=False, gid="smoothed")
-    beyond = [f"{style.number(one.value, '.2g')} at {step:g}" for step, one in points if not low <= one.value <= high]
-    said = LABELS["smoothed"] + (f"; beyond the panel: {', '.join(beyond)}" if beyond else "")
-    return [Line2D([], [], **look, label=said)] if points else []
+        for side in (0, 1):
+            mark = EDGE_MARKS["within" if ends[side] == whole[side] else "beyond"][side]
+            ax.plot([step], [ends[side]], **look | {"marker": mark, "markerfacecolor": look["color"]}, clip_on=False)
+        if low <= value <= high:
+            ax.plot([step], [value], **look, clip_on=False, gid="smoothed")
+        else:
+            beyond.append(f"{style.number(value, '.2g')} at {step:g}")
+    if steps:
+        said = LABELS["smoothed"] + (f"; beyond the panel: {', '.join(beyond)}" if beyond else "")
+        ax.plot([], [], **look, label=said)
 
 
-def _draw_gaps(ax: Axes, curve: _Curve) -> list[Artist]:
+def _draw_gaps(ax: Axes, steps: page.Grid, lost: NDArray[np.bool_]) -> None:
     """Shade the steps over which too few changes are clear of the noise, halfway to their neighbours."""
     low, high = ax.get_xlim()
-    steps = [step for step, _ in curve.points]
-    edges = [low, *(math.sqrt(one * other) for one, other in pairwise(steps)), high]
-    lost = [ends for ends, (_, one) in zip(pairwise(edges), curve.points, strict=True) if one is None]
-    for start, end in lost:
-        ax.axvspan(start, end, **style.NO_SLOPE, zorder=0, gid="gap")
-    return [Patch(**style.NO_SLOPE, label="too few changes of the loss are clear of its noise")] if lost else []
+    edges = [low, *np.sqrt(steps[1:] * steps[:-1]), high]
+    label = "too few changes of the loss are clear of its noise"
+    for start, end in np.array(list(pairwise(edges)))[lost]:
+        ax.axvspan(start, end, **style.NO_SLOPE, zorder=0, gid="gap", label=label)
 
 
 def _draw_levels(ax: Axes) -> None:
@@ -206,16 +181,15 @@ def _draw_levels(ax: Axes) -> None:
     ax.axhline(0.0, **look | {"linestyle": "solid", "color": style.FAINT})
 
 
-def _draw_steps(ax: Axes) -> list[Artist]:
+def _draw_steps(ax: Axes) -> None:
     sheet = page.sheet_of(ax)
     look = sheet.look(style.STEP_LINE)
     for name, step in OPTIMISER_STEPS.items():
-        ax.axvline(step, **look, gid="optimiser")
+        ax.axvline(step, **look, gid="optimiser", label="first step of an optimiser (at most, of gradient descent)")
         ax.annotate(
             name, (step, 0.0), (-4 * sheet.type, 4 * sheet.type), xycoords=("data", "axes fraction"),
             textcoords="offset points", rotation=90, size=sheet.small, ha="right", va="bottom", **style.NAME_TEXT,
         )  # fmt: skip
-    return [Line2D([], [], **look, label="first step of an optimiser (at most, of gradient descent)")]
 
 
 def _draw_kinds(ax: Axes, kinds: Mapping[Kind, int]) -> None:

@@ -7,9 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
-from matplotlib.artist import Artist
 from matplotlib.axes import Axes
-from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from ...identity import plane_of
@@ -27,6 +25,7 @@ PITCH, MIN_PANEL = 4.8, 40.0  # room of a panel: on a screen [inch], and at leas
 HEIGHT = 2.2  # of a panel over a line [inch]
 PLAIN = 3  # digits before or after the point, up to which differences have no power of ten
 LISTED = 4  # settings that differ, in the legend
+IN_EITHER = " in A or B"
 
 
 def comparison_figure(found: SliceComparison, *, width: float | None = None) -> page.Picture:
@@ -34,47 +33,41 @@ def comparison_figure(found: SliceComparison, *, width: float | None = None) -> 
 
     Each cell, or point of a line, is a sample of both; nothing is interpolated. The scale of differences is the same
     to both sides of zero. Where a sample failed in one of the slices, what is drawn of both is hatched. Over a line
-    curves break there, and the gradients themselves are drawn, as their cosine is but a sign.
+    the gradients themselves are drawn, as their cosine is but a sign.
 
     Raises ValueError where the page is too narrow or too wide.
     """
     draw = _draw_maps if plane_of(found.data[0]).rank == 2 else _draw_lines
-    picture, entries = draw(found, width)
+    picture = draw(found, width)
     points = " \N{MULTIPLICATION SIGN} ".join(str(count) for count in reversed(found.data[0]["loss"].shape))
     page.entitle(picture, f"A: {found.a} against B: {found.b} · {points} points")
-    page.finish(picture, [*entries, *_say(found)], heading=_made(found))
+    page.finish(picture, _say(found), heading=_made(found))
     return picture
 
 
-def _draw_maps(found: SliceComparison, width: float | None) -> tuple[page.Picture, list[Artist]]:
+def _draw_maps(found: SliceComparison, width: float | None) -> page.Picture:
     panels = 4 if found.slopes else 3
     sheet = style.Sheet.of(width, pitch=PITCH, columns=2, least=MIN_PANEL)
-    picture = page.Picture(sheet, -(-panels // sheet.columns) * sheet.pitch)
-    axes, both = page.grid(picture, panels, share=True), _where_either_failed(found)
-    entries = _loss_maps(axes, found)
+    picture, axes = page.panels(sheet, panels, share=True)
+    both = _where_either_failed(found)
+    _loss_maps(axes, found)
     _difference_map(axes[2], found)
-    entries += _farthest(axes[2], found)
+    _farthest(axes[2], found)
     if found.cosine is not None:
         _cosine_map(axes[3], found.data[0], found.cosine)
     for ax, dataset in zip(axes, (*found.data, both, both), strict=False):
-        contour.frame(ax, dataset, plane_of(dataset))
+        contour.frame(ax, dataset, plane_of(dataset), IN_EITHER if dataset is both else None)
         page.name_outer(ax, *plane_of(dataset).labels)
-    return picture, [*entries, *_failures(both)]
+    return picture
 
 
-def _loss_maps(axes: list[Axes], found: SliceComparison) -> list[Artist]:
-    """Draw the losses of A and B on one scale; return the legend's entries."""
-    scale, entries = _loss_scale(found), list[Artist]()
+def _loss_maps(axes: list[Axes], found: SliceComparison) -> None:
+    """Draw the losses of A and B on one scale."""
+    scale = style.Scale.of_loss(np.concatenate([one["loss"].to_numpy().ravel() for one in found.data]))
     for ax, letter, name, dataset in zip(axes, "AB", (found.a, found.b), found.data, strict=False):
-        drawn = contour.cell_map(ax, dataset, dataset["loss"].to_numpy(), scale, style.LOSS_MAP)
-        entries += contour.lowest_sample(ax, dataset, f"lowest sample of {letter}")
+        contour.loss_map(ax, dataset, scale)
+        contour.lowest_sample(ax, dataset, f"lowest sample of {letter}")
         page.caption(ax, f"{letter}: {name}")
-        page.colour_bar(ax, drawn, page.loss_name(dataset), scale)
-    return entries
-
-
-def _loss_scale(found: SliceComparison) -> style.Scale:
-    return style.Scale.of_loss(np.concatenate([one["loss"].to_numpy().ravel() for one in found.data]))
 
 
 def _difference_map(ax: Axes, found: SliceComparison) -> None:
@@ -107,21 +100,20 @@ def _cosine_map(ax: Axes, dataset: xr.Dataset, cosine: xr.DataArray) -> None:
     page.colour_bar(ax, drawn, "cosine of gradients", scale)
 
 
-def _farthest(ax: Axes, found: SliceComparison) -> list[Artist]:
-    """Mark where the losses are farthest apart; return the legend's entry."""
+def _farthest(ax: Axes, found: SliceComparison) -> None:
+    """Mark where the losses are farthest apart."""
     if not found.loss.largest.value > 0 or not found.parting:
-        return []
+        return
     look, apart = page.sheet_of(ax).look(style.FARTHEST), found.parting.b - found.parting.a
     at = ([one] for one in found.parting.place.values())
-    (mark,) = ax.plot(*at, **look, zorder=4, label=f"farthest apart, B \N{MINUS SIGN} A: {style.number(apart)}")
-    return [mark]
+    ax.plot(*at, **look, zorder=4, label=f"farthest apart, B \N{MINUS SIGN} A: {style.number(apart)}")
 
 
-def _draw_lines(found: SliceComparison, width: float | None) -> tuple[page.Picture, list[Artist]]:
-    panels, plane = 3 if found.slopes else 2, plane_of(found.data[0])
+def _draw_lines(found: SliceComparison, width: float | None) -> page.Picture:
+    panels, plane, both = 3 if found.slopes else 2, plane_of(found.data[0]), _where_either_failed(found)
     sheet = style.Sheet.of(width, pitch=page.LINE_PITCH)
     picture, axes = page.stack(sheet, [max(page.FLATTEST, sheet.zoom) * HEIGHT] * panels)
-    entries = _curves(axes[0], found, [one["loss"].to_numpy() for one in found.data])
+    _curves(axes[0], found, [one["loss"].to_numpy() for one in found.data])
     page.name_axes(axes[0], y=page.loss_name(found.data[0]))
     look = sheet.look(style.stroke(found.points))
     values, power = _in_powers(found)
@@ -131,42 +123,31 @@ def _draw_lines(found: SliceComparison, width: float | None) -> tuple[page.Pictu
         _curves(axes[2], found, [box_slopes(one)[:, 0] for one in found.data])
         page.name_axes(axes[2], y=f"slope [{found.loss_unit or 'loss'} per side]")
     for ax in axes:
-        ax.set_xlim(float(plane.lower[0]), float(plane.upper[0]))
-        page.dress(ax, plane)
+        contour.frame(ax, both, plane, IN_EITHER)
     for ax in axes[1:]:
         ax.axhline(0, color=style.FAINT, linewidth=0.8 * sheet.weight, zorder=0.5)
     page.name_axes(axes[-1], plane.labels[0])
     picture.align_ylabels(axes)
-    return picture, [*entries, *_failures(_where_either_failed(found))]
+    return picture
 
 
-def _curves(ax: Axes, found: SliceComparison, values: list[Any]) -> list[Artist]:
-    """Draw a curve for each slice; return the legend's entries."""
-    sheet, entries, u = page.sheet_of(ax), list[Artist](), found.data[0]["u"].to_numpy()
+def _curves(ax: Axes, found: SliceComparison, values: list[Any]) -> None:
+    """Draw a curve for each slice."""
+    sheet, u = page.sheet_of(ax), found.data[0]["u"].to_numpy()
     for letter, name, curve, look in zip("AB", (found.a, found.b), values, style.PAIR, strict=True):
-        entries += ax.plot(u, curve, **sheet.look(style.stroke(len(u)) | look), label=f"{letter}: {name}")
-    return entries
+        ax.plot(u, curve, **sheet.look(style.stroke(len(u)) | look), label=f"{letter}: {name}")
 
 
 def _where_either_failed(found: SliceComparison) -> xr.Dataset:
-    """Return slice A with the status of B where A has a loss: what is hatched in a map of both."""
+    """Return slice A with the status of B where A has a loss: what is hatched in a panel of both."""
     ours, theirs = (one["status"] for one in found.data)
     return found.data[0].assign(status=ours.copy(data=np.where(has_loss(ours), theirs, ours)))
 
 
-def _failures(both: xr.Dataset) -> list[Patch]:
-    """Return the legend's entries of the failures in either slice; over a line, whose curves break, without a sign."""
-    entries = page.failure_key(both)
-    for one in entries:
-        kind, _, count = str(one.get_label()).rpartition(": ")
-        one.set(label=f"{kind} in A or B: {count}", visible=both["loss"].ndim == 2)
-    return entries
-
-
-def _say(found: SliceComparison) -> list[Patch]:
-    """Return legend entries without a sign: the chief numbers, and the settings that differ."""
+def _say(found: SliceComparison) -> list[str]:
+    """Say the chief numbers, and the settings that differ."""
     if not found.compared:
-        return [Patch(visible=False, label="no point has a loss in both")]
+        return ["no point has a loss in both"]
     percent = style.number(100 * found.loss.shares["median"].value, ".2g")
     unit = f" {found.loss_unit}" if found.loss_unit else ""
     said = [f"median difference: {style.number(found.loss.median.value)}{unit}, {percent} % of A's range"]
@@ -180,7 +161,7 @@ def _say(found: SliceComparison) -> list[Patch]:
     settings = [f"{name}: {a} in A, {b} in B" for name, (a, b) in found.shared.items()]
     rest = len(found.differing) - min(len(settings), LISTED)
     more = [f"and {rest} more settings differ"] if rest else []
-    return [Patch(visible=False, label=text) for text in (*said, *settings[:LISTED], *more)]
+    return [*said, *settings[:LISTED], *more]
 
 
 def _interval(one: Estimate) -> str:

@@ -69,8 +69,8 @@ def episode_figure(
         shown += replay.frames(replace(episode, parts=goals), [0], marked=False)
         said.append("target")
     sheet = style.Sheet.of(width, pitch=PITCH, columns=len(shown), least=MIN_FRAME)
-    picture = page.Picture(sheet, -(-len(shown) // sheet.columns) * sheet.pitch)
-    for ax, pixels, text in zip(page.grid(picture, len(shown)), shown, said, strict=True):
+    picture, axes = page.panels(sheet, len(shown))
+    for ax, pixels, text in zip(axes, shown, said, strict=True):
         ax.imshow(pixels, interpolation="antialiased", aspect="auto")
         ax.set_box_aspect(pixels.shape[0] / pixels.shape[1])
         ax.set(xticks=[], yticks=[])
@@ -79,7 +79,7 @@ def episode_figure(
     shot = replay.Shot.of(episode.viewpoint(), replay.HEIGHT)
     _draw_scale(picture.axes[0], shot)
     _write(picture, caption, f"Scale: {style.number(shot.bar)} m at the middle of the view; what is nearer is larger.")
-    page.finish(picture, [])
+    page.finish(picture)
     return picture
 
 

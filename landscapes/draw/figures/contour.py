@@ -7,12 +7,10 @@ from typing import Any, cast
 import numpy as np
 import torch
 import xarray as xr
-from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.collections import QuadMesh
 from matplotlib.colors import Colormap
-from matplotlib.lines import Line2D
-from matplotlib.patches import Patch, PathPatch
+from matplotlib.patches import PathPatch
 from matplotlib.path import Path
 from numpy.typing import NDArray
 
@@ -49,33 +47,43 @@ def landscape_figure(
     if plane.rank != 2:
         raise ValueError(f"landscape_figure draws planes; got a slice of rank {plane.rank}, so use profile_figure")
     panels = 1 + ("grad" in dataset) + (floor is not None)
-    sheet = style.Sheet.of(width, pitch=PITCH, panels=panels)
-    picture = page.Picture(sheet, -(-panels // sheet.columns) * sheet.pitch)
-    axes = page.grid(picture, panels, share=True)
-    entries = loss_panel(axes[0], in_unit(dataset))
-    entries += [] if floor is None else floor_panel(axes[1], dataset, floor)
-    entries += arrow_panel(axes[-1], dataset) if "grad" in dataset else []
+    picture, axes = page.panels(style.Sheet.of(width, pitch=PITCH, panels=panels), panels, share=True)
+    loss_panel(axes[0], in_unit(dataset))
+    if floor is not None:
+        floor_panel(axes[1], dataset, floor)
+    if "grad" in dataset:
+        arrow_panel(axes[-1], dataset)
     for ax in axes:
         frame(ax, dataset, plane)
         page.name_outer(ax, *plane.labels)
     page.head(picture, axes[0], dataset)
-    page.finish(picture, [*entries, *page.failure_key(dataset), *page.sampling_key(dataset)])
+    page.finish(picture, page.sampling_key(dataset))
     return picture
 
 
-def frame(ax: Axes, dataset: xr.Dataset, plane: Plane) -> None:
-    """Give a panel over a slice its limits, its ticks and its failures."""
-    ax.set(xlim=_limits(plane, 0), ylim=_limits(plane, 1), box_aspect=1)
+def frame(ax: Axes, dataset: xr.Dataset, plane: Plane, within: str | None = "") -> None:
+    """Give a panel limits, ticks and its failures, which the legend counts, `within` it, unless that is None."""
+    if plane.rank == 2:
+        ax.set(xlim=_limits(plane, 0), ylim=_limits(plane, 1), box_aspect=1)
+        page.name_axes(ax, y=plane.labels[1])
+    else:
+        ax.set_xlim(float(plane.lower[0]), float(plane.upper[0]))
     page.dress(ax, plane)
-    page.name_axes(ax, y=plane.labels[1])
-    for kind, look in style.STATUS_LOOKS.items():
-        _shade(ax, dataset, kind, look)
+    for kind in (*style.FAILURES, Status.MISSING):
+        shade(ax, dataset, kind, None if within is None else page.lost_samples(dataset, kind, within))
 
 
-def _shade(ax: Axes, dataset: xr.Dataset, kind: Status, look: dict[str, Any]) -> None:
-    """Shade the cells of the samples that ended in one way."""
-    if (where := own_cells(dataset)["status"].to_numpy() == kind).any():
-        ax.add_patch(cells_patch(*cell_edges(dataset), where, **look, zorder=1.5, gid=kind.name))
+def shade(ax: Axes, dataset: xr.Dataset, kind: Status, label: str | None) -> None:
+    """Shade the cells, or over a line the stretches, of the samples that ended in one way."""
+    where = own_cells(dataset)["status"].to_numpy() == kind
+    if not where.any():
+        return
+    look = style.STATUS_LOOKS[kind] | {"gid": kind.name, "label": label}
+    if where.ndim == 2:
+        ax.add_patch(cells_patch(*cell_edges(dataset), where, **look, zorder=1.5))
+    else:
+        u, look["transform"] = dataset["u"].to_numpy(), ax.get_xaxis_transform()
+        ax.add_patch(cells_patch(_edges(u, u[0], u[-1]), np.array([0.0, 1.0]), where[None], **look, zorder=0.6))
 
 
 def cells_patch(u: Grid, v: Grid, where: NDArray[np.bool_], **look: Any) -> PathPatch:
@@ -88,24 +96,25 @@ def cells_patch(u: Grid, v: Grid, where: NDArray[np.bool_], **look: Any) -> Path
     return PathPatch(path, antialiased=False, **look)
 
 
-def loss_panel(ax: Axes, dataset: xr.Dataset, scale: style.Scale | None = None) -> list[Artist]:
-    """Draw the loss map and its lowest sample, on the slice's own scale unless given; return the legend's entries."""
+def loss_panel(ax: Axes, dataset: xr.Dataset, scale: style.Scale | None = None) -> None:
+    """Draw the loss map and its lowest sample, on the slice's own scale unless given."""
     loss_map(ax, dataset, scale or style.Scale.of_loss(dataset["loss"].to_numpy()))
-    return lowest_sample(ax, dataset)
+    lowest_sample(ax, dataset)
 
 
-def lowest_sample(ax: Axes, dataset: xr.Dataset, said: str = "lowest sample") -> list[Artist]:
-    """Mark the lowest sample on a map, with what is said of it; return the legend's entry, none without a loss."""
+def lowest_sample(ax: Axes, dataset: xr.Dataset, said: str = "lowest sample") -> None:
+    """Mark the lowest sample on a map or a line, with what is said of it."""
     loss = dataset["loss"].to_numpy()
-    u, v = dataset["u"].to_numpy(), dataset["v"].to_numpy()
     if not np.isfinite(loss).any():
-        return []
-    if np.nanmin(loss) == np.nanmax(loss):
-        return [Line2D([], [], linestyle="none", label=f"every sample: {style.number(np.nanmin(loss))}")]
-    row, column = np.unravel_index(np.nanargmin(loss), loss.shape)
+        return
+    lowest = np.nanargmin(loss)
+    if loss.ndim == 2 and loss.ravel()[lowest] == np.nanmax(loss):
+        ax.plot([], [], linestyle="none", label=f"every sample: {style.number(loss.ravel()[lowest])}")
+        return
+    place = np.meshgrid(dataset["u"], dataset["v"]) if loss.ndim == 2 else (dataset["u"].to_numpy(), loss)
     look = page.sheet_of(ax).look(style.LOWEST_MARK)
-    (lowest,) = ax.plot(u[column], v[row], **look, label=f"{said}: {style.number(loss[row, column])}")
-    return [lowest]
+    label = f"{said}: {style.number(loss.ravel()[lowest])}"
+    ax.plot(*(at.ravel()[lowest] for at in place), **look, zorder=4 if loss.ndim == 1 else 2, label=label)
 
 
 def loss_map(ax: Axes, dataset: xr.Dataset, scale: style.Scale) -> None:
@@ -121,27 +130,23 @@ def cell_map(ax: Axes, dataset: xr.Dataset, values: Grid, scale: style.Scale, co
     )
 
 
-def floor_panel(ax: Axes, dataset: xr.Dataset, floor: xr.Dataset) -> list[Artist]:
-    """Draw the standard deviation between replicas at every sample; return the legend's entries.
-
-    Hatched are samples that have a loss, while a replica has none there.
-    """
+def floor_panel(ax: Axes, dataset: xr.Dataset, floor: xr.Dataset) -> None:
+    """Draw the standard deviation between replicas at every sample; hatched are those that have none in a replica."""
     unit = unit_of(dataset["loss"].to_numpy())
     deviation = floor["deviation"].transpose("v", "u").to_numpy() / unit
     scale = style.Scale.of_deviation(deviation)
     mesh = cell_map(ax, dataset, deviation, scale, style.FLOOR_MAP)
     page.colour_bar(ax, mesh, labelled("numerical floor", page.loss_unit(in_unit(dataset))), scale)
     lost = np.isfinite(dataset["loss"].to_numpy()) & ~np.isfinite(deviation)
-    if not lost.any():
-        return []
-    look = style.STATUS_LOOKS[Status.ERROR]
-    ax.add_patch(cells_patch(*cell_edges(dataset), lost, **look, zorder=1.5))
-    return [Patch(**look, label=f"no loss in a replica: {int(lost.sum())} of {page.evaluated(dataset)}")]
+    if lost.any():
+        label = f"no loss in a replica: {int(lost.sum())} of {page.evaluated(dataset)}"
+        look = style.STATUS_LOOKS[Status.ERROR] | {"label": label}
+        ax.add_patch(cells_patch(*cell_edges(dataset), lost, **look, zorder=1.5))
 
 
-def arrow_panel(ax: Axes, dataset: xr.Dataset, scale: style.Scale | None = None) -> list[Artist]:
-    """Draw the negated gradients as arrows, on the slice's own scale unless given; return the legend's entries."""
-    plane = plane_of(dataset)
+def arrow_panel(ax: Axes, dataset: xr.Dataset, scale: style.Scale | None = None) -> None:
+    """Draw the negated gradients as arrows, on the slice's own scale unless given."""
+    plane, asked = plane_of(dataset), with_gradients(dataset)
     rows, columns = (arrows_along(dataset, name) for name in ("v", "u"))
     slope = slopes(dataset)
     size, label = magnitude(slope, plane, page.loss_unit(dataset))
@@ -160,15 +165,11 @@ def arrow_panel(ax: Axes, dataset: xr.Dataset, scale: style.Scale | None = None)
     )  # fmt: skip
     bar = page.colour_bar(ax, quiver, label, scale)
     bar.ax.set_visible(bool(seen.any()))  # hidden rather than left out, so that both panels keep their width
-    entries: list[Artist] = [*page.gradient_key(dataset)]
-    if entries:
-        _shade(ax, dataset, Status.NO_GRADIENT, style.NO_GRADIENT_LOOK)
-    if not flat.any():
-        return entries
-    look = page.sheet_of(ax).look(style.FLAT_MARK)
-    ax.plot(u[flat[at]], v[flat[at]], **look, zorder=2.5)
-    asked = page.evaluated(with_gradients(dataset))
-    return [*entries, Line2D([], [], **look, label=f"gradient exactly zero: {int(flat.sum())} of {asked}")]
+    shade(ax, dataset, Status.NO_GRADIENT, page.lost_samples(asked, Status.NO_GRADIENT))
+    if flat.any():
+        look = page.sheet_of(ax).look(style.FLAT_MARK)
+        said = f"gradient exactly zero: {int(flat.sum())} of {page.evaluated(asked)}"
+        ax.plot(u[flat[at]], v[flat[at]], **look, zorder=2.5, label=said)
 
 
 def slopes(dataset: xr.Dataset) -> Grid:

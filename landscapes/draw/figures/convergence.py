@@ -6,22 +6,19 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.artist import Artist
 from matplotlib.axes import Axes
-from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
 
 from .. import style
 from . import page
 
 if TYPE_CHECKING:
     from ....studies.convergence import ConvergenceRecord, Move, SettingConvergence
-    from ....studies.samples import Bootstrap
 
 PITCH, SHAPE = 5.2, 0.8  # room of a panel on a screen [inch]; its height, against its width
 COLUMN, FLAT = 3, 0.34  # panels of that shape that a column of a page has room for, and the shape of more
 ROW = 0.07  # of a flat panel's width: what a name next to it takes
 REACH = 1.8  # what the axes reach beyond the marks, as a ratio
+KINDS = {"p95": ("95th percentile", 0.45), "median": ("median over the points", 1.0)}  # of moves, and their opacity
 MIN_MOVE = 1e-16  # of the spread: what is drawn on the lower edge of rounding
 WIDTHS = {
     "dt": "time step [s]",
@@ -44,69 +41,49 @@ def convergence_figure(found: ConvergenceRecord, *, width: float | None = None) 
     drawn = [one for one in found.settings if one.setting in WIDTHS and one.moves]
     count = len(drawn) + bool(found.distributions)
     sheet = style.Sheet.of(width, pitch=PITCH, columns=min(2, max(1, count)), panels=max(1, count))
-    picture = page.Picture(sheet, sheet.width)
-    axes = page.grid(picture, max(1, count))
+    picture, axes = page.panels(sheet, max(1, count))
     flat = sheet.columns == 1 and count > COLUMN
     for ax in axes:
         ax.set_box_aspect(FLAT if flat else SHAPE)
-    entries: dict[str, Artist] = {}
     for ax, one in zip(axes, drawn, strict=False):
-        _draw_setting(ax, one, found, entries)
+        _draw_setting(ax, one, found)
     if found.distributions:
-        _draw_distributions(axes[-1], found, entries)
+        _draw_distributions(axes[-1], found)
         axes[-1].set_box_aspect(max(FLAT, ROW * len(found.distributions.compared)) if flat else SHAPE)
     page.entitle(picture, f"{found.env} · self-convergence · {found.points} points")
-    page.finish(picture, list(entries.values()), columns=3, heading=" · ".join(page.made_by(found)))
+    look = {"color": style.QUIET, "marker": "o", "linestyle": "solid", "linewidth": 1.0}
+    shown = [page.sign(sheet, name, look | {"alpha": alpha}) for name, alpha in KINDS.values() if drawn]
+    page.finish(picture, shown, columns=3, heading=" · ".join(page.made_by(found)))
     return picture
 
 
-def _draw_setting(ax: Axes, one: SettingConvergence, found: ConvergenceRecord, entries: dict[str, Artist]) -> None:
+def _draw_setting(ax: Axes, one: SettingConvergence, found: ConvergenceRecord) -> None:
     page.dress(ax)
-    sheet, look = page.sheet_of(ax), style.VARIANTS[one.setting]
-    for kind, alpha in (("p95", 0.45), ("median", 1.0)):
-        name = "95th percentile" if kind == "p95" else "median over the points"
-        _draw_moves(ax, one.moves, kind, look | {"alpha": alpha})
-        mark = {"color": style.QUIET, "marker": look["marker"], "linestyle": "solid", "alpha": alpha, "linewidth": 1.0}
-        entries.setdefault(kind, Line2D([], [], **sheet.look(mark), label=name))
-    _limit(ax, one)
-    _draw_design(ax, one, entries)
-    _draw_levels(ax, one, found, entries)
-    for axis in (ax.xaxis, ax.yaxis):  # whose ends are known now
+    for kind, (_, alpha) in KINDS.items():
+        _draw_moves(ax, one.moves, kind, style.VARIANTS[one.setting] | {"alpha": alpha})
+    ends = page.ends_of(move_ for move in one.moves for move_ in (move.median, move.p95))
+    values = [*np.maximum(ends[np.isfinite(ends)], MIN_MOVE)] or [MIN_MOVE, 1.0]
+    widths = [move.width for move in one.moves]
+    ax.set(xlim=(min(widths) / REACH**0.5, max(widths) * REACH**0.5), ylim=(min(values) / REACH, max(values) * REACH))
+    _draw_design(ax, one)
+    _draw_levels(ax, one, found)
+    for axis in (ax.xaxis, ax.yaxis):
         page.log_axis(axis)
     page.name_axes(ax, WIDTHS[one.setting], "loss moves [share of the spread]" if found.spread else "loss moves")
     page.caption(ax, _title(one))
 
 
 def _draw_moves(ax: Axes, moves: Sequence[Move], kind: str, look: dict[str, object]) -> None:
-    sheet = page.sheet_of(ax)
-    known: list[tuple[float, Bootstrap]] = [(move.width, getattr(move, kind)) for move in moves]
-    drawn = [(width, one) for width, one in known if one.value is not None]
-    for width, one in drawn:
-        low, high = (end or one.value or 0.0 for end in (one.low, one.high))
-        ax.plot(
-            [width, width], [max(low, MIN_MOVE), max(high, MIN_MOVE)], **sheet.look(style.INTERVAL_LINE), gid="interval"
-        )
-    values = [max(one.value or 0.0, MIN_MOVE) for _, one in drawn]
-    ax.plot(
-        [width for width, _ in drawn],
-        values,
-        **sheet.look(style.VARIANT_MARK | look | {"linestyle": "solid"}),
-        gid=kind,
-    )
+    ends, widths = page.ends_of(getattr(move, kind) for move in moves), np.array([move.width for move in moves])
+    known = np.isfinite(ends[:, 0])
+    ends = np.maximum(np.where(np.isfinite(ends), ends, ends[:, :1]), MIN_MOVE)
+    for width, (_, low, high) in zip(widths[known], ends[known], strict=True):
+        page.interval(ax, [width, width], [low, high], label=None)
+    line = page.sheet_of(ax).look(style.VARIANT_MARK | look | {"linestyle": "solid"})
+    ax.plot(widths[known], ends[known, 0], **line, gid=kind)
 
 
-def _limit(ax: Axes, one: SettingConvergence) -> None:
-    """Span the marks, on logarithmic axes."""
-    ends = [end for move in one.moves for one in (move.median, move.p95) for end in (one.value, one.low, one.high)]
-    values = [max(end, MIN_MOVE) for end in ends if end is not None] or [MIN_MOVE, 1.0]
-    widths = [move.width for move in one.moves]
-    ax.set_xlim(min(widths) / REACH**0.5, max(widths) * REACH**0.5)
-    ax.set_ylim(min(values) / REACH, max(values) * REACH)
-    for axis in (ax.xaxis, ax.yaxis):
-        style.log_axis(axis)
-
-
-def _draw_design(ax: Axes, one: SettingConvergence, entries: dict[str, Artist]) -> None:
+def _draw_design(ax: Axes, one: SettingConvergence) -> None:
     """Draw the slope of the designed order, and those within the interval of the observed one, through the medians."""
     known = [(move.width, move.median.value) for move in one.moves if move.median.value]
     if not known:
@@ -116,15 +93,14 @@ def _draw_design(ax: Axes, one: SettingConvergence, entries: dict[str, Artist]) 
     span = np.geomspace(*ax.get_xlim(), 32)
     if one.order.low is not None and one.order.high is not None and one.verdict == "converges":
         edges = [height * (span / middle) ** order for order in (one.order.low, one.order.high)]
-        ax.fill_between(span, *edges, color=style.BAND[0], linewidth=0.0, zorder=0, gid="observed")
-        entries.setdefault("observed", Patch(color=style.BAND[0], label="observed order, 95 %"))
+        look = {"color": style.BAND[0], "linewidth": 0.0, "zorder": 0, "gid": "observed"}
+        ax.fill_between(span, *edges, **look, label="observed order, 95 %")
     if one.designed is not None:
         look = page.sheet_of(ax).look({"color": style.INK, "linewidth": 0.9, "linestyle": (0, (5, 2)), "zorder": 1})
-        ax.plot(span, height * (span / middle) ** one.designed, **look, gid="design", scaley=False, scalex=False)
-        entries.setdefault("design", Line2D([], [], **look, label="designed order"))
+        ax.plot(span, height * (span / middle) ** one.designed, **look, gid="design", label="designed order")
 
 
-def _draw_levels(ax: Axes, one: SettingConvergence, found: ConvergenceRecord, entries: dict[str, Artist]) -> None:
+def _draw_levels(ax: Axes, one: SettingConvergence, found: ConvergenceRecord) -> None:
     """Draw the floor, what the rule allows, and what Richardson's limit leaves at the reference."""
     sheet, off = page.sheet_of(ax), found.rule.off.value
     left = next((one.median.value for one in found.remainders if one.name == found.reference), None)
@@ -137,9 +113,8 @@ def _draw_levels(ax: Axes, one: SettingConvergence, found: ConvergenceRecord, en
         low, high = ax.get_ylim()
         if value and low / 30 < value < 30 * high:
             look = sheet.look({"color": style.QUIET, "linewidth": 1.0, "linestyle": dashes, "zorder": 0.5})
-            ax.axhline(value, **look, gid=gid)
+            ax.axhline(value, **look, gid=gid, label=said)
             ax.set_ylim(min(low, value / REACH), max(high, value * REACH))
-            entries.setdefault(gid, Line2D([], [], **look, label=said))
 
 
 def _title(one: SettingConvergence) -> str:
@@ -150,23 +125,17 @@ def _title(one: SettingConvergence) -> str:
     return f"{one.setting}: {one.verdict}, order {style.number(order.value, '.2g')} ({ends})"
 
 
-def _draw_distributions(ax: Axes, found: ConvergenceRecord, entries: dict[str, Artist]) -> None:
+def _draw_distributions(ax: Axes, found: ConvergenceRecord) -> None:
     """Draw Wasserstein's distance of each fidelity's losses over neighbourhoods from the reference's, and the noise."""
     apart = found.distributions
     assert apart is not None
     page.dress(ax)
-    sheet = page.sheet_of(ax)
-    look = sheet.look(style.VARIANT_MARK | {"color": style.LOSS_LINE, "marker": "o"})
-    for place, one in enumerate(apart.compared):
-        distance = one.distance.wasserstein
-        if distance.value is None:
-            continue
-        ends = [distance.value if end is None else end for end in (distance.low, distance.high)]
-        ax.plot(ends, [place, place], **sheet.look(style.INTERVAL_LINE), gid="interval")
-        ax.plot([distance.value], [place], **look, gid="distance")
+    ends = page.ends_of(one.distance.wasserstein for one in apart.compared)
+    look = style.VARIANT_MARK | {"color": style.LOSS_LINE, "marker": "o"}
+    page.draw_rows(ax, np.where(np.isfinite(ends), ends, ends[:, :1]), look, "", gid="distance")
     if limit := apart.noise_limit["wasserstein"]:
-        ax.axvspan(0, limit, color=style.BAND[0], zorder=0, gid="noise")
-        entries["noise"] = Line2D([], [], color=style.BAND[0], linewidth=5, label="noise: the reference twice (95 %)")
+        noise = {"color": style.BAND[0], "zorder": 0, "gid": "noise", "label": "noise: the reference twice (95 %)"}
+        ax.axvspan(0, limit, **noise)
     ax.set_yticks(range(len(apart.compared)), [one.name.removeprefix("reference-") for one in apart.compared])
     ax.set_xlim(left=0)
     ax.margins(y=0.15)

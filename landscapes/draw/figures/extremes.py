@@ -7,14 +7,9 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.artist import Artist
 from matplotlib.axes import Axes
-from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
-from matplotlib.ticker import FixedLocator
 from numpy.typing import NDArray
 
-from ...objective import Status
 from ...space import labelled
 from .. import style
 from . import contour, page
@@ -31,7 +26,7 @@ NAMES = {
     "not judged": "finite, not judged",
     "refused": "refused",
 }  # of the outcomes of `studies.stability`
-NAMES |= {kind.name: name for kind, name in style.FAILURES.items()} | {Status.NO_GRADIENT.name: style.NO_GRADIENT}
+NAMES |= {kind.name: name for kind, name in style.ENDED.items()}
 REACH = 1.35  # what the axis of factors reaches beyond the outermost marks, as a ratio
 
 Grid = NDArray[np.float64]
@@ -48,53 +43,48 @@ def extremes_figure(found: ExtremesRecord, *, width: float | None = None) -> pag
     rows = [[one for one in found.maps if one.precision == precision] for precision in found.precisions]
     columns = 1 + max(map(len, rows))
     sheet = style.Sheet.of(width, pitch=PITCH, columns=columns, least=MIN_PANEL)
-    picture = page.Picture(sheet, len(rows) * math.ceil(columns / sheet.columns) * sheet.pitch)
-    axes = iter(page.grid(picture, sum(1 + len(maps) for maps in rows)))
-    entries: dict[str, Artist] = {}
+    picture, axes = page.panels(sheet, sum(1 + len(maps) for maps in rows))
+    panels = iter(axes)
     for precision, maps in zip(found.precisions, rows, strict=True):
-        limits = [one for one in found.limits if one.precision == precision]
-        entries |= _draw_errors(next(axes), limits, found.tolerance, precision)
+        ax = next(panels)
+        _draw_errors(ax, [one for one in found.limits if one.precision == precision], found.tolerance)
+        page.caption(ax, f"{precision}: errors before it fails")
         for one in maps:
-            entries |= _draw_map(next(axes), one)
+            _draw_map(next(panels), one)
     page.entitle(picture, f"{found.env} · {found.fidelity} · extremes · {found.points} points")
-    page.finish(
-        picture,
-        list(entries.values()),
-        columns=4,
-        heading=" · ".join(
-            [f"judged by {found.reference}", *page.made_by(found, "device", "engine", "created"), found.command]
-        ),
-    )
+    made = page.made_by(found, "device", "engine", "created")
+    page.finish(picture, columns=4, heading=" · ".join([f"judged by {found.reference}", *made, found.command]))
     return picture
 
 
-def _draw_errors(ax: Axes, limits: Sequence[Limit], tolerance: float, precision: str) -> dict[str, Artist]:
-    """Draw the error of each setting's stable values over the factor it is changed by; return the legend's entries."""
-    sheet, entries = page.sheet_of(ax), dict[str, Artist]()
+def _draw_errors(ax: Axes, limits: Sequence[Limit], tolerance: float) -> None:
+    """Draw the error of each setting's stable values over the factor it is changed by."""
+    sheet = page.sheet_of(ax)
     page.dress(ax)
     drawn = [limit for limit in limits if _has_factor(limit)]
     looks = _looks(list(dict.fromkeys(limit.setting for limit in drawn)))
+    cross = sheet.look({"marker": "x", "markersize": 6.0, "markeredgewidth": 1.4, "linestyle": "none"})
     for limit in drawn:
-        look = sheet.look({"linewidth": 1.1, **style.VARIANT_MARK, "markersize": 5.0, **looks[limit.setting]})
+        look = {"linewidth": 1.1, **style.VARIANT_MARK, "markersize": 5.0, **looks[limit.setting], "linestyle": "solid"}
         factors = [cell.values[0] / limit.base for cell in limit.scanned]
         errors = [_error(cell) for cell in limit.scanned]
-        ax.plot(factors, errors, **look | {"linestyle": "solid"}, gid=limit.setting, clip_on=False)
-        entries[limit.setting] = Line2D([], [], **look | {"linestyle": "solid"}, label=limit.setting)
+        ax.plot(factors, errors, **sheet.look(look), gid=limit.setting, clip_on=False, label=limit.setting)
         if limit.failed is not None:
-            cross = sheet.look({"marker": "x", "markersize": 6.0, "markeredgewidth": 1.4, "linestyle": "none"})
             at, top = [limit.failed / limit.base], [HIGHEST]
-            ax.plot(at, top, color=look["color"], **cross, gid="failed", clip_on=False, zorder=5)
-            entries["failed"] = Line2D([], [], color=style.INK, **cross, label="first failure, on the edge")
+            ax.plot(at, top, color=looks[limit.setting]["color"], **cross, gid="failed", clip_on=False, zorder=5)
+    if any(limit.failed is not None for limit in drawn):
+        ax.plot([], [], color=style.INK, **cross, label="first failure, on the edge")
     if drawn:
         reach = [cell.values[0] / limit.base for limit in drawn for cell in limit.scanned]
         ax.set_xlim(min(reach) / REACH, max(reach) * REACH)
     ax.set_ylim(LOWEST, HIGHEST)
     for axis in (ax.xaxis, ax.yaxis):
         page.log_axis(axis)
-    ax.yaxis.set_major_locator(FixedLocator([10.0**power for power in range(-4, 5, 2)]))
-    _dress_errors(ax, tolerance, precision)
-    line = sheet.look(style.REFERENCE_LINE)
-    return entries | {"tolerance": Line2D([], [], **line, label=f"accurate below {100 * tolerance:g} %")}
+    label = f"accurate below {100 * tolerance:g} %"
+    ax.axhline(100 * tolerance, **sheet.look(style.REFERENCE_LINE), label=label)
+    ax.axvline(1.0, color=style.FAINT, linewidth=0.8 * sheet.weight, zorder=0)
+    ax.set_box_aspect(1)
+    page.name_axes(ax, "times what the scene has", "loss error, 95 % of the points [% of the spread]")
 
 
 def _error(cell: Cell) -> float:
@@ -102,14 +92,6 @@ def _error(cell: Cell) -> float:
     if not cell.stable or cell.error is None:
         return math.nan
     return float(np.clip(100 * cell.error, LOWEST, HIGHEST))
-
-
-def _dress_errors(ax: Axes, tolerance: float, precision: str) -> None:
-    ax.axhline(100 * tolerance, **page.sheet_of(ax).look(style.REFERENCE_LINE))
-    ax.axvline(1.0, color=style.FAINT, linewidth=0.8 * page.sheet_of(ax).weight, zorder=0)
-    ax.set_box_aspect(1)
-    page.name_axes(ax, "times what the scene has", "loss error, 95 % of the points [% of the spread]")
-    page.caption(ax, f"{precision}: errors before it fails")
 
 
 def _has_factor(limit: Limit) -> bool:
@@ -125,25 +107,22 @@ def _looks(settings: Sequence[str]) -> dict[str, dict[str, object]]:
     return {name: known[name] if name in known else next(others) for name in settings}
 
 
-def _draw_map(ax: Axes, found: StabilityMap) -> dict[str, Artist]:
-    """Draw how each cell ended, the boundary and the base; return the legend's entries."""
-    sheet, entries = page.sheet_of(ax), dict[str, Artist]()
+def _draw_map(ax: Axes, found: StabilityMap) -> None:
+    """Draw how each cell ended, the boundary and the base."""
+    sheet = page.sheet_of(ax)
     outcomes = np.array([cell.outcome for cell in found.cells]).reshape(len(found.ys), len(found.xs))
     edges = _edges(found.xs), _edges(found.ys)
-    for outcome in [name for name in style.OUTCOMES if (outcomes == name).any()]:
-        look = style.OUTCOMES[outcome]
-        ax.add_patch(contour.cells_patch(*edges, outcomes == outcome, **look, gid=outcome))
-        entries[outcome] = Patch(**look, label=NAMES[outcome])
+    for outcome, look in style.OUTCOMES.items():
+        if (where := outcomes == outcome).any():
+            ax.add_patch(contour.cells_patch(*edges, where, **look, gid=outcome, label=NAMES[outcome]))
     lines = {"limit of accuracy, bisected": found.accurate_boundary, "limit of stability, bisected": found.boundary}
     for label, ends in lines.items():
         if ends:
             y, low, high = np.array(sorted(ends)).T
-            line = sheet.look(style.BOUNDARIES[ends is found.boundary])
-            ax.plot(np.sqrt(low * high) if low.min() > 0 else (low + high) / 2, y, **line, gid=label, clip_on=False)
-            entries[label] = Line2D([], [], **line, label=label)
+            line = sheet.look(style.BOUNDARIES[ends is found.boundary]) | {"gid": label, "label": label}
+            ax.plot(np.sqrt(low * high) if low.min() > 0 else (low + high) / 2, y, **line, clip_on=False)
     star = sheet.look(style.LOWEST_MARK)
-    ax.plot(*([one] for one in found.base), **star, gid="base", zorder=4)
-    entries["base"] = Line2D([], [], **star, label="what the scene has")
+    ax.plot(*([one] for one in found.base), **star, gid="base", zorder=4, label="what the scene has")
     page.dress(ax)
     for axis, limits, values in ((ax.xaxis, edges[0], found.xs), (ax.yaxis, edges[1], found.ys)):
         (ax.set_xlim if axis is ax.xaxis else ax.set_ylim)(float(limits[0]), float(limits[-1]))
@@ -152,7 +131,6 @@ def _draw_map(ax: Axes, found: StabilityMap) -> dict[str, Artist]:
     ax.set_box_aspect(1)
     page.name_axes(ax, *map(labelled, (found.x, found.y), found.units))
     page.caption(ax, f"{found.precision}: {found.x} against {found.y}")
-    return entries
 
 
 def _edges(values: Sequence[float]) -> Grid:

@@ -6,9 +6,7 @@ import math
 from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.artist import Artist
 from matplotlib.axes import Axes
-from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 from .. import style
@@ -26,6 +24,7 @@ BINS = 48  # of the density
 DECADES = 12  # that the axis spans on each side, at most
 NARROWEST = 0.09  # half the linear part, by all decades: its ends have names
 TICKS = 4  # on each side
+WITHIN = "at most so far off"
 REACH = 3.0  # what the axis reaches beyond the marks, as a ratio
 
 
@@ -51,15 +50,14 @@ def hessian_figure(found: Hessian, *, width: float | None = None) -> page.Pictur
         ax.set_xscale("symlog", linthresh=linear, linscale=max(0.6, NARROWEST * decades))
         ax.set_xlim(-below, end)
         _mark(ax, linear, end)
-    entries = _draw_eigenvalues(axes[0], found)
+    _draw_eigenvalues(axes[0], found)
     if sampled:
         _draw_density(axes[1], found, linear, end)
     unit = f"loss unit{f', {found.loss_unit}' if found.loss_unit else ''}"
     page.name_axes(axes[-1], f"eigenvalue [{unit}; the box is 1 wide along every parameter]")
     page.entitle(picture, f"{found.env} · {found.fidelity} · Hessian at {found.through}: {found.kind}")
     page.remark(axes[0], _remark(found))
-    heading = " · ".join(page.made_by(found))
-    page.finish(picture, entries, columns=2, heading=heading)
+    page.finish(picture, heading=" · ".join(page.made_by(found)))
     return picture
 
 
@@ -105,24 +103,19 @@ def _write(value: float) -> str:
     return ("\N{MINUS SIGN}" if value < 0 else "") + style.power(abs(value), style.PLAIN)
 
 
-def _draw_eigenvalues(ax: Axes, found: Hessian) -> list[Artist]:
-    sheet, places = page.sheet_of(ax), _drawn(found)
-    rows = np.arange(len(places))
-    drawn: dict[str, Artist] = {}
-    for row, value, error in zip(rows, found.values, found.errors, strict=True):
-        sign = "cannot tell" if not abs(value) > error else "positive" if value > 0 else "negative"
-        look = sheet.look(style.EIGENVALUES[sign])
-        ax.plot([value - error, value + error], [row, row], **sheet.look(style.INTERVAL_LINE), gid="error")
-        ax.plot([value], [row], **look, gid="eigenvalue")
-        drawn.setdefault(sign, Line2D([], [], **look, label=style.EIGENVALUE_NAMES[sign]))
+def _draw_eigenvalues(ax: Axes, found: Hessian) -> None:
+    places, value, error = _drawn(found), found.values, found.errors
+    rows, ends = np.arange(len(places)), np.stack([value, value - error, value + error], axis=1)
+    told = np.abs(value) > error
+    for sign, where in {"positive": told & (value > 0), "negative": told & (value < 0), "cannot tell": ~told}.items():
+        look, name = style.EIGENVALUES[sign], style.EIGENVALUE_NAMES[sign]
+        page.draw_rows(ax, np.where(where[:, None], ends, np.nan), look, name, gid="eigenvalue", within=WITHIN)
     shown = [row for row in rows if len(rows) <= MOST_ROWS or row % math.ceil(len(rows) / MOST_ROWS) == 0]
     ax.set_yticks(shown, [str(places[row]) for row in shown])
     ax.set_ylim(len(places) - 0.3, -0.7)
     page.name_axes(ax, "", "place")
     if len(places) < found.dim:
-        ax.axhline(len(places) // 2 - 0.5, **sheet.look(style.STEP_LINE), gid="gap")
-    entries = [drawn[sign] for sign in style.EIGENVALUES if sign in drawn]
-    return [*entries, Line2D([], [], **sheet.look(style.INTERVAL_LINE), label="at most so far off")]
+        ax.axhline(len(places) // 2 - 0.5, **page.sheet_of(ax).look(style.STEP_LINE), gid="gap")
 
 
 def _draw_density(ax: Axes, found: Hessian, linear: float, end: float) -> None:

@@ -16,7 +16,6 @@ from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.image import AxesImage
 from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from ...identity import plane_of
@@ -68,9 +67,7 @@ def companions_figure(
     What failed is grey. Raises ValueError where the page is too narrow or too wide.
     """
     sheet = style.Sheet.of(width, pitch=PITCH, columns=len(cuts), least=MIN_PANEL)
-    rows = -(-len(cuts) // sheet.columns)
-    picture = page.Picture(sheet, rows * TALL * sheet.pitch)
-    axes = page.grid(picture, len(cuts), share=True)
+    picture, axes = page.panels(sheet, len(cuts), share=True)
     scale = style.Scale.of_loss(np.concatenate([cut.loss.ravel().astype(float) for cut in cuts]))
     plane = plane_of(dataset)
     y = plane.labels[1] if plane.rank == 2 else page.loss_name(dataset)
@@ -83,7 +80,7 @@ def companions_figure(
         page.name_outer(ax, plane.labels[0], y)
     if plane.rank == 2:
         page.colour_bar(axes[0], axes[0].images[0], page.loss_name(dataset), scale, beside=axes)
-    page.finish(picture, [])
+    page.finish(picture)
     return picture
 
 
@@ -128,20 +125,15 @@ def census_figure(census: Census, *, width: float | None = None) -> page.Picture
     many = f"{len(census.slices)} slices, the least rugged first"
     numerics = [census.floor.sentence()] if census.floor else []
     page.entitle(picture, f"{census.env} · census at {census.fidelity} · {many}")
-    page.finish(
-        picture,
-        _words(census),
-        columns=2,
-        heading=" · ".join([*numerics, *page.made_by(census, "device", "created"), *filter(None, [census.command])]),
-    )
+    made = [*numerics, *page.made_by(census, "device", "created"), *filter(None, [census.command])]
+    page.finish(picture, _words(census), heading=" · ".join(made))
     return picture
 
 
-def _words(census: Census) -> list[Patch]:
-    """Return legend entries without a sign that say how often each word fits, the most frequent first."""
-    shares = [(word, share) for word, share in census.words.items() if share.value > 0]
-    said = [f"{word}: {_share(share)}" for word, share in sorted(shares, key=lambda one: -one[1].value)]
-    return [Patch(visible=False, label=text) for text in said[: 2 * FOOT]]
+def _words(census: Census) -> list[str]:
+    """Say how often each word fits, the most frequent first."""
+    shares = sorted(census.words.items(), key=lambda one: -one[1].value)
+    return [f"{word}: {_share(share)}" for word, share in shares if share.value > 0][: 2 * FOOT]
 
 
 def _share(share: Estimate) -> str:
@@ -175,22 +167,17 @@ def wall_figure(landscapes: Sequence[Landscape], *, width: float | None = None) 
     sheet = style.Sheet.of(
         width, pitch=WALL_PITCH, columns=min(WALL_ACROSS, len(landscapes)), panels=len(landscapes), least=MIN_LANDSCAPE
     )
-    rows = -(-len(landscapes) // sheet.columns)
-    picture = page.Picture(sheet, 1.15 * rows * sheet.pitch)
-    for ax, one in zip(page.grid(picture, len(landscapes)), landscapes, strict=True):
-        _draw_wall(ax, one.dataset)
+    picture, axes = page.panels(sheet, len(landscapes))
+    for ax, one in zip(axes, landscapes, strict=True):
+        _frame(ax, shape=0.75)
+        if _draw_alone(ax, one.dataset, linewidth=1.1) is None:
+            ax.set_facecolor("white")
         page.caption(ax, one.name)
         said = "\n".join(textwrap.wrap(one.said.replace(" %", "\N{NO-BREAK SPACE}%"), LINE)) or " "
         ax.set_xlabel(said, size=sheet.small, color=style.QUIET, parse_math=False)
     page.entitle(picture, "Losses, each on its own scale: dark is low, light is high")
-    page.finish(picture, [])
+    page.finish(picture)
     return picture
-
-
-def _draw_wall(ax: Axes, dataset: xr.Dataset) -> None:
-    _frame(ax, shape=0.75)
-    if _draw_alone(ax, dataset, linewidth=1.1) is None:
-        ax.set_facecolor("white")
 
 
 def _draw_alone(ax: Axes, dataset: xr.Dataset, *, linewidth: float) -> AxesImage | None:
@@ -311,10 +298,11 @@ def opposing(cut: CardSlice) -> tuple[NDArray[np.bool_], float]:
 
 def _legend(sheet: style.Sheet) -> list[Line2D]:
     look: dict[str, Any] = {"linestyle": "none", "marker": r"$\rightarrow$", "markersize": 11 * sheet.type}
-    return [
-        Line2D([], [], color=style.QUIET, label="steepest descent by the gradient (white on the map)", **look),
-        Line2D([], [], color=OPPOSED, label="where it opposes the slope between neighbouring samples", **look),
-    ]
+    said = {
+        "steepest descent by the gradient (white on the map)": style.QUIET,
+        "where it opposes the slope between neighbouring samples": OPPOSED,
+    }
+    return [Line2D([], [], color=colour, label=label, **look) for label, colour in said.items()]
 
 
 WIDTH, THUMBNAIL_SHAPE = 2.4, 0.75  # of the page [inch]; its height, against its width

@@ -11,7 +11,6 @@ from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.colors import to_rgba
-from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
@@ -44,8 +43,7 @@ def overlay_figure(dataset: xr.Dataset, runs: Runs, *, width: float | None = Non
     """
     plane, reach = plane_of(dataset), farthest_distance(runs)
     sheet = style.Sheet.of(width, pitch=PITCH, columns=2)
-    picture = page.Picture(sheet, 2 / sheet.columns * sheet.pitch)
-    over, against = page.grid(picture, 2)
+    picture, (over, against) = page.panels(sheet, 2)
     scale = joint_scale(dataset, runs)
     contour.loss_map(over, dataset, scale)
     contour.frame(over, dataset, plane)
@@ -55,10 +53,7 @@ def overlay_figure(dataset: xr.Dataset, runs: Runs, *, width: float | None = Non
         _join_improvements(over, run, plane, len(runs))
     _draw_against(against, dataset, runs, reach)
     page.head(picture, over, dataset, f"{page.title(dataset)} · {_describe_runs(runs)}")
-    entries = [*_run_entries(sheet, runs), *_order_entries(sheet, runs), *_kind_entries(sheet, runs)]
-    entries += [*_distance_entries(sheet, runs, reach), *_count_entries(sheet, runs)]
-    keys = [*page.failure_key(dataset), *page.sampling_key(dataset)]
-    page.finish(picture, [*entries, *keys], heading=HEADING)
+    page.finish(picture, [*_signs(sheet, runs, reach), *page.sampling_key(dataset)], heading=HEADING)
     _number_improvements(over, runs, plane)
     return picture
 
@@ -193,21 +188,38 @@ def _square(ax: Axes, scale: style.Scale) -> tuple[float, float]:
         low, high = low - 0.03 * (high - low), high + 0.03 * (high - low)
     ax.set(xlim=(low, high), ylim=(low, high))
     for axis in (ax.xaxis, ax.yaxis) if scale.logarithmic else ():
-        style.log_axis(axis)
+        page.log_axis(axis)
     ax.plot([low, high], [low, high], color=style.FAINT, linewidth=page.sheet_of(ax).weight, zorder=1)
     return low, high
 
 
-def _run_entries(sheet: style.Sheet, runs: Runs) -> list[Artist]:
-    """Return one entry per method, with its best run; per run where there is one of each."""
-    entries: list[Artist] = []
+def _signs(sheet: style.Sheet, runs: Runs, reach: float) -> list[Artist | str]:
+    """Say what stands for methods, each with its best run, improvements, kinds of points, distances and failures."""
+    signs: list[Artist | str] = []
     for method in dict.fromkeys(str(run.attrs["method"]) for run in runs):
         own = [run for run in runs if run.attrs["method"] == method]
         name = run_name(own[0]) if len(own) == 1 else f"{method}, {len(own)} runs"
-        look = sheet.look({"linewidth": 1.6, "marker": "*", "markersize": 10, "markeredgewidth": 1.0})
-        look |= {"color": style.method(own[0])["color"], "markerfacecolor": "white"}
-        entries.append(Line2D([], [], **look, label=f"{name}: {_describe_best(own)}"))
-    return entries
+        look = {"linewidth": 1.6, "marker": "*", "markersize": 10, "markeredgewidth": 1.0, "markerfacecolor": "white"}
+        look["color"] = style.method(own[0])["color"]
+        signs.append(page.sign(sheet, f"{name}: {_describe_best(own)}", look))
+    if any(len(improvements(run)) > 1 for run in runs):
+        edge = withStroke(linewidth=sheet.weight * style.IMPROVEMENTS[0]["linewidth"], foreground=style.INK)
+        look = style.IMPROVEMENTS[1] | {"path_effects": [edge]}
+        signs.append(page.sign(sheet, "white line: the best loss so far; numbers: episodes", look))
+    plain = {"linestyle": "none", "markeredgecolor": style.INK, "markersize": 5.5, "markeredgewidth": 1.0}
+    for name in dict.fromkeys(name for run in runs for name, _ in by_kind(run)):
+        count = sum(int(here.sum()) for run in runs for kind, here in by_kind(run) if kind == name)
+        look = plain | {"markerfacecolor": "white", "marker": style.POINT_MARKS[name]["marker"]}
+        signs.append(page.sign(sheet, f"{name} point: {count}", look))
+    signs += _distance_signs(sheet, runs, reach)
+    total = _count(runs)
+    outside = sum(int(run["outside"].sum()) for run in runs)
+    lost = sum(int(failed(run["status"]).sum()) for run in runs)
+    for marker, name, count in (("o", "beyond the map", outside), ("x", "failed episode", lost)):
+        if count:
+            look = plain | {"marker": marker, "markerfacecolor": "none"}
+            signs.append(page.sign(sheet, f"{name}: {count} of {total} points", look))
+    return signs
 
 
 def _describe_best(runs: Runs) -> str:
@@ -228,52 +240,14 @@ def half_widths(distance: float) -> str:
     return f"{said} half-width{'' if said == '1' else 's'} of the box"
 
 
-def _order_entries(sheet: style.Sheet, runs: Runs) -> list[Artist]:
-    """Return the legend entry of the white lines, if there are any."""
-    if not any(len(improvements(run)) > 1 for run in runs):
-        return []
-    effects = [withStroke(linewidth=sheet.weight * style.IMPROVEMENTS[0]["linewidth"], foreground=style.INK)]
-    look = sheet.look(style.IMPROVEMENTS[1]) | {"path_effects": effects}
-    return [Line2D([], [], **look, label="white line: the best loss so far; numbers: episodes")]
-
-
-def _kind_entries(sheet: style.Sheet, runs: Runs) -> list[Artist]:
-    counts: dict[str, int] = {}
-    for run in runs:
-        for name, here in by_kind(run):
-            counts[name] = counts.get(name, 0) + int(here.sum())
-    look = _mark(sheet, markerfacecolor="white")
-    return [
-        Line2D([], [], marker=style.POINT_MARKS[name]["marker"], **look, label=f"{name} point: {count}")
-        for name, count in counts.items()
-    ]
-
-
-def _distance_entries(sheet: style.Sheet, runs: Runs, reach: float) -> list[Artist]:
+def _distance_signs(sheet: style.Sheet, runs: Runs, reach: float) -> list[Artist | str]:
     if not reach:
-        return [Line2D([], [], linestyle="none", label="every point lies on the plane")]
+        return ["every point lies on the plane"]
     steps = np.array([0.0, reach / 2, reach])
-    sizes = sheet.weight * np.sqrt(style.point_areas(steps, reach, _count(runs)))
-    look: dict[str, Any] = {"linestyle": "none", "marker": "o", "markerfacecolor": style.QUIET, "markeredgewidth": 0.0}
+    sizes = np.sqrt(style.point_areas(steps, reach, _count(runs)))
+    look = {"linestyle": "none", "marker": "o", "markerfacecolor": style.QUIET, "markeredgewidth": 0.0}
     said = ("on the plane", *(f"{half_widths(float(away))} off it" for away in steps[1:]))
-    return [Line2D([], [], markersize=size, **look, label=text) for size, text in zip(sizes, said, strict=True)]
-
-
-def _count_entries(sheet: style.Sheet, runs: Runs) -> list[Artist]:
-    total = _count(runs)
-    outside = sum(int(run["outside"].sum()) for run in runs)
-    lost = sum(int(failed(run["status"]).sum()) for run in runs)
-    hollow, cross = _mark(sheet, marker="o", markerfacecolor="none"), _mark(sheet, marker="x")
-    return [
-        Line2D([], [], **look, label=f"{name}: {count} of {total} points")
-        for look, name, count in ((hollow, "beyond the map", outside), (cross, "failed episode", lost))
-        if count
-    ]
-
-
-def _mark(sheet: style.Sheet, **look: Any) -> dict[str, Any]:
-    plain = {"linestyle": "none", "markeredgecolor": style.INK, "markersize": 5.5, "markeredgewidth": 1.0}
-    return sheet.look(plain | look)
+    return [page.sign(sheet, text, look | {"markersize": size}) for size, text in zip(sizes, said, strict=True)]
 
 
 def _count(runs: Runs) -> int:

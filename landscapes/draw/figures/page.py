@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 import textwrap
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import xarray as xr
@@ -24,13 +24,14 @@ from matplotlib.colorbar import Colorbar
 from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties
 from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.textpath import text_to_path
-from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, MaxNLocator, NullFormatter
-from numpy.typing import NDArray
+from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullFormatter
+from matplotlib.transforms import Bbox
+from numpy.typing import ArrayLike, NDArray
 
 from ...identity import PACKAGE, VERSIONS, simulator_parts, stored_identity, stored_provenance
-from ...lattice import with_gradients
 from ...measures.slice_floor import floor_of
 from ...measures.undersampled import Undersampled
 from ...objective import Status
@@ -42,6 +43,13 @@ from .. import style
 from ..figure import Picture as Picture
 from ..style import mark_decades
 
+if TYPE_CHECKING:
+    from ....studies.samples import Bootstrap
+    from ...statistics import Estimate
+
+Grid = NDArray[np.float64]
+
+ENDINGS = {kind.name for kind in style.ENDED}  # what samples that failed are called, which are last in a legend
 HANDLE = 4.5  # room of a legend's sign, in the height of its type
 # Type in a PDF can be selected and searched, its font goes with it. SVG cannot carry one: there type is outlines, which
 # look the same everywhere. Neither holds a clock or a random name, so that equal pictures are equal files.
@@ -76,14 +84,8 @@ def write_over(ax: Axes, text: str, *, size: float, color: str) -> None:
 
 
 def picture_of(ax: Axes) -> Picture:
-    """Return the picture that a panel is in.
-
-    Raises TypeError where it is in a figure that is no Picture.
-    """
-    picture = ax.get_figure(root=True)
-    if not isinstance(picture, Picture):
-        raise TypeError(f"panels are drawn in a Picture, which knows its sheet; got one in a {type(picture).__name__}")
-    return picture
+    """Return the picture that a panel is in."""
+    return cast("Picture", ax.get_figure(root=True))
 
 
 def sheet_of(ax: Axes) -> style.Sheet:
@@ -134,60 +136,75 @@ def loss_unit(dataset: xr.Dataset) -> str:
     return str(dataset["loss"].attrs.get("units", ""))
 
 
-def failure_key(dataset: xr.Dataset) -> list[Patch]:
-    """Return one legend entry for each way of failing that occurs, with how often."""
-    status = dataset["status"].to_numpy()
-    names = style.FAILURES | {Status.MISSING: "not sampled yet"}
-    return [
-        Patch(**style.STATUS_LOOKS[kind], label=f"{name}: {count} of {evaluated(dataset)}")
-        for kind, name in names.items()
-        if (count := int((status == kind).sum()))
-    ]
+def lost_samples(dataset: xr.Dataset, kind: Status, within: str = "") -> str:
+    """Return what the legend says of samples that ended in one way: what that is, and how many did."""
+    count = int((dataset["status"] == kind).sum())
+    return f"{style.ENDED[kind]}{within}: {count} of {evaluated(dataset)}"
 
 
-def gradient_key(dataset: xr.Dataset) -> list[Patch]:
-    """Return the legend entry of the samples that have a loss and no gradient, with how many they are; none of none."""
-    lacking = int((dataset["status"] == Status.NO_GRADIENT).sum()) if "status" in dataset else 0
-    label = f"{style.NO_GRADIENT}: {lacking} of {evaluated(with_gradients(dataset))}"
-    return [Patch(**style.NO_GRADIENT_LOOK, label=label)] if lacking else []
+def sampling_key(dataset: xr.Dataset) -> list[str]:
+    """Return what the legend says of how exact a refined slice is, what samples hide, and of the numerical floor."""
+    refined, between, floor = Refined.of(dataset), Undersampled.of(dataset), floor_of(dataset)
+    said = []
+    if refined and refined.error is not None:
+        said.append(f"interpolated points: 95 % within {100 * refined.error:.2g} % of the range")
+    said.append(between.describe() if between else "")
+    return [one for one in (*said, floor.sentence() if floor else "") if one]
 
 
-def sampling_key(dataset: xr.Dataset) -> list[Patch]:
-    """Return legend entries of how exact a refined slice is, what its samples hide, and its numerical floor."""
-    refined = Refined.of(dataset)
-    exact = (
-        f"interpolated points: 95 % within {100 * refined.error:.2g} % of the range"
-        if refined and refined.error is not None
-        else ""
-    )
-    between = Undersampled.of(dataset)
-    floor = floor_of(dataset)
-    lines = [exact, between.describe() if between else "", floor.sentence() if floor else ""]
-    return [Patch(facecolor="none", edgecolor="none", label=said) for said in lines if said]
+def sign(sheet: style.Sheet, label: str, look: Mapping[str, Any]) -> Line2D:
+    """Return the legend's entry of lines or marks that have this look."""
+    return Line2D([], [], **sheet.look(look), label=label)
 
 
-def finish(picture: Picture, entries: Sequence[Artist], *, columns: int = 2, heading: str = "") -> None:
-    """Put the legend, with a small quiet `heading` if it has one, under the panels, and fit the page's height."""
-    if entries:
+def interval(ax: Axes, x: ArrayLike, y: ArrayLike, label: str | None = "95 % interval") -> None:
+    """Draw an interval, from one end to the other; the legend says what it is if it has a `label`."""
+    ax.plot(x, y, **sheet_of(ax).look(style.INTERVAL_LINE), gid="interval", label=label)
+
+
+def ends_of(estimates: Iterable[Estimate | Bootstrap]) -> Grid:
+    """Return values and both ends of their intervals, shape (estimate, 3), NaN where one is unknown."""
+    return np.array([(one.value, one.low, one.high) for one in estimates], dtype=float).reshape(-1, 3)
+
+
+def draw_rows(
+    ax: Axes, ends: Grid, look: Mapping[str, Any], label: str, *, gid: str, within: str = "95 % interval"
+) -> None:
+    """Draw in each row an estimate that is known, with its interval, as `ends_of` has them."""
+    for row in np.flatnonzero(np.isfinite(ends[:, 0])):
+        ax.plot(ends[row, :1], [row], **sheet_of(ax).look(look), gid=gid, label=label)
+        interval(ax, ends[row, 1:], [row, row], within)
+
+
+def finish(picture: Picture, more: Sequence[Artist | str] = (), *, columns: int = 2, heading: str = "") -> None:
+    """Put the legend under the panels, with a small quiet `heading` if it has one, and fit the page's height.
+
+    It has everything in the panels that has a label, once, and what is `more`, where a text stands without a sign.
+    """
+    signs = [Patch(visible=False, label=one) if isinstance(one, str) else one for one in more]
+    if entries := sorted([*drawn_signs(picture), *signs], key=lambda one: one.get_gid() in ENDINGS):
         _key(picture, entries, columns, heading)
     settle(picture)
+
+
+def drawn_signs(picture: Picture) -> list[Artist]:
+    """Return what has a label in the panels, the first that has it."""
+    found: dict[str, Artist] = {}
+    for ax in picture.axes:
+        for one, label in zip(*ax.get_legend_handles_labels(), strict=True):
+            found.setdefault(label, one)
+    return list(found.values())
 
 
 def _key(picture: Picture, entries: Sequence[Artist], columns: int, heading: str) -> None:
     """Put a legend under the panels, in fewer columns where it would be wider than the page."""
     sheet, room = picture.sheet, picture.sheet.width - 2 * MARGIN
+    wide = room - HANDLE * sheet.tick / 72
+    labels = [wrap_text(str(one.get_label()), wide, sheet.tick, lines=3) for one in entries]
     legend = picture.legend(
-        handles=list(entries),
-        labels=[
-            wrap_text(str(one.get_label()), room - HANDLE * sheet.tick / 72, sheet.tick, lines=3) for one in entries
-        ],
-        loc="outside lower center",
-        ncols=columns,
-        fontsize=sheet.tick,
-        frameon=False,
-        handlelength=1.8,
-        columnspacing=1.6,
-    )
+        list(entries), labels, loc="outside lower center", ncols=columns, fontsize=sheet.tick, frameon=False,
+        handlelength=1.8, columnspacing=1.6,
+    )  # fmt: skip
     for text in legend.get_texts():
         text.set_parse_math(False)
     if columns > 1 and legend.get_window_extent().width > room * picture.dpi:
@@ -230,18 +247,26 @@ def save_prints(draw: Callable[[float], Figure], path: Path, widths: Sequence[fl
 
 
 NARROW = 1.8  # room of a panel that has fewer ticks [inch]
-FINE_DECADES = 1.0, 1.5  # decades of a logarithmic axis with several ticks in each, in a narrow panel and in another
-DECADES = 3, 6  # of one that has a tick in each
+DECADES = 3, 6  # ticks of a logarithmic axis, about, in a narrow panel and in another
 
 
-def grid(picture: Picture, panels: int, *, share: bool = False) -> list[Axes]:
-    """Return so many panels, as many side by side as the sheet has columns; they may share their window."""
-    columns = min(panels, picture.sheet.columns)
-    rows = -(-panels // columns)
+def panels(sheet: style.Sheet, count: int, *, share: bool = False) -> tuple[Picture, list[Axes]]:
+    """Return a picture of so many panels, in as many columns as the sheet has; they may share their window."""
+    columns = min(count, sheet.columns)
+    rows = -(-count // columns)
+    picture = Picture(sheet, rows * sheet.pitch)
     every = list(picture.subplots(rows, columns, sharex=share, sharey=share, squeeze=False).flat)
-    for empty in every[panels:]:
+    for empty in every[count:]:
         empty.remove()
-    return every[:panels]
+    return picture, every[:count]
+
+
+def panel(sheet: style.Sheet, shape: float) -> tuple[Picture, Axes]:
+    """Return a picture of one panel, `shape` times as high as it is wide, with its ticks and frame."""
+    picture, (ax,) = panels(sheet, 1)
+    dress(ax)
+    ax.set_box_aspect(shape)
+    return picture, ax
 
 
 LINE_PITCH, LINE_ROOM = 8.0, 1.2  # width of a page of panels over a line on a screen, room next to them [inch]
@@ -274,17 +299,13 @@ def dress(ax: Axes, plane: Plane | None = None) -> None:
 
 
 def log_axis(axis: Axis) -> None:
-    """Make an axis logarithmic, with decades alone where a panel has no room for more."""
-    style.log_axis(axis)
-    low, high = sorted(axis.get_view_interval())
-    decades, wide = math.log10(high / low), sheet_of(axis.axes).pitch > NARROW
-    if decades > FINE_DECADES[wide]:
-        every = math.ceil(decades / DECADES[wide])
-        powers = range(math.ceil(math.log10(low)), math.floor(math.log10(high)) + 1)
-        axis.set_major_locator(FixedLocator([10.0**power for power in powers if power % every == 0]))
-        axis.set_major_formatter(FuncFormatter(lambda value, _: style.power(value, 3)))
-    elif not wide:
-        axis.set_major_locator(LogLocator(subs=(1, 2, 5), numticks=9))
+    """Make an axis logarithmic, with round values for what is drawn already, the fewer the less room a panel has."""
+    (axis.axes.set_xscale if axis is axis.axes.xaxis else axis.axes.set_yscale)("log")
+    low, high = np.log10(sorted(axis.get_view_interval()))
+    ticks = style.decades(low, high, DECADES[sheet_of(axis.axes).pitch > NARROW])
+    axis.set_major_locator(FixedLocator([10.0**tick for tick in ticks]))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: style.write_power(math.log10(value))))
+    axis.set_minor_formatter(NullFormatter())
 
 
 def name_axes(ax: Axes, x: str | None = None, y: str | None = None) -> None:
@@ -481,8 +502,6 @@ def text_width(text: str, size: float) -> float:
     return HINTED * float(width) / 72
 
 
-Grid = NDArray[np.float64]
-
 SIDES = (  # right, up: where a name may stand, in the order tried; from the second gap on all of them
     *((0, 1), (1, 0), (0, -1), (-1, 0), (1, 1), (1, -1), (-1, -1), (-1, 1)),
     *((0.5, 1), (1, 0.5), (1, -0.5), (0.5, -1), (-0.5, -1), (-1, -0.5), (-1, 0.5), (-0.5, 1)),
@@ -520,7 +539,7 @@ def place_labels(
     dot = ax.figure.dpi / 72
     origins = ax.transData.transform(np.array([name.at for name in names]).reshape(-1, 2))
     points = [ax.transData.transform(some.reshape(-1, 2)) for some in (np.concatenate([clear, rather]), clear)]
-    crowd = _Crowd.of(ax, origins, margin=dot)
+    crowd = _Crowd(ax.get_window_extent().padded(-dot), origins)
     left = []
     for number, name in enumerate(names):
         half = np.array([text_width(name.text, size) * 72, ROOM * size]) * dot / 2
@@ -528,63 +547,48 @@ def place_labels(
             shift = np.array(side) * (half + gap * dot)
             if not far and side not in SIDES[:NEAR_SIDES]:
                 continue
-            if crowd.takes(number, origins[number] + shift, half, avoided, led=far > 0):
-                _write(ax, name, shift / dot, size, led=far > 0, gid=gid)
+            if crowd.takes(number, shift, half, avoided, led=far > 0):
+                x, y = (shift / dot).tolist()
+                text = ax.annotate(
+                    name.text, name.at, (x, y), textcoords="offset points", ha="center", va="center", size=size,
+                    arrowprops=style.LEADER if far else None, parse_math=False, gid=gid, **style.NAME_TEXT,
+                )  # fmt: skip
+                text.set_in_layout(False)  # it has found its room
                 break
         else:
             left.append(number)
     return left
 
 
-def _write(ax: Axes, name: Label, shift: Grid, size: float, *, led: bool, gid: str) -> None:
-    text = ax.annotate(
-        name.text, name.at, (float(shift[0]), float(shift[1])), textcoords="offset points", ha="center", va="center",
-        size=size, arrowprops=style.LEADER if led else None, parse_math=False, gid=gid, **style.NAME_TEXT,
-    )  # fmt: skip
-    text.set_in_layout(False)  # it has found its room
-
-
-@dataclass(eq=False)
 class _Crowd:
-    """What is taken of a panel [pixel]: its frame, places that are named, boxes of names, lines to them."""
+    """What is taken of a panel [pixel]: places that are named, boxes of names, and points along lines to them."""
 
-    frame: Grid  # two corners
-    origins: Grid
-    boxes: Grid  # middle and half the sides of each, shape (box, 4)
-    lines: Grid  # points along them
+    def __init__(self, frame: Bbox, origins: Grid) -> None:
+        self.frame, self.origins = frame, origins
+        self.boxes: list[Bbox] = []
+        self.lines = NOTHING
 
-    @classmethod
-    def of(cls, ax: Axes, origins: Grid, *, margin: float) -> _Crowd:
-        box = ax.get_window_extent()
-        frame = np.array([[box.x0 + margin, box.y0 + margin], [box.x1 - margin, box.y1 - margin]])
-        return cls(frame, origins, np.zeros((0, 4)), NOTHING)
-
-    def takes(self, number: int, middle: Grid, half: Grid, points: Grid, *, led: bool) -> bool:
+    def takes(self, number: int, shift: Grid, half: Grid, points: Grid, *, led: bool) -> bool:
         """Take a box for a place, and the line that leads there, if neither points nor anything else is in its way."""
-        if (middle - half < self.frame[0]).any() or (middle + half > self.frame[1]).any():
+        own, others = self.origins[number], np.delete(self.origins, number, axis=0)
+        box = Bbox([own + shift - half, own + shift + half])
+        inside = (box.min >= self.frame.min).all() and (box.max <= self.frame.max).all()
+        if not inside or box.count_overlaps(self.boxes):
             return False
-        apart = np.abs(self.boxes[:, :2] - middle) - self.boxes[:, 2:] - half
-        covered = np.abs(np.concatenate([points, self.origins, self.lines]) - middle) < half
-        if (apart < 0).all(axis=1).any() or covered.all(axis=1).any():
+        if box.count_contains(np.concatenate([points, self.origins, self.lines])):
             return False
-        away = np.linalg.norm(np.maximum(np.abs(self.origins - middle) - half, 0), axis=1)
-        others = np.delete(np.arange(len(away)), number)
-        if not led and (away[others] <= away[number]).any():
-            return False
-        path = self._path(self.origins[number], middle, half) if led else self.lines[:0]
-        crossed = np.abs(path[:, None] - self.boxes[None, :, :2]) < self.boxes[None, :, 2:]
-        near = np.linalg.norm(self.origins[others] - self.origins[number], axis=1) < 2 * half[1]
-        passed = self.origins[others[~near]]  # those that its own place all but covers it cannot pass
-        reach = np.linalg.norm(path[:, None] - passed, axis=-1)
-        if crossed.all(axis=-1).any() or (reach < half[1]).any():
-            return False
-        self.boxes = np.concatenate([self.boxes, np.concatenate([middle, half])[None]])
+        path = NOTHING
+        if led:
+            path = own + np.linspace(0.05, 1.0, 48)[:, None] * shift
+            path = path[(np.abs(path - own - shift) >= half).any(axis=1)]  # up to the box
+            far = others[np.linalg.norm(others - own, axis=1) >= 2 * half[1]]  # a nearer one cannot be passed
+            passed = np.linalg.norm(path[:, None] - far, axis=-1) < half[1]
+            if passed.any() or any(one.count_contains(path) for one in self.boxes):
+                return False
+        elif len(others):
+            away = [np.linalg.norm(np.maximum(np.abs(at - own - shift) - half, 0), axis=-1) for at in (own, others)]
+            if (away[1] <= away[0]).any():
+                return False
+        self.boxes.append(box)
         self.lines = np.concatenate([self.lines, path])
         return True
-
-    @staticmethod
-    def _path(origin: Grid, middle: Grid, half: Grid) -> Grid:
-        """Return points from a place to a box, without those in it."""
-        path = origin + np.linspace(0.05, 1.0, 48)[:, None] * (middle - origin)
-        found: Grid = path[(np.abs(path - middle) >= half).any(axis=1)]
-        return found

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 import torch
 import xarray as xr
-from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from numpy.typing import ArrayLike, NDArray
 
@@ -20,7 +18,7 @@ from ...objective import Status
 from ...plane import Plane
 from ...space import labelled
 from .. import style
-from . import page
+from . import contour, page
 
 LOSS, FLOOR, SLOPE = 2.6, 1.4, 2.2  # height of the panels [inch]
 ROOM = 1.1  # of the numerical floor, against its largest value
@@ -49,21 +47,23 @@ def profile_figure(
     counted = {name: _counts(name, values, dataset.sizes["u"]) for name, values in (events or {}).items()}
     places, whole, dataset = dataset["u"].to_numpy(), dataset, sampled_line(dataset)
     sheet = style.Sheet.of(width, pitch=page.LINE_PITCH)
-    heights = [STRIP * sheet.small / 72] * len(counted)
-    heights += [max(page.FLATTEST, sheet.zoom) * height for height in _heights("grad" in dataset, floor is not None)]
+    shown = [LOSS, *[FLOOR] * (floor is not None), *[SLOPE] * ("grad" in dataset)]
+    heights = [STRIP * sheet.small / 72] * len(counted) + [max(page.FLATTEST, sheet.zoom) * one for one in shown]
     picture, axes = page.stack(sheet, heights)
     strips, panels = axes[: len(counted)], axes[len(counted) :]
-    entries = _draw_loss(panels[0], dataset)
-    entries += [] if floor is None else _draw_floor(panels[1], whole, floor["deviation"].to_numpy() / unit)
-    entries += _draw_slope(panels[-1], dataset, plane) if "grad" in dataset else []
+    _draw_loss(panels[0], dataset)
+    if floor is not None:
+        _draw_floor(panels[1], whole, floor["deviation"].to_numpy() / unit)
+    if "grad" in dataset:
+        _draw_slope(panels[-1], dataset, plane)
     for ax in panels:
-        _frame(ax, dataset, plane)
+        contour.frame(ax, dataset, plane)
     for strip, (name, counts) in zip(strips, counted.items(), strict=True):
         _draw_strip(strip, panels, places, name, counts)
     page.name_axes(panels[-1], plane.labels[0])
     picture.align_ylabels(panels)
     page.head(picture, axes[0], whole)
-    page.finish(picture, [*entries, *page.failure_key(whole), *page.sampling_key(whole)])
+    page.finish(picture, page.sampling_key(whole))
     return picture
 
 
@@ -76,53 +76,39 @@ def _counts(name: str, values: ArrayLike, points: int) -> NDArray[np.int64]:
     return counts.astype(np.int64)
 
 
-def _draw_loss(ax: Axes, dataset: xr.Dataset) -> list[Artist]:
-    u, loss = dataset["u"].to_numpy(), dataset["loss"].to_numpy()
-    sheet = page.sheet_of(ax)
-    ax.plot(u, loss, color=style.LOSS_LINE, **sheet.look(style.stroke(len(u))))
+def _draw_loss(ax: Axes, dataset: xr.Dataset) -> None:
+    u = dataset["u"].to_numpy()
+    ax.plot(u, dataset["loss"], color=style.LOSS_LINE, **page.sheet_of(ax).look(style.stroke(len(u))))
     page.name_axes(ax, y=page.loss_name(dataset))
-    if not np.isfinite(loss).any():
-        return []
-    lowest = int(np.nanargmin(loss))
-    (star,) = ax.plot(
-        u[lowest], loss[lowest], **sheet.look(style.LOWEST_MARK), zorder=4,
-        label=f"lowest sample: {style.number(loss[lowest])}",
-    )  # fmt: skip
-    return [star]
+    contour.lowest_sample(ax, dataset)
 
 
-def _heights(grad: bool, floor: bool) -> list[float]:
-    return [LOSS, *([FLOOR] if floor else []), *([SLOPE] if grad else [])]
-
-
-def _draw_floor(ax: Axes, dataset: xr.Dataset, deviation: NDArray[np.float64]) -> list[Artist]:
+def _draw_floor(ax: Axes, dataset: xr.Dataset, deviation: NDArray[np.float64]) -> None:
     """Draw the standard deviation between replicas at every sample, from 0 on."""
     u = dataset["u"].to_numpy()
     ax.plot(u, deviation, color=style.INK, **page.sheet_of(ax).look(style.stroke(len(u))))
     most = np.nanmax(deviation, initial=0.0)
     ax.set_ylim(0, ROOM * most if most > 0 else 1)
     page.name_axes(ax, y=labelled("numerical floor", page.loss_unit(dataset)))
-    return []
 
 
-def _draw_slope(ax: Axes, dataset: xr.Dataset, plane: Plane) -> list[Artist]:
-    u, loss, sloped = dataset["u"].to_numpy(), dataset["loss"].to_numpy(), with_gradients(dataset)
-    slopes = plane.slope(torch.from_numpy(sloped["grad"].to_numpy())).numpy()[:, 0]
+def _draw_slope(ax: Axes, dataset: xr.Dataset, plane: Plane) -> None:
+    u, loss, asked = dataset["u"].to_numpy(), dataset["loss"].to_numpy(), with_gradients(dataset)
+    slopes = plane.slope(torch.from_numpy(asked["grad"].to_numpy())).numpy()[:, 0]
     slope, differences = (np.where(np.abs(one) > LARGEST, np.nan, one) for one in (slopes, _differences(u, loss)))
-    ax.axhline(0, color=style.FAINT, linewidth=0.8, zorder=0.5)
-    sheet, thin = page.sheet_of(ax), {"color": style.QUIET, "linewidth": 0.7}
-    (behind,) = ax.plot(u, differences, **sheet.look(thin), label="central difference of the loss")
-    (line,) = ax.plot(
-        sloped["u"], slope, color=style.SLOPE_LINE, **sheet.look(style.stroke(len(slope))), label="gradient"
-    )
     low, high = style.span_of_line(slope, differences)
     ax.set_ylim(low, high)
+    ax.axhline(0, color=style.FAINT, linewidth=0.8, zorder=0.5)
+    said = [
+        name + (f" ({off} off scale)" if (off := int(((values < low) | (values > high)).sum())) else "")
+        for name, values in (("gradient", slopes), ("central difference of the loss", differences))
+    ]
+    sheet = page.sheet_of(ax)
+    behind, line = sheet.look({"color": style.QUIET, "linewidth": 0.7}), sheet.look(style.stroke(len(slope)))
+    ax.plot(u, differences, **behind, label=said[1])
+    ax.plot(asked["u"], slope, color=style.SLOPE_LINE, **line, label=said[0])
     page.name_axes(ax, y=_slope_label(plane, page.loss_unit(dataset)))
-    for drawn, values in ((line, slopes), (behind, differences)):
-        if off := int(((values < low) | (values > high)).sum()):
-            drawn.set_label(f"{drawn.get_label()} ({off} off scale)")
-    _shade(ax, dataset, Status.NO_GRADIENT, style.NO_GRADIENT_LOOK)
-    return [line, behind, *page.gradient_key(dataset)]
+    contour.shade(ax, dataset, Status.NO_GRADIENT, page.lost_samples(asked, Status.NO_GRADIENT))
 
 
 def _differences(u: NDArray[np.float64], loss: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -140,26 +126,6 @@ def _slope_label(plane: Plane, loss_unit: str) -> str:
     per = f"({unit})" if "/" in unit else unit
     named = f"{loss_unit or '1'}/{per}" if unit else loss_unit
     return labelled("slope of the loss", named)
-
-
-def _frame(ax: Axes, dataset: xr.Dataset, plane: Plane) -> None:
-    ax.set_xlim(float(plane.lower[0]), float(plane.upper[0]))
-    page.dress(ax, plane)
-    for kind, look in style.STATUS_LOOKS.items():
-        _shade(ax, dataset, kind, look)
-
-
-def _shade(ax: Axes, dataset: xr.Dataset, kind: Status, look: dict[str, Any]) -> None:
-    """Shade the stretches of the samples that ended in one way."""
-    u, status = dataset["u"].to_numpy(), dataset["status"].to_numpy()
-    edges = np.concatenate([u[:1], (u[1:] + u[:-1]) / 2, u[-1:]])
-    for start, stop in _runs(status == kind):
-        ax.axvspan(edges[start], edges[stop], **look, zorder=0.6, gid=kind.name)
-
-
-def _runs(where: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    changes = np.flatnonzero(np.diff(np.concatenate([[False], where, [False]])))
-    return list(zip(changes[::2].tolist(), changes[1::2].tolist(), strict=True))
 
 
 def _draw_strip(strip: Axes, panels: list[Axes], u: NDArray[np.float64], name: str, counts: NDArray[np.int64]) -> None:

@@ -11,9 +11,7 @@ import xarray as xr
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
-from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 from ...identity import gradient_stride, plane_of, stored_identity
 from ...lattice import with_gradients
@@ -45,18 +43,21 @@ def quality_figure(dataset: xr.Dataset, quality: GradientQuality, *, width: floa
     picture = page.Picture(sheet, len(rows) * sheet.pitch)
     mosaic: Any = rows
     axes: dict[str, Axes] = picture.subplot_mosaic(mosaic)
-    entries = _slope_lines(axes[LINE], dataset) if plane.rank == 1 else []
+    if plane.rank == 1:
+        _slope_lines(axes[LINE], dataset)
     for number, name in enumerate(maps):
         _cosine_map(axes[name], dataset, samples.isel(scale=number), last=name == maps[-1])
-    entries += _scales(axes[SCALES], quality.steps, samples)
+    _scales(axes[SCALES], quality.steps, samples)
     for number, name in enumerate(ORDERS):
         draw = _disagreement_map if plane.rank == 2 else _two_orders
-        entries += draw(axes[name], dataset, quality.smooth, number)
+        draw(axes[name], dataset, quality.smooth, number)
     for kind in (maps, ORDERS):
         _share_names(axes, rows, kind)
     page.entitle(picture, f"{page.title(dataset)}: gradient quality")
-    entries = [*{str(one.get_label()): one for one in entries}.values(), *_signs(sheet, dataset)]
-    page.finish(picture, entries, columns=3, heading=page.provenance(dataset))
+    more: list[Artist] = [page.sign(sheet, "first order is biased beyond chance (p < 0.001)", style.BIASED)]
+    if plane.rank == 2:
+        more.append(Patch(**style.NO_SLOPE, label="no slope above the noise, or too close to the border"))
+    page.finish(picture, more, columns=3, heading=page.provenance(dataset))
     return picture
 
 
@@ -73,12 +74,6 @@ def _share_names(axes: dict[str, Axes], rows: Sequence[Sequence[str]], kind: Seq
             if left in kind and name in kind and axes[left].get_ylim() == axes[name].get_ylim():
                 page.name_axes(axes[name], y="")
                 axes[name].tick_params(labelleft=False)
-
-
-def _signs(sheet: style.Sheet, dataset: xr.Dataset) -> list[Artist]:
-    sure = Line2D([], [], **sheet.look(style.BIASED), label="first order is biased beyond chance (p < 0.001)")
-    unseen = Patch(**style.NO_SLOPE, label="no slope above the noise, or too close to the border")
-    return [sure, *([unseen] if dataset["loss"].ndim == 2 else []), *page.failure_key(dataset)]
 
 
 def _cosine_map(ax: Axes, dataset: xr.Dataset, found: xr.Dataset, *, last: bool) -> None:
@@ -102,55 +97,41 @@ def _bar(ax: Axes, drawn: ScalarMappable, label: str) -> None:
     page.colour_bar(ax, drawn, label, **(below if page.sheet_of(ax).pitch < BELOW else {}))
 
 
-def _slope_lines(ax: Axes, dataset: xr.Dataset) -> list[Artist]:
+def _slope_lines(ax: Axes, dataset: xr.Dataset) -> None:
     plane, u = plane_of(dataset), dataset["u"].to_numpy()
     slope, loss = box_slopes(dataset)[:, 0], dataset["loss"].to_numpy()
     difference = np.full_like(loss, np.nan)
     difference[1:-1] = (loss[2:] - loss[:-2]) * (len(loss) - 1) / 2
     look = page.sheet_of(ax).look(style.stroke(len(u)))
-    lines = ax.plot(u, difference, color=style.LOSS_LINE, **look, label="difference over two samples")
-    lines += ax.plot(u, slope, color=style.SLOPE_LINE, **look, label="gradient", alpha=0.8)
+    ax.plot(u, difference, color=style.LOSS_LINE, **look, label="difference over two samples")
+    ax.plot(u, slope, color=style.SLOPE_LINE, **look, label="gradient", alpha=0.8)
     ax.set_box_aspect(FLAT)
-    ax.set_xlim(float(u[0]), float(u[-1]))
-    page.dress(ax, plane)
+    contour.frame(ax, dataset, plane)
     ax.set_ylim(*style.span_of_line(difference, slope))
     page.name_axes(ax, plane.labels[0], _slope_label(dataset))
-    return list(lines)
 
 
-def _scales(ax: Axes, steps: xr.Dataset, samples: xr.Dataset) -> list[Artist]:
+def _scales(ax: Axes, steps: xr.Dataset, samples: xr.Dataset) -> None:
     """Draw mean cosine and share of uphill gradients over the scale of the difference."""
-    sheet, entries = page.sheet_of(ax), list[Artist]()
-    for found, filled in ((steps, True), (samples, False)):
+    sheet = page.sheet_of(ax)
+    for found, where in ((steps, "new evaluations"), (samples, "the slice's samples")):
         rows = [row for row in scale_table(found) if row.points]
-        scale = [row.scale for row in rows]
-        for name, colour, label in (("cosine", style.LOSS_LINE, "mean cosine"), ("uphill", style.SLOPE_LINE, "uphill")):
-            estimates = [row.cosine if name == "cosine" else row.uphill for row in rows]
-            value = np.array([one.value for one in estimates], dtype=float)
-            ends = np.array([(one.low, one.high) for one in estimates], dtype=float).reshape(-1, 2)
-            reach = np.abs(np.nan_to_num(ends - value[:, None])).T
-            look = sheet.look({"linewidth": 1.1, "markersize": 4.5, "markeredgewidth": 1.0, "capsize": 2.0})
-            look |= {"color": colour, "marker": "o" if name == "cosine" else "v"}
-            look["markerfacecolor"] = colour if filled else "white"
-            where = "new evaluations" if filled else "the slice's samples"
-            ax.errorbar(scale, value, reach, **look)
-            del look["capsize"]
-            entries.append(Line2D([], [], **look, label=f"{label}, {where}"))
+        for name, colour, marker in (("mean cosine", style.LOSS_LINE, "o"), ("uphill", style.SLOPE_LINE, "v")):
+            ends = page.ends_of(row.uphill if name == "uphill" else row.cosine for row in rows)
+            reach = np.abs(np.nan_to_num(ends[:, 1:] - ends[:, :1])).T
+            look = {"color": colour, "marker": marker, "markerfacecolor": colour if found is steps else "white"}
+            look |= sheet.look({"linewidth": 1.1, "markersize": 4.5, "markeredgewidth": 1.0, "capsize": 2.0})
+            ax.errorbar([row.scale for row in rows], ends[:, 0], reach, **look, label=f"{name}, {where}")
     page.dress(ax)
-    ax.set_xscale("log")
-    every = 1 if sheet.pitch > 3.0 else 2
-    ax.xaxis.set_major_locator(FixedLocator([10.0**power for power in range(-6, 0)][1 % every :: every]))
-    ax.xaxis.set_major_formatter(FuncFormatter(lambda value, _: style.power(value, 0)))
-    ax.xaxis.set_minor_locator(NullLocator())
+    page.log_axis(ax.xaxis)
     ax.set_ylim(-1.05, 1.05)
     ax.axhline(0, color=style.FAINT, linewidth=0.8 * sheet.weight, zorder=0)
     ax.set_box_aspect(1)
     page.name_axes(ax, "width of the difference / box", "cosine; share pointing uphill")
     page.caption(ax, "gradient against differences,\nby scale")
-    return entries
 
 
-def _disagreement_map(ax: Axes, dataset: xr.Dataset, smooth: xr.Dataset, number: int) -> list[Artist]:
+def _disagreement_map(ax: Axes, dataset: xr.Dataset, smooth: xr.Dataset, number: int) -> None:
     plane, place = plane_of(dataset), smooth["place"].to_numpy()
     side = round(len(place) ** 0.5)
     apart, sure = (of(smooth).isel(width=number).to_numpy() for of in (disagreement, find_bias))
@@ -166,25 +147,21 @@ def _disagreement_map(ax: Axes, dataset: xr.Dataset, smooth: xr.Dataset, number:
     _say_smoothing(ax, smooth, number, sure)
     if number == len(ORDERS) - 1:
         _bar(ax, drawn, "|first \N{MINUS SIGN} zeroth order| / sum of both")
-    return []
 
 
-def _two_orders(ax: Axes, dataset: xr.Dataset, smooth: xr.Dataset, number: int) -> list[Artist]:
+def _two_orders(ax: Axes, dataset: xr.Dataset, smooth: xr.Dataset, number: int) -> None:
     plane, place, found = plane_of(dataset), smooth["place"].to_numpy()[:, 0], smooth.isel(width=number)
-    sheet, entries = page.sheet_of(ax), list[Artist]()
+    sheet = page.sheet_of(ax)
     for name, colour, marker in (("zeroth", style.LOSS_LINE, "s"), ("first", style.SLOPE_LINE, "o")):
         error = found[f"{name}_error"].to_numpy()[:, 0]
         look = sheet.look({"color": colour, "marker": marker, "markersize": 4.0, "linewidth": 0.9, "capsize": 2.0})
-        ax.errorbar(place, found[name].to_numpy()[:, 0], error, **look)
-        del look["capsize"]
-        entries.append(Line2D([], [], **look, label=f"{name} order"))
+        ax.errorbar(place, found[name].to_numpy()[:, 0], error, **look, label=f"{name} order")
     sure = find_bias(smooth).isel(width=number).to_numpy()
     ax.plot(place[sure], found["first"].to_numpy()[sure, 0], **sheet.look(style.BIASED), zorder=4)
     page.dress(ax, plane)
     ax.set_box_aspect(1)
     page.name_axes(ax, plane.labels[0], _slope_label(dataset))
     _say_smoothing(ax, smooth, number, sure)
-    return entries
 
 
 def _say_smoothing(ax: Axes, smooth: xr.Dataset, number: int, sure: np.ndarray[Any, Any]) -> None:

@@ -25,19 +25,16 @@ WIDE = 30.0  # ratio of losses from which the axis is logarithmic
 
 def run_figure(table: xr.Dataset, *, width: float | None = None) -> page.Picture:
     """Draw a run's losses, by what each point was evaluated for, and the best so far; failures are marked below."""
-    sheet = style.Sheet.of(width, pitch=PITCH)
-    picture = page.Picture(sheet, sheet.width)
-    ax = picture.subplots()
-    page.dress(ax)
-    ax.set_box_aspect(SHAPE)
+    picture, ax = page.panel(style.Sheet.of(width, pitch=PITCH), SHAPE)
     loss = table["loss"].to_numpy()
-    best = np.fmin.accumulate(loss)
     _scale(ax, loss)
-    entries = [*_draw_points(ax, table), _draw_best(ax, table, best), *_draw_failures(ax, table)]
+    _draw_points(ax, table)
+    _draw_best(ax, table, np.fmin.accumulate(loss))
+    _draw_failures(ax, table)
     page.name_axes(ax, "episodes", page.loss_name(table))
     ax.set_xlim(0, len(loss) + 1)
     page.head(picture, ax, table, _title(table))
-    page.finish(picture, entries)
+    page.finish(picture)
     return picture
 
 
@@ -57,18 +54,17 @@ def _scale(ax: Axes, loss: NDArray[np.float64]) -> None:
         return
     low, high = float(finite.min()), float(style.Scale.of_loss(finite).norm.vmax or finite.max())
     if low > 0 and high / low >= WIDE:
-        style.log_axis(ax.yaxis)
         room = (high / low) ** 0.05
         ax.set_ylim(low / room, high * room)
+        page.log_axis(ax.yaxis)
     else:
         room = 0.05 * (high - low) or 0.5
         ax.set_ylim(low - room, high + room)
 
 
-def _draw_points(ax: Axes, table: xr.Dataset) -> list[Artist]:
+def _draw_points(ax: Axes, table: xr.Dataset) -> None:
     loss, episodes = (table[name].to_numpy() for name in ("loss", "episodes"))
     top = ax.get_ylim()[1]
-    entries: list[Artist] = []
     for name, own in by_kind(table):
         here = own & np.isfinite(loss)
         if not here.any():
@@ -76,26 +72,22 @@ def _draw_points(ax: Axes, table: xr.Dataset) -> list[Artist]:
         above = int((loss[here] > top).sum())
         label = f"{name} points" + (f" ({above} above the picture)" if above else "")
         look = style.POINT_MARKS[name] | {"markersize": 3.0, "markeredgewidth": 0.0, "alpha": 0.55, "linestyle": "none"}
-        entries += ax.plot(episodes[here], loss[here], **page.sheet_of(ax).look(look), label=label, gid=name)
-    return entries
+        ax.plot(episodes[here], loss[here], **page.sheet_of(ax).look(look), label=label, gid=name)
 
 
-def _draw_best(ax: Axes, table: xr.Dataset, best: NDArray[np.float64]) -> Artist:
+def _draw_best(ax: Axes, table: xr.Dataset, best: NDArray[np.float64]) -> None:
     label = f"best so far: {style.number(best[-1])}" if np.isfinite(best[-1]) else "no episode has succeeded"
     look = page.sheet_of(ax).look({"color": style.INK, "linewidth": 1.4, "zorder": 3})
-    (line,) = ax.step(table["episodes"], best, where="post", label=label, gid="best", **look)
-    return line
+    ax.step(table["episodes"], best, where="post", label=label, gid="best", **look)
 
 
-def _draw_failures(ax: Axes, table: xr.Dataset) -> list[Artist]:
-    status, episodes = table["status"].to_numpy(), table["episodes"].to_numpy()
-    lost = failed(status)
-    if not lost.any():
-        return []
-    label = f"failed: {int(lost.sum())} of {len(lost)}"
-    look = page.sheet_of(ax).look({"color": style.QUIET, "marker": "|", "markersize": 7, "linestyle": "none"})
-    at = np.full(lost.sum(), 0.02)
-    return list(ax.plot(episodes[lost], at, transform=ax.get_xaxis_transform(), label=label, gid="failed", **look))
+def _draw_failures(ax: Axes, table: xr.Dataset) -> None:
+    lost = failed(table["status"].to_numpy())
+    if lost.any():
+        label = f"failed: {int(lost.sum())} of {len(lost)}"
+        look = page.sheet_of(ax).look({"color": style.QUIET, "marker": "|", "markersize": 7, "linestyle": "none"})
+        at = table["episodes"].to_numpy()[lost], np.full(lost.sum(), 0.02)
+        ax.plot(*at, transform=ax.get_xaxis_transform(), label=label, gid="failed", **look)
 
 
 RACE_PITCH, RACE_SHAPE = 4.9, 0.95  # room of a panel on a screen [inch]; its height, against its width
@@ -115,23 +107,23 @@ def race_figure(dataset: xr.Dataset, *, width: float | None = None) -> page.Pict
     easiest target as the hardest is below it, so that a few bad first losses do not flatten the rest.
     """
     sheet = style.Sheet.of(width, pitch=RACE_PITCH, columns=2)
-    picture = page.Picture(sheet, 2 / sheet.columns * sheet.pitch)
-    losses, shares = page.grid(picture, 2)
-    entries: list[Artist] = [_draw_method(losses, shares, dataset, row) for row in range(dataset.sizes["method"])]
+    picture, (losses, shares) = page.panels(sheet, 2)
+    for row in range(dataset.sizes["method"]):
+        _draw_method(losses, shares, dataset, row)
     for ax in (losses, shares):
         page.dress(ax)
         ax.set_box_aspect(RACE_SHAPE)
-        style.log_axis(ax.xaxis)
         ax.set_xlim(1, dataset.attrs["budget"])
+        page.log_axis(ax.xaxis)
         page.name_axes(ax, "episodes")
     _frame_losses(losses, dataset)
     _frame_shares(shares, dataset)
     page.head(picture, losses, dataset, dataset.attrs["title"])
-    page.finish(picture, entries, columns=2 if dataset["unsuccessful"].any() else 4)
+    page.finish(picture, columns=2 if dataset["unsuccessful"].any() else 4)
     return picture
 
 
-def _draw_method(losses: Axes, shares: Axes, dataset: xr.Dataset, row: int) -> Artist:
+def _draw_method(losses: Axes, shares: Axes, dataset: xr.Dataset, row: int) -> None:
     one = dataset.isel(method=row)
     name = str(one["method"].item())
     look = page.sheet_of(losses).look(style.METHOD_LINE | style.METHODS.get(name, style.OTHER_METHOD))
@@ -140,12 +132,11 @@ def _draw_method(losses: Axes, shares: Axes, dataset: xr.Dataset, row: int) -> A
         "markevery": (MARK_SPACING * (row + 0.5) / dataset.sizes["method"], MARK_SPACING),
     }
     episodes, mean, low, high = (_where_finite(one[key], one["mean"]) for key in ("episodes", "mean", "low", "high"))
-    (line,) = losses.plot(episodes, mean, label=_label(name, one, dataset), **look)
+    losses.plot(episodes, mean, label=_label(name, one, dataset), **look)
     losses.fill_between(episodes, low, high, step="post", color=look["color"], **style.METHOD_BAND)
     hits = np.sort(_where_finite(one["hit"], one["hit"]))
     share = np.arange(len(hits) + 1) / max(one["hit"].size, 1)
     shares.plot([1, *hits, dataset.attrs["budget"]], [*share, share[-1]], **look)
-    return line
 
 
 def _label(name: str, one: xr.Dataset, dataset: xr.Dataset) -> str:
@@ -167,7 +158,7 @@ def _frame_losses(ax: Axes, dataset: xr.Dataset) -> None:
         said = "no method succeeded with every seed: no mean"
         ax.set_yticks([])
     elif dataset.attrs["spacing"] == "log" and easiest >= DECADE * hardest:
-        style.log_axis(ax.yaxis)
+        page.log_axis(ax.yaxis)
     elif count > 1:
         ax.set_ylim(top=min(ax.get_ylim()[1], 2 * easiest - hardest))
     look: dict[str, Any] = {"size": page.sheet_of(ax).small, "color": style.QUIET, "ha": "right", "va": "top"}
@@ -259,21 +250,19 @@ def _frame(ax: Axes, dataset: xr.Dataset, *, upright: bool) -> None:
         ax.axvline(column - 0.5, color="white", linewidth=sheet.weight)
 
 
-def _legend(dataset: xr.Dataset, *, told: bool) -> list[Patch]:
+def _legend(dataset: xr.Dataset, *, told: bool) -> list[Artist | str]:
     """Say what stands in the cells."""
-    blank: dict[str, Any] = {"facecolor": "none", "edgecolor": "none"}
     below = (
         "below it the 95 % bootstrap interval, over seeds, and over scenes in the last row"
         if told
         else "intervals are in league.json"
     )
     known = [
-        Patch(**blank, label=f"mean rank over {_seeds(dataset)}; {below}"),
-        Patch(**blank, label="bold: first, ahead of every other method by the rank test, corrected for all pairs"),
+        f"mean rank over {_seeds(dataset)}; {below}",
+        "bold: first, ahead of every other method by the rank test, corrected for all pairs",
     ]
-    if not np.isfinite(dataset["rank"]).all():
-        known.append(Patch(**style.NOT_RUN, label="did not run here"))
-    return [*known, Patch(**blank, label=dataset.attrs["command"])]
+    missing = [] if np.isfinite(dataset["rank"]).all() else [Patch(**style.NOT_RUN, label="did not run here")]
+    return [*known, *missing, dataset.attrs["command"]]
 
 
 def _in_two(name: str) -> str:

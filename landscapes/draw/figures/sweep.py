@@ -125,14 +125,13 @@ def frame_figure(sweep: Sweep, number: int, scales: Scales, *, width: float | No
     """Draw one frame: loss map, arrows, the value and where in its range it is; nothing moves from frame to frame."""
     dataset, panels = sweep.slices[number], 1 if scales.slope is None else 2
     sheet = style.Sheet.of(width, pitch=PITCH, columns=panels)
-    layout = Layout(
-        sheet, panels, 2 + len({one.get_hatch() for slice_ in sweep.slices for one in page.failure_key(slice_)})
-    )
+    ended = {code for one in sweep.slices for code in np.unique(one["status"]).tolist()} & {*style.ENDED}
+    layout = Layout(sheet, panels, 2 + len(ended))
     picture = page.Picture(sheet, layout.height)
     axes = [picture.add_axes(layout.panel(place)) for place in range(panels)]
-    entries = contour.loss_panel(axes[0], dataset, scales.loss)
+    contour.loss_panel(axes[0], dataset, scales.loss)
     if scales.slope:
-        entries += contour.arrow_panel(axes[1], dataset, scales.slope)
+        contour.arrow_panel(axes[1], dataset, scales.slope)
     plane = plane_of(dataset)
     for ax in axes:
         contour.frame(ax, dataset, plane)
@@ -140,7 +139,7 @@ def frame_figure(sweep: Sweep, number: int, scales: Scales, *, width: float | No
     _draw_range(picture, layout, sweep, sweep.values[number])
     _write(picture, layout, dataset)
     legend = picture.legend(
-        handles=[*entries, *page.failure_key(dataset)], loc="upper left", ncols=layout.columns,
+        handles=page.drawn_signs(picture), loc="upper left", ncols=layout.columns,
         bbox_to_anchor=layout.box(LEFT * sheet.type, layout.foot - AXIS * sheet.type, 0.0, 0.0)[:2],
         fontsize=sheet.tick, frameon=False, handlelength=1.8, columnspacing=1.6, borderpad=0, borderaxespad=0,
     )  # fmt: skip

@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
 
 from .. import style
 from . import page
 
 if TYPE_CHECKING:
-    from ....studies.symmetry import MeasuredReplica, SymmetryRecord
-    from ...statistics import Estimate
+    from ....studies.symmetry import SymmetryRecord
 
 PITCH, ROW, LEAST = 6.2, 0.09, 0.3  # room of a panel on a screen [inch]; height of a row and least height, by width
+MARK = style.VARIANT_MARK | {"color": style.LOSS_LINE, "marker": "o"}
 
 
 def symmetry_figure(found: SymmetryRecord, *, width: float | None = None) -> page.Picture:
@@ -28,53 +24,25 @@ def symmetry_figure(found: SymmetryRecord, *, width: float | None = None) -> pag
 
     Raises ValueError where the page is too narrow or too wide.
     """
-    sheet = style.Sheet.of(width, pitch=PITCH, columns=1, panels=2)
-    picture = page.Picture(sheet, sheet.width)
-    axes = page.grid(picture, 2)
-    for ax in axes:
+    replicas, share = found.replicas, found.floor.share
+    picture, axes = page.panels(style.Sheet.of(width, pitch=PITCH, columns=1, panels=2), 2)
+    hollow = picture.sheet.look(MARK | {"markerfacecolor": "white", "markeredgecolor": style.LOSS_LINE})
+    low = [one.cosine_low for one in replicas]
+    axes[1].plot(low, range(len(low)), **hollow, gid="quartile", label="lower quartile")
+    estimates = ([one.apart for one in replicas], [one.cosine for one in replicas])
+    for ax, values, unit in zip(axes, estimates, (100.0, 1.0), strict=True):
         page.dress(ax)
-        ax.set_box_aspect(max(LEAST, ROW * len(found.replicas)))
-    _draw_losses(axes[0], found)
-    _draw_gradients(axes[1], found.replicas)
-    look = sheet.look(style.VARIANT_MARK | {"color": style.LOSS_LINE, "marker": "o"})
-    entries = [
-        Line2D([], [], **look, label="a replica against the scene itself"),
-        Line2D([], [], **sheet.look(style.INTERVAL_LINE), label="95 % interval"),
-        Line2D(
-            [], [], **{**look, "markerfacecolor": "white", "markeredgecolor": style.LOSS_LINE}, label="lower quartile"
-        ),
-        Patch(color=style.BAND[0], label="all replicas together"),
-    ]
-    page.entitle(picture, f"{found.env} · symmetry · {found.fidelity}, {found.points} points")
-    page.finish(picture, entries, columns=2, heading=" · ".join(page.made_by(found)))
-    return picture
-
-
-def _draw_losses(ax: Axes, found: SymmetryRecord) -> None:
-    """Draw how far losses are apart, in per cent of the range."""
-    _draw_rows(ax, found.replicas, [one.apart for one in found.replicas], unit=100.0)
-    share = found.floor.share
+        ax.set_box_aspect(max(LEAST, ROW * len(replicas)))
+        label = "a replica against the scene itself"
+        page.draw_rows(ax, unit * page.ends_of(values), MARK, label, gid="replica")
+        ax.set_yticks(range(len(replicas)), [one.name for one in replicas])
+        ax.set_ylim(len(replicas) - 0.5, -0.5)
     if np.isfinite(share.low):
-        ax.axvspan(100 * share.low, 100 * share.high, color=style.BAND[0], zorder=0, gid="floor")
-    ax.set_xlim(left=0)
-    page.name_axes(ax, "losses apart [% of the range]")
-
-
-def _draw_gradients(ax: Axes, replicas: Sequence[MeasuredReplica]) -> None:
-    """Draw the cosines of gradients."""
-    look = page.sheet_of(ax).look(style.VARIANT_MARK | {"color": style.LOSS_LINE, "marker": "o"})
-    hollow = {**look, "markerfacecolor": "white", "markeredgecolor": style.LOSS_LINE}
-    ax.plot([one.cosine_low for one in replicas], range(len(replicas)), **hollow, gid="quartile")
-    _draw_rows(ax, replicas, [one.cosine for one in replicas])
-    page.name_axes(ax, "cosine of gradients with the scene's")
-
-
-def _draw_rows(ax: Axes, replicas: Sequence[MeasuredReplica], values: Sequence[Estimate], unit: float = 1.0) -> None:
-    """Draw an estimate with its interval in each replica's row, named on the left, the first one on top."""
-    sheet = page.sheet_of(ax)
-    look = sheet.look(style.VARIANT_MARK | {"color": style.LOSS_LINE, "marker": "o"})
-    for place, one in enumerate(values):
-        ax.plot([unit * one.low, unit * one.high], [place, place], **sheet.look(style.INTERVAL_LINE), gid="interval")
-        ax.plot([unit * one.value], [place], **look, gid="replica")
-    ax.set_yticks(range(len(replicas)), [one.name for one in replicas])
-    ax.set_ylim(len(replicas) - 0.5, -0.5)
+        look = {"color": style.BAND[0], "zorder": 0, "gid": "floor", "label": "all replicas together"}
+        axes[0].axvspan(100 * share.low, 100 * share.high, **look)
+    axes[0].set_xlim(left=0)
+    page.name_axes(axes[0], "losses apart [% of the range]")
+    page.name_axes(axes[1], "cosine of gradients with the scene's")
+    page.entitle(picture, f"{found.env} · symmetry · {found.fidelity}, {found.points} points")
+    page.finish(picture, heading=" · ".join(page.made_by(found)))
+    return picture

@@ -14,7 +14,6 @@ import xarray as xr
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
-from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
 from ...identity import plane_of
@@ -86,8 +85,7 @@ def surface_figure(dataset: xr.Dataset, runs: Runs = (), *, width: float | None 
     """
     sheet = style.Sheet.of(width, pitch=PITCH)
     fine = max(1.0, FINE * sheet.width / PIXELS[0]) if width else 1.0
-    picture = page.Picture(sheet, sheet.width)
-    ax = picture.add_subplot()
+    picture, (ax,) = page.panels(sheet, 1)
     with scene(dataset, runs, pixels=(round(fine * PIXELS[0]), round(fine * PIXELS[1]))) as shown:
         ax.imshow(np.asarray(shown.plotter.screenshot(return_img=True)), interpolation="antialiased", aspect="auto")
         _crop(ax, shown)
@@ -96,7 +94,7 @@ def surface_figure(dataset: xr.Dataset, runs: Runs = (), *, width: float | None 
     scale = shown.relief.scale
     shown_scale = ScalarMappable(scale.norm, style.LOSS_MAP)
     page.colour_bar(ax, shown_scale, page.loss_name(dataset), scale, fraction=0.03, shrink=0.8)
-    page.finish(picture, [*_entries(sheet, runs), *_holes(dataset)], columns=3)
+    page.finish(picture, [*_signs(sheet, runs), *_holes(dataset)], columns=3)
     return picture
 
 
@@ -208,20 +206,18 @@ def _name(ax: Axes, shown: Shown, axis: int, name: str, away: float) -> None:
     ax.text(x, y, name, rotation=slope, rotation_mode="anchor", ha="center", va="center", **look)
 
 
-def _entries(sheet: style.Sheet, runs: Runs) -> list[Artist]:
-    """Return legend entries of methods and of kinds of points."""
-    dot = sheet.look({"linestyle": "none", "marker": "o", "markersize": 6.0})
+def _signs(sheet: style.Sheet, runs: Runs) -> list[Artist | str]:
+    """Say what stands for kinds of points and for methods."""
+    dot = {"linestyle": "none", "marker": "o", "markersize": 6.0}
     kinds = dict.fromkeys(name for run in runs for name, _ in by_kind(run))
-    found: list[Artist] = [Line2D([], [], color=style.POINT_MARKS[name]["color"], **dot, label=name) for name in kinds]
+    found: list[Artist | str] = [page.sign(sheet, k, dot | {"color": style.POINT_MARKS[k]["color"]}) for k in kinds]
     methods = {str(run.attrs["method"]): style.method(run)["color"] for run in runs}
-    large = dot | {"markersize": 10.0 * sheet.weight}
-    bests = [Line2D([], [], color=color, **large, label=f"{m}: best") for m, color in methods.items()]
+    found += [page.sign(sheet, f"{m}: best", dot | {"markersize": 10.0, "color": c}) for m, c in methods.items()]
     outside = sum(int(run["outside"].sum()) for run in runs)
-    beyond = [Line2D([], [], linestyle="none", label=f"beyond the slice: {outside} points")] if outside else []
-    return [*found, *bests, *beyond]
+    return [*found, f"beyond the slice: {outside} points"] if outside else found
 
 
-def _holes(dataset: xr.Dataset) -> list[Artist]:
+def _holes(dataset: xr.Dataset) -> list[str]:
     status = dataset["status"].to_numpy()
     holes = int((~has_loss(status)).sum())
-    return [Line2D([], [], linestyle="none", label=f"holes: {holes} of {status.size} samples")] if holes else []
+    return [f"holes: {holes} of {status.size} samples"] if holes else []
