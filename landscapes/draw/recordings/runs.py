@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +22,7 @@ from ..figures import contour, page
 from ..figures.overlay import by_kind, farthest_distance, half_widths, joint_scale
 from ..figures.sweep import RATES, Scales, Sweep
 from ..render import relief
-from ..render.relief import HEIGHT, SIDE
+from ..render.relief import HEIGHT, SIDE, Relief
 
 Runs = Sequence[xr.Dataset]
 Grid = NDArray[np.float64]
@@ -44,74 +43,62 @@ def save_stream(dataset: xr.Dataset, runs: Runs, path: str | Path) -> None:
     smaller the farther it lies off the plane. What is known after so many evaluations is what the timeline
     `evaluation` shows there; nothing else, no clock, is recorded, so that equal runs give equal recordings.
     """
-    scene = Scene.of(dataset, runs)
+    body = Relief.of(dataset, joint_scale(dataset, runs))
     arrays = [dataset["loss"], *(run[name] for run in runs for name in ("x", "loss"))]
-    with recording(digest(arrays), Path(path), _blueprint(dataset, scene)) as stream:
-        _log(stream, SURFACE, surface(scene, dataset))
+    what = "best loss so far, log10" if body.scale.logarithmic else "best loss so far"
+    curves = rrb.TimeSeriesView(name=what, origin="best", plot_legend=rrb.Corner2D.RightTop)
+    panel = rrb.TimePanel(timeline=TIMELINE, play_state="following", state="collapsed")
+    ends = {"start": rrb.TimeRangeBoundary.infinite(), "end": rrb.TimeRangeBoundary.cursor_relative()}
+    blueprint = _blueprint(dataset, body, curves, panel, rrb.VisibleTimeRange(TIMELINE, **ends))
+    with recording(digest(arrays), Path(path), blueprint) as stream:
+        _log(stream, SURFACE, _surface(body, dataset))
         if "grad" in dataset:
-            _log(stream, ARROWS, descent_arrows(scene, dataset))
-        log_axes(stream, scene, dataset)
+            _log(stream, ARROWS, _descent_arrows(body, dataset))
+        _log_axes(stream, body, dataset)
+        reach = farthest_distance(runs)
         for run in runs:
-            _log_run(stream, scene, run)
-            _log_best(stream, scene, run)
-        _log_key(stream, scene, runs)
-        _log(stream, "about", rr.TextDocument(_about(dataset, runs, scene), media_type=rr.MediaType.MARKDOWN))
+            _log_run(stream, body, run, reach)
+            _log_best(stream, body, run)
+        _log_key(stream, body, runs)
+        _log(stream, "about", rr.TextDocument(_about(dataset, runs, body, reach), media_type=rr.MediaType.MARKDOWN))
 
 
-@dataclass(frozen=True, eq=False)
-class Scene:
-    """Say where plane coordinates and losses are in the scene, which is centred on the slice's window."""
-
-    body: relief.Relief
-    reach: float
-
-    @classmethod
-    def of(cls, dataset: xr.Dataset, runs: Runs, scale: style.Scale | None = None) -> Scene:
-        """Return the scene of a slice and of runs laid over it, on the scale of their losses unless given."""
-        return cls(relief.Relief.of(dataset, scale or joint_scale(dataset, runs)), farthest_distance(runs))
-
-    @property
-    def eye(self) -> rrb.EyeControls3D:
-        """From where it is seen at first."""
-        place, focus = self.body.place(0.0, AWAY, UP), (0.0, 0.0, relief.FOCUS)
-        return rrb.EyeControls3D(position=place, look_target=focus, eye_up=(0.0, 0.0, 1.0))
-
-    def at(self, u: Grid, v: Grid, loss: Grid) -> Grid:
-        """Return positions, shape (..., 3); places beyond the window are moved to its border."""
-        (left, front), (right, back) = (side.numpy() for side in self.body.plane.cell_bounds())
-        return self.body.at(np.clip(u, left, right), np.clip(v, front, back), loss)
-
-    def tint(self, loss: Grid) -> NDArray[np.uint8]:
-        """Return the colour of a loss."""
-        return style.LOSS_MAP(self.body.shade(loss), bytes=True)
+def _places(body: Relief, dataset: xr.Dataset, loss: Grid | None = None) -> Grid:
+    """Return where the points of a slice or of a run are, shape (..., 3); those beyond the window are at its border."""
+    u, v = dataset["u"].to_numpy(), dataset["v"].to_numpy()
+    if loss is None:
+        loss = dataset["loss"].to_numpy()
+    if loss.ndim == 2:
+        u, v = np.meshgrid(u, v)
+    low, high = (side.numpy() for side in body.plane.cell_bounds())
+    return body.at(np.clip(u, low[0], high[0]), np.clip(v, low[1], high[1]), loss)
 
 
 def _log(stream: rr.RecordingStream, path: str, archetype: rr.AsComponents) -> None:
     stream.log(path, archetype, static=True, strict=True)
 
 
-def surface(scene: Scene, dataset: xr.Dataset) -> rr.Mesh3D:
+def _surface(body: Relief, dataset: xr.Dataset) -> rr.Mesh3D:
     """Return a slice as flat cells whose height and colour are the loss."""
-    made = relief.cells(scene.body, dataset)
+    made = relief.cells(body, dataset)
     loss = dataset["loss"].transpose("v", "u").to_numpy().ravel()
+    colours = style.LOSS_MAP(body.shade(loss[made.sample]), bytes=True)
     return rr.Mesh3D(
         vertex_positions=made.corners.reshape(-1, 3),
         triangle_indices=made.triangles,
         vertex_normals=np.repeat(made.normals, 4, axis=0),
-        vertex_colors=np.repeat(scene.tint(loss[made.sample]), 4, axis=0),
+        vertex_colors=np.repeat(colours, 4, axis=0),
     )
 
 
-def descent_arrows(scene: Scene, dataset: xr.Dataset, scale: style.Scale | None = None) -> rr.Arrows3D:
+def _descent_arrows(body: Relief, dataset: xr.Dataset, scale: style.Scale | None = None) -> rr.Arrows3D:
     """Lay the directions of steepest descent on the cells, coloured by the gradient's magnitude."""
     rows, columns = (contour.arrows_along(dataset, name) for name in ("v", "u"))
     at = np.ix_(rows, columns)
     logarithm = contour.log_magnitude(dataset)
     norm = (scale or style.Scale.of_magnitude(logarithm)).norm
-    u, v = np.meshgrid(dataset["u"].to_numpy(), dataset["v"].to_numpy())
-    places = scene.at(u, v, dataset["loss"].transpose("v", "u").to_numpy())
-    origins = places[at]
-    flat = contour.descent(contour.slopes(dataset), scene.body.plane)[at] * 0.8 * SIDE / max(len(rows), len(columns))
+    origins = _places(body, dataset)[at]
+    flat = contour.descent(contour.slopes(dataset), body.plane)[at] * 0.8 * SIDE / max(len(rows), len(columns))
     vectors = np.concatenate([flat, np.zeros_like(flat[..., :1])], axis=-1)
     seen = np.isfinite(vectors).all(axis=-1) & np.isfinite(origins).all(axis=-1)
     return rr.Arrows3D(
@@ -122,27 +109,27 @@ def descent_arrows(scene: Scene, dataset: xr.Dataset, scale: style.Scale | None 
     )
 
 
-def log_axes(stream: rr.RecordingStream, scene: Scene, dataset: xr.Dataset) -> None:
+def _log_axes(stream: rr.RecordingStream, body: Relief, dataset: xr.Dataset) -> None:
     """Frame the scene, with the ticks of both parameters and of the loss."""
-    frame = rr.LineStrips3D(scene.body.frame(), colors=rgba(style.MID_GREY), radii=LINE / 2)
+    frame = rr.LineStrips3D(body.frame(), colors=rgba(style.MID_GREY), radii=LINE / 2)
     _log(stream, "landscape/axes/frame", frame)
-    for axis, name in enumerate((*scene.body.plane.labels, page.loss_name(dataset))):
-        ticks, share = scene.body.ticks(axis)
-        places = [scene.body.beside(axis, part, TICKS) for part in share]
-        places.append(scene.body.beside(axis, 0.5, NAMES) if axis < 2 else scene.body.beside(axis, OVER, TICKS))
-        labels = [*(scene.body.write(axis, tick) for tick in ticks.tolist()), name]
+    for axis, name in enumerate((*body.plane.labels, page.loss_name(dataset))):
+        ticks, share = body.ticks(axis)
+        places = [body.beside(axis, part, TICKS) for part in share]
+        places.append(body.beside(axis, 0.5, NAMES) if axis < 2 else body.beside(axis, OVER, TICKS))
+        labels = [*(body.write(axis, tick) for tick in ticks.tolist()), name]
         points = rr.Points3D(places, labels=labels, show_labels=True, colors=rgba(style.MID_GREY), radii=DOT)
         _log(stream, f"landscape/axes/{'uvz'[axis]}", points)
 
 
-def _log_key(stream: rr.RecordingStream, scene: Scene, runs: Runs) -> None:
+def _log_key(stream: rr.RecordingStream, body: Relief, runs: Runs) -> None:
     """Label the colours of points, behind the scene: the labels themselves in one that is read on every ground."""
     shown = {name: style.POINT_MARKS[name]["color"] for run in runs for name, _ in by_kind(run)}
     if any(run["outside"].any() for run in runs):
         shown["outside"] = style.BEYOND
     if any(failed(run["status"]).any() for run in runs):
         shown["failed"] = style.LOST
-    behind, left = (np.array(scene.body.place(turn, 1.0, -relief.FOCUS)) for turn in (180.0, -90.0))
+    behind, left = (np.array(body.place(turn, 1.0, -relief.FOCUS)) for turn in (180.0, -90.0))
     high = np.array([0.0, 0.0, 1.25 * HEIGHT])
     places = [SIDE / 2 * behind + 0.45 * (number - 0.5) * left + high for number in range(len(shown))]
     colors = [rgba(color) for color in shown.values()]
@@ -151,10 +138,10 @@ def _log_key(stream: rr.RecordingStream, scene: Scene, runs: Runs) -> None:
     _log(stream, "landscape/key/names", names)
 
 
-def _log_run(stream: rr.RecordingStream, scene: Scene, run: xr.Dataset) -> None:
+def _log_run(stream: rr.RecordingStream, body: Relief, run: xr.Dataset, reach: float) -> None:
     path, loss, outside = f"landscape/runs/{_path_of(run)}", run["loss"].to_numpy(), run["outside"].to_numpy()
-    places = scene.at(run["u"].to_numpy(), run["v"].to_numpy(), np.nan_to_num(loss, nan=-np.inf))
-    radii = RADIUS * np.sqrt(style.point_areas(run["distance"].to_numpy(), scene.reach, 1) / style.MARK_AREAS[1])
+    places = _places(body, run, np.nan_to_num(loss, nan=-np.inf))
+    radii = RADIUS * np.sqrt(style.point_areas(run["distance"].to_numpy(), reach, 1) / style.MARK_AREAS[1])
     lost = failed(run["status"].to_numpy())
     groups = [(name, here & ~outside & ~lost, style.POINT_MARKS[name]["color"]) for name, here in by_kind(run)]
     groups += [("outside", outside & ~lost, style.BEYOND), ("failed", lost, style.LOST)]
@@ -163,35 +150,31 @@ def _log_run(stream: rr.RecordingStream, scene: Scene, run: xr.Dataset) -> None:
     rows = np.flatnonzero(run["previous"].to_numpy() >= 0)
     steps = np.stack([places[run["previous"].to_numpy()[rows]], places[rows]], axis=1)
     _log_lines(stream, f"{path}/descents", rows, steps, style.method(run)["color"])
-    _log_gaps(stream, scene, run, f"{path}/gaps", places)
+    _log_gaps(stream, body, run, f"{path}/gaps", places)
 
 
-def _log_gaps(stream: rr.RecordingStream, scene: Scene, run: xr.Dataset, path: str, places: Grid) -> None:
+def _log_gaps(stream: rr.RecordingStream, body: Relief, run: xr.Dataset, path: str, places: Grid) -> None:
     """Join each point to the surface below or above it, where its loss is another."""
     feet = places.copy()
-    feet[:, 2] = scene.body.height(run["beneath"].to_numpy())
+    feet[:, 2] = body.height(run["beneath"].to_numpy())
     apart = np.isfinite(run["loss"].to_numpy()) & (np.abs(feet[:, 2] - places[:, 2]) > RADIUS)
     rows = np.flatnonzero(apart)
     _log_lines(stream, path, rows, np.stack([feet[rows], places[rows]], axis=1), style.MID_GREY)
 
 
-def _log_best(stream: rr.RecordingStream, scene: Scene, run: xr.Dataset) -> None:
+def _log_best(stream: rr.RecordingStream, body: Relief, run: xr.Dataset) -> None:
     """Log the least loss so far as a curve and the points that lowered it in the scene."""
     label, color, best = run.attrs["label"], style.method(run)["color"], run["best"].to_numpy()
     known = np.flatnonzero(np.isfinite(best))
     if not len(known):
         return
     with np.errstate(divide="ignore", invalid="ignore"):  # a run may go below the losses of a slice, and below zero
-        curve = np.log10(best[known]) if scene.body.scale.logarithmic else best[known]
+        curve = np.log10(best[known]) if body.scale.logarithmic else best[known]
     _log(stream, f"best/{_path_of(run)}", rr.SeriesLines(colors=rgba(color), names=label, widths=1.5))
     stream.send_columns(f"best/{_path_of(run)}", _times(known), rr.Scalars.columns(scalars=curve), strict=True)
-    lowered = improvements(run)
-    places = scene.at(*(run[name].to_numpy()[lowered] for name in ("u", "v", "loss")))
-    spread = np.empty((run.sizes["evaluation"], 3))
-    spread[lowered] = places
-    _log_points(
-        stream, f"landscape/runs/{_path_of(run)}/best", lowered, spread, np.full(len(spread), 1.6 * RADIUS), color
-    )
+    lowered, places = improvements(run), _places(body, run)
+    radii = np.full(len(places), 1.6 * RADIUS)
+    _log_points(stream, f"landscape/runs/{_path_of(run)}/best", lowered, places, radii, color)
 
 
 def _path_of(run: xr.Dataset) -> str:
@@ -226,40 +209,37 @@ def rgba(color: str, opacity: float | None = None) -> NDArray[np.uint8]:
     return found
 
 
-def _blueprint(dataset: xr.Dataset, scene: Scene) -> rrb.Blueprint:
-    so_far = rrb.VisibleTimeRange(
-        TIMELINE, start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.cursor_relative()
-    )
-    what = "best loss so far, log10" if scene.body.scale.logarithmic else "best loss so far"
-    curves = rrb.TimeSeriesView(name=what, origin="best", plot_legend=rrb.Corner2D.RightTop)
-    panel = rrb.TimePanel(timeline=TIMELINE, play_state="following", state="collapsed")
-    return _views(dataset, scene, curves, panel, so_far)
-
-
-def _views(
+def _blueprint(
     dataset: xr.Dataset,
-    scene: Scene,
+    body: Relief,
     curves: rrb.TimeSeriesView,
     panel: rrb.TimePanel,
     ranges: rrb.VisibleTimeRange | None = None,
 ) -> rrb.Blueprint:
-    """Return the layout: the scene on the left, curves and a description of all runs on the right."""
+    """Return the layout: the scene on the left, curves and a description on the right."""
+    place, focus = body.place(0.0, AWAY, UP), (0.0, 0.0, relief.FOCUS)
+    eye = rrb.EyeControls3D(position=place, look_target=focus, eye_up=(0.0, 0.0, 1.0))
     space = rrb.Spatial3DView(
-        name=page.title(dataset), origin="landscape", time_ranges=ranges, eye_controls=scene.eye, line_grid=False
+        name=page.title(dataset), origin="landscape", time_ranges=ranges, eye_controls=eye, line_grid=False
     )
     right = rrb.Vertical(curves, rrb.TextDocumentView(name="about", origin="about"))
     return rrb.Blueprint(rrb.Horizontal(space, right, column_shares=[2.2, 1.0]), panel, collapse_panels=True)
 
 
-def _about(dataset: xr.Dataset, runs: Runs, scene: Scene) -> str:
+def _ends(scale: style.Scale) -> tuple[str, str, str]:
+    """Write both ends of a scale, and what kind it is."""
+    low, high = map(style.number, scale.ends)
+    return low, high, "logarithmic" if scale.logarithmic else "linear"
+
+
+def _about(dataset: xr.Dataset, runs: Runs, body: Relief, reach: float) -> str:
     """Say in Markdown what is to be seen, and where it comes from."""
-    low, high = map(style.number, scene.body.scale.ends)
-    kind = "logarithmic" if scene.body.scale.logarithmic else "linear"
+    low, high, kind = _ends(body.scale)
     unit = dataset["loss"].attrs.get("units", "")
     distance = (
-        f"A point on the plane is largest; one {half_widths(scene.reach)} off it has "
+        f"A point on the plane is largest; one {half_widths(reach)} off it has "
         f"{style.FARTHEST_SHARE**0.5:.0%} of that radius."
-        if scene.reach
+        if reach
         else "Every point lies on the plane."
     )
     lines = [
@@ -276,7 +256,7 @@ def _about(dataset: xr.Dataset, runs: Runs, scene: Scene) -> str:
         "|---|---|---|---|---|",
         *(_row(run) for run in runs),
         "",
-        f"Best losses are plotted as {'their decimal logarithm' if scene.body.scale.logarithmic else 'they are'}.",
+        f"Best losses are plotted as {'their decimal logarithm' if body.scale.logarithmic else 'they are'}.",
         "",
         page.provenance(dataset),
     ]
@@ -318,38 +298,33 @@ def recording(name: str, path: Path, blueprint: rrb.Blueprint) -> Iterator[rr.Re
 def save_sweep(sweep: Sweep, path: Path) -> None:
     """Write the slices as surfaces on a rerun timeline named after what moves, numbered like the frames from 0."""
     scales, first = Scales.of(sweep), sweep.slices[0]
-    scene = Scene.of(first, [], scales.loss)
+    body = Relief.of(first, scales.loss)
     arrays = [np.asarray(sweep.values), *(one["loss"].to_numpy() for one in sweep.slices)]
-    with recording(digest(arrays), path, _blueprint_sweep(sweep, scene)) as kept:
-        log_axes(kept, scene, first)
-        _log(kept, "about", rr.TextDocument(_about_sweep(sweep, scales), media_type=rr.MediaType.MARKDOWN))
+    hidden = rrb.PlotLegend(visible=False)
+    curve = rrb.TimeSeriesView(name="lowest loss of each frame", origin="lowest", plot_legend=hidden)
+    panel = rrb.TimePanel(timeline=sweep.name, state="expanded", fps=RATES[-1], loop_mode="all")
+    with recording(digest(arrays), path, _blueprint(first, body, curve, panel)) as kept:
+        _log_axes(kept, body, first)
+        _log(kept, "about", rr.TextDocument(_about_sweep(sweep, scales.loss), media_type=rr.MediaType.MARKDOWN))
         for number, dataset in enumerate(sweep.slices):
             kept.set_time(sweep.name, sequence=number)
-            kept.log(SURFACE, surface(scene, dataset), strict=True)
+            kept.log(SURFACE, _surface(body, dataset), strict=True)
             if scales.slope:
-                kept.log(ARROWS, descent_arrows(scene, dataset, scales.slope), strict=True)
-            kept.log("landscape/value", _label(sweep, scene, number), strict=True)
+                kept.log(ARROWS, _descent_arrows(body, dataset, scales.slope), strict=True)
+            kept.log("landscape/value", _label(sweep, body, number), strict=True)
             if np.isfinite(dataset["loss"]).any():
                 kept.log("lowest", rr.Scalars(float(dataset["loss"].min())), strict=True)
 
 
-def _label(sweep: Sweep, scene: Scene, number: int) -> rr.Points3D:
-    place = scene.body.place(180.0, SIDE / 2, HEIGHT)
+def _label(sweep: Sweep, body: Relief, number: int) -> rr.Points3D:
+    place = body.place(180.0, SIDE / 2, HEIGHT)
     said = f"{sweep.name} = {sweep.write_value(sweep.values[number])}"
     return rr.Points3D([place], labels=[said], show_labels=True, colors=rgba(style.MID_GREY), radii=DOT)
 
 
-def _blueprint_sweep(sweep: Sweep, scene: Scene) -> rrb.Blueprint:
-    hidden = rrb.PlotLegend(visible=False)
-    curve = rrb.TimeSeriesView(name="lowest loss of each frame", origin="lowest", plot_legend=hidden)
-    panel = rrb.TimePanel(timeline=sweep.name, state="expanded", fps=RATES[-1], loop_mode="all")
-    return _views(sweep.slices[0], scene, curve, panel)
-
-
-def _about_sweep(sweep: Sweep, scales: Scales) -> str:
+def _about_sweep(sweep: Sweep, scale: style.Scale) -> str:
     """Say in Markdown what is to be seen, and where it comes from."""
-    low, high = map(style.number, scales.loss.ends)
-    kind = "logarithmic" if scales.loss.logarithmic else "linear"
+    low, high, kind = _ends(scale)
     lines = [
         f"# {page.title(sweep.slices[0])}\n",
         f"One surface for each value of {sweep.label}, by number on the timeline. Height and colour: loss from {low} "

@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import xarray as xr
-from matplotlib.ticker import LogLocator, MaxNLocator
 from numpy.typing import NDArray
 
 from ...identity import plane_of
@@ -70,15 +69,11 @@ class Relief:
 
         Of the loss none is at the foot, where another axis begins.
         """
-        low, high = [*zip(*(side.tolist() for side in self.plane.cell_bounds()), strict=True), self.scale.ends][axis]
-        if self._has_decades(axis):
-            ticks = np.asarray(decades(low, high))
-        else:
-            logarithmic = axis == 2 and self.scale.logarithmic
-            ticks = np.asarray((LogLocator(numticks=6) if logarithmic else MaxNLocator(5)).tick_values(low, high))
-        ticks = ticks[(ticks >= low) & (ticks <= high)]
         if axis < 2:
+            low, high = (float(side[axis]) for side in self.plane.cell_bounds())
+            ticks = np.asarray((decades if self._has_decades(axis) else style.round_values)(low, high))
             return ticks, (ticks - low) / (high - low)
+        ticks = np.asarray(self.scale.ticks())
         share = self.shade(ticks)
         return ticks[share > FOOT], share[share > FOOT]
 
