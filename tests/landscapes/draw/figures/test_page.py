@@ -6,6 +6,7 @@ import json
 import pkgutil
 import re
 from collections.abc import Callable
+from functools import cache, partial
 from importlib import import_module
 from pathlib import Path
 
@@ -19,30 +20,11 @@ from gradscape.landscapes import draw
 from gradscape.landscapes.draw.figure import FIGURES as DISPATCHED
 from gradscape.landscapes.draw.figure import figure_of
 from gradscape.landscapes.draw.figures import page
-from gradscape.landscapes.draw.figures.accuracy import fidelity_figure, model_figure
-from gradscape.landscapes.draw.figures.check import check_figure
-from gradscape.landscapes.draw.figures.comparison import comparison_figure
-from gradscape.landscapes.draw.figures.contact import Caption, episode_figure
+from gradscape.landscapes.draw.figures.contact import Caption
 from gradscape.landscapes.draw.figures.contour import landscape_figure
-from gradscape.landscapes.draw.figures.convergence import convergence_figure
-from gradscape.landscapes.draw.figures.extremes import extremes_figure
-from gradscape.landscapes.draw.figures.hessian import hessian_figure
-from gradscape.landscapes.draw.figures.multiples import (
-    CompanionSlice,
-    Landscape,
-    card_figure,
-    census_figure,
-    companions_figure,
-    thumbnail_figure,
-    wall_figure,
-)
-from gradscape.landscapes.draw.figures.overlay import overlay_figure
+from gradscape.landscapes.draw.figures.multiples import CompanionSlice, Landscape, thumbnail_figure
 from gradscape.landscapes.draw.figures.profile import profile_figure
-from gradscape.landscapes.draw.figures.quality import quality_figure
-from gradscape.landscapes.draw.figures.search import league_figure, race_figure, run_figure
-from gradscape.landscapes.draw.figures.sweep import Scales, frame_figure
-from gradscape.landscapes.draw.figures.symmetry import symmetry_figure
-from gradscape.landscapes.draw.render.surface import surface_figure
+from gradscape.landscapes.draw.figures.sweep import Scales
 from gradscape.landscapes.episode import Episode, Part, View
 from gradscape.landscapes.measures import gradient_quality as gradients
 from gradscape.landscapes.measures.slice_comparison import SliceComparison, compare_slices
@@ -111,77 +93,58 @@ HUNG = [
 RACE = race(tuple(methods()), provenance=json.dumps({"created": "2026-11-21", "command": COMMAND}))
 MIXED = mixed()
 CHOSEN = {"draft": MIXED.variants[-1].name, "standard": MIXED.variants[10].name}
-FIGURES: dict[str, list[Callable[[float | None], page.Picture]]] = {
-    "landscape_figure": [
-        lambda width: landscape_figure(PLANE, width=width),
-        lambda width: landscape_figure(dated(sample(Bowl(), plane(9, 9), gradients=0)), width=width),
-    ],
-    "profile_figure": [lambda width: profile_figure(LONG, events={"bounces": BOUNCES}, width=width)],
+FIGURES: dict[str, list[Callable[[Callable[..., page.Picture]], page.Picture]]] = {
+    "landscape_figure": [lambda draw: draw(PLANE), lambda draw: draw(dated(sample(Bowl(), plane(9, 9), gradients=0)))],
+    "profile_figure": [lambda draw: draw(LONG, events={"bounces": BOUNCES})],
     "run_figure": [
-        lambda width: run_figure(
-            table([9.0, 3.0, np.nan, 0.01], [0, 1, 2, 3]).assign_attrs(provenance=json.dumps({"command": COMMAND})),
-            width=width,
+        lambda draw: draw(
+            table([9.0, 3.0, np.nan, 0.01], [0, 1, 2, 3]).assign_attrs(provenance=json.dumps({"command": COMMAND}))
         )
     ],
-    "quality_figure": [
-        lambda width: quality_figure(*quality(PLANE), width=width),
-        lambda width: quality_figure(*quality(LONG), width=width),
-    ],
-    "overlay_figure": [
-        lambda width: overlay_figure(dated(SLICE), LAID, width=width),
-        lambda width: overlay_figure(dated(SLICE), LAID[:1] * 12, width=width),
-    ],
-    "race_figure": [
-        lambda width: race_figure(RACE, width=width),
-        lambda width: race_figure(RACE.assign(unsuccessful=RACE["unsuccessful"] + 2), width=width),
-    ],
+    "quality_figure": [lambda draw: draw(*quality(PLANE)), lambda draw: draw(*quality(LONG))],
+    "overlay_figure": [lambda draw: draw(dated(SLICE), LAID), lambda draw: draw(dated(SLICE), LAID[:1] * 12)],
+    "race_figure": [lambda draw: draw(RACE), lambda draw: draw(RACE.assign(unsuccessful=RACE["unsuccessful"] + 2))],
     "comparison_figure": [
-        lambda width: comparison_figure(compared(DATASET, SHIFTED), width=width),
-        lambda width: comparison_figure(compared(LINE, LINE.assign(loss=1.2 * LINE["loss"])), width=width),
-        lambda width: comparison_figure(compared(DATASET, FAILED), width=width),
+        lambda draw: draw(compared(DATASET, SHIFTED)),
+        lambda draw: draw(compared(LINE, LINE.assign(loss=1.2 * LINE["loss"]))),
+        lambda draw: draw(compared(DATASET, FAILED)),
     ],
-    "surface_figure": [
-        lambda width: surface_figure(dated(SLICE), LAID, width=width),
-        lambda width: surface_figure(PLANE, width=width),
-    ],
-    "fidelity_figure": [
-        lambda width: fidelity_figure(fidelities(), width=width),
-        lambda width: fidelity_figure(MIXED, width=width, chosen=CHOSEN),
-    ],
-    "convergence_figure": [lambda width: convergence_figure(convergence(), width=width)],
-    "model_figure": [lambda width: model_figure(study(PARTS, failing=True), width=width)],
-    "companions_figure": [
-        lambda width: companions_figure([AIM, *CUTS], PLANE, width=width),
-        lambda width: companions_figure([CENTER, RANDOM], LONG, width=width),
-    ],
-    "card_figure": [lambda width: card_figure(card(), width=width)],
-    "census_figure": [lambda width: census_figure(census(), width=width)],
-    "check_figure": [
-        lambda width: check_figure(checked(), width=width),
-        lambda width: check_figure(checked((), kinds={}), width=width),
-    ],
+    "surface_figure": [lambda draw: draw(dated(SLICE), LAID), lambda draw: draw(PLANE)],
+    "fidelity_figure": [lambda draw: draw(fidelities()), lambda draw: draw(MIXED, chosen=CHOSEN)],
+    "convergence_figure": [lambda draw: draw(convergence())],
+    "model_figure": [lambda draw: draw(study(PARTS, failing=True))],
+    "companions_figure": [lambda draw: draw([AIM, *CUTS], PLANE), lambda draw: draw([CENTER, RANDOM], LONG)],
+    "card_figure": [lambda draw: draw(card())],
+    "census_figure": [lambda draw: draw(census())],
+    "check_figure": [lambda draw: draw(checked()), lambda draw: draw(checked((), kinds={}))],
     "hessian_figure": [
-        lambda width: hessian_figure(hessian(3, 3), width=width),
-        lambda width: hessian_figure(hessian(40, 40), width=width),
-        lambda width: hessian_figure(hessian(300, 10), width=width),
+        lambda draw: draw(hessian(3, 3)),
+        lambda draw: draw(hessian(40, 40)),
+        lambda draw: draw(hessian(300, 10)),
     ],
-    "extremes_figure": [lambda width: extremes_figure(extremes(), width=width)],
-    "symmetry_figure": [lambda width: symmetry_figure(symmetry(), width=width)],
-    "league_figure": [lambda width: league_figure(league(), width=width)],
-    "frame_figure": [lambda width: frame_figure(SWEEP, 1, Scales.of(SWEEP), width=width)],
-    "episode_figure": [lambda width: episode_figure(EPISODE, caption=CAPTION, width=width)],
-    "wall_figure": [lambda width: wall_figure(HUNG * 16, width=width), lambda width: wall_figure(HUNG, width=width)],
-    "thumbnail_figure": [lambda width: thumbnail_figure(DATASET, width=width)],
+    "extremes_figure": [lambda draw: draw(extremes())],
+    "symmetry_figure": [lambda draw: draw(symmetry())],
+    "league_figure": [lambda draw: draw(league())],
+    "frame_figure": [lambda draw: draw(SWEEP, 1, Scales.of(SWEEP))],
+    "episode_figure": [lambda draw: draw(EPISODE, caption=CAPTION)],
+    "wall_figure": [lambda draw: draw(HUNG * 16), lambda draw: draw(HUNG)],
+    "thumbnail_figure": [lambda draw: draw(DATASET)],
 }
-EACH = [pytest.param(make, id=f"{name}-{number}") for name, all_ in FIGURES.items() for number, make in enumerate(all_)]
+EACH = [
+    pytest.param(name, make, id=f"{name}-{number}") for name in FIGURES for number, make in enumerate(FIGURES[name])
+]
+
+
+@cache
+def functions() -> dict[str, Callable[..., page.Picture]]:
+    """Return every figure function there is, by its name."""
+    modules = [import_module(one.name) for one in pkgutil.walk_packages(draw.__path__, f"{draw.__name__}.")]
+    every = {name: made for module in modules for name, made in vars(module).items()}
+    return {name: made for name, made in every.items() if name.endswith("_figure") and not name.startswith("_")}
 
 
 def test_every_figure_function_is_held_to_this() -> None:
-    found = set()
-    for module in pkgutil.walk_packages(draw.__path__, f"{draw.__name__}."):
-        names = vars(import_module(module.name))
-        found |= {name for name in names if name.endswith("_figure") and not name.startswith("_")}
-    assert found == {*FIGURES, "mixed_figure"}  # which is that of a fidelity study, with other marks
+    assert set(functions()) == {*FIGURES, "mixed_figure"}  # which is that of a fidelity study, with other marks
 
 
 @pytest.mark.parametrize("kind", DISPATCHED)
@@ -233,11 +196,11 @@ def seen(picture: page.Picture) -> list[Text]:
 
 
 @pytest.mark.parametrize("width", WIDTHS)
-@pytest.mark.parametrize("make", EACH)
+@pytest.mark.parametrize(("name", "make"), EACH)
 def test_in_print_all_is_legible_on_the_page_and_apart(
-    make: Callable[..., page.Picture], width: float, tmp_path: Path
+    name: str, make: Callable[..., page.Picture], width: float, tmp_path: Path
 ) -> None:
-    picture = make(width)
+    picture = make(partial(functions()[name], width=width))
     assert isinstance(picture, page.Picture)  # which a notebook shows
     picture.canvas.draw()
     assert picture.get_size_inches()[0] * INCH == pytest.approx(width, abs=0.01)
@@ -265,8 +228,9 @@ def test_in_print_all_is_legible_on_the_page_and_apart(
 
 
 def test_panels_stand_one_below_the_other_in_a_column_and_side_by_side_on_a_page() -> None:
-    for make in (FIGURES["landscape_figure"][0], FIGURES["overlay_figure"][0], FIGURES["race_figure"][0]):
-        column, whole = (make(width).axes[:2] for width in WIDTHS)
+    for name in ("landscape_figure", "overlay_figure", "race_figure"):
+        make = FIGURES[name][0]
+        column, whole = (make(partial(functions()[name], width=width)).axes[:2] for width in WIDTHS)
         assert column[0].get_position().y0 > column[1].get_position().y1
         assert whole[0].get_position().x1 < whole[1].get_position().x0
 

@@ -1,6 +1,7 @@
 """Searches: the losses of a run, races of methods, and the map of a league."""
 
 import json
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
@@ -206,9 +207,11 @@ def ranked() -> xr.Dataset:
     )
 
 
-def luminance(colour: tuple[float, ...]) -> float:
-    linear = [part / 12.92 if part <= 0.04045 else ((part + 0.055) / 1.055) ** 2.4 for part in colour[:3]]
-    return float(np.dot(linear, (0.2126, 0.7152, 0.0722)))
+def luminance(colour: Sequence[float], most: float = 1.0) -> float:
+    """Return WCAG's relative luminance of red, green and blue."""
+    parts = np.array(colour[:3]) / most
+    linear = np.where(parts <= 0.04045, parts / 12.92, ((parts + 0.055) / 1.055) ** 2.4)
+    return float(linear @ [0.2126, 0.7152, 0.0722])
 
 
 @pytest.mark.parametrize("width", [None, 85.0, 170.0])

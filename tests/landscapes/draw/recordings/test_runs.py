@@ -24,6 +24,7 @@ from gradscape.landscapes.space import ParameterSpace
 
 from ....processes import alone
 from ...made_runs import run_table
+from ..figures.test_search import luminance
 
 pytestmark = pytest.mark.slow
 
@@ -180,20 +181,15 @@ def test_a_recording_is_served_to_this_machine_alone_and_its_page_may_call_nobod
     assert not list(tmp_path.rglob("analytics*"))  # rerun keeps what it would send there
 
 
-def luminance(color: int) -> float:
-    """WCAG's relative luminance of a packed RGBA."""
-    parts = np.array([color >> 24 & 255, color >> 16 & 255, color >> 8 & 255]) / 255
-    linear = np.where(parts <= 0.04045, parts / 12.92, ((parts + 0.055) / 1.055) ** 2.4)
-    return float(linear @ [0.2126, 0.7152, 0.0722])
-
-
 @pytest.mark.parametrize("ground", [0xECECECFF, 0x1C1C1EFF], ids=["light", "dark"])
 def test_every_label_is_legible_on_what_the_viewer_lays_under_it(held, ground: int) -> None:
     """A label has the colour of its point. WCAG asks for 3:1 of large type; no one colour has more than 3.8 on both."""
     seen = 0
     for components in held.values():
         for label, color in zip(components.get("labels", []), components.get("colors", []), strict=False):
-            low, high = sorted((luminance(ground), luminance(color[0])))
+            low, high = sorted(
+                luminance([part >> shift & 255 for shift in (24, 16, 8)], 255) for part in (ground, color[0])
+            )
             assert (high + 0.05) / (low + 0.05) > 3.5, label
             seen += len(label)
     assert seen > 15
