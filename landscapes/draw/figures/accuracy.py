@@ -108,7 +108,8 @@ def _draw_marks(ax: Axes, marks: Iterable[_Mark], label: str, gid: str) -> None:
 
 
 def _write_head(ax: Axes, record: FidelityRecord | ModelRecord, title: str, y: str) -> None:
-    """Write the title, how the record was made, and what stands up the panel's side."""
+    """Write the title, how the record was made, what stands up the panel's side, and what the thin lines are."""
+    page.interval(ax, [], [])
     page.entitle(page.picture_of(ax), title)
     spread = [] if record.spread is None else [f"spread {style.number(record.spread)} {record.loss_unit}".rstrip()]
     page.remark(ax, " · ".join([*spread, *page.made_by(record)]))
@@ -167,10 +168,8 @@ def fidelity_figure(
 
     def draw(ax: Axes) -> None:
         ax.set(xlim=(min(seconds) / REACH, max(seconds) * REACH), ylim=(low, high))
-        for axis in (ax.xaxis, ax.yaxis):
-            page.log_axis(axis)
+        page.log_axis(ax.xaxis, ax.yaxis)
         _draw_variants(ax, record, {mark.name: mark for mark in marks}, chosen, end)
-        page.interval(ax, [], [])
         said = f"{reference.name}: {style.number(end[0])} {unit}, error 0 by definition"
         ax.axvline(end[0], **page.sheet_of(ax).look(style.REFERENCE_LINE), label=said)
         page.name_axes(ax, f"time of an episode with gradient [{unit}]")
@@ -230,7 +229,6 @@ def model_figure(study: ModelRecord, *, width: float | None = None) -> page.Pict
         _sign_effects(ax, study)
         for mark in marks:
             _draw_marks(ax, [mark], "", "part")
-        page.interval(ax, [], [])
         sheet = page.sheet_of(ax)
         ax.axvline(0.0, **sheet.look(style.REFERENCE_LINE), label="the full model's time")
         if noise:

@@ -101,7 +101,6 @@ def _cosine_map(ax: Axes, dataset: xr.Dataset, cosine: xr.DataArray) -> None:
 
 
 def _farthest(ax: Axes, found: SliceComparison) -> None:
-    """Mark where the losses are farthest apart."""
     if not found.loss.largest.value > 0 or not found.parting:
         return
     look, apart = page.sheet_of(ax).look(style.FARTHEST), found.parting.b - found.parting.a
@@ -132,7 +131,6 @@ def _draw_lines(found: SliceComparison, width: float | None) -> page.Picture:
 
 
 def _curves(ax: Axes, found: SliceComparison, values: list[Any]) -> None:
-    """Draw a curve for each slice."""
     sheet, u = page.sheet_of(ax), found.data[0]["u"].to_numpy()
     for letter, name, curve, look in zip("AB", (found.a, found.b), values, style.PAIR, strict=True):
         ax.plot(u, curve, **sheet.look(style.stroke(len(u)) | look), label=f"{letter}: {name}")
@@ -145,7 +143,6 @@ def _where_either_failed(found: SliceComparison) -> xr.Dataset:
 
 
 def _say(found: SliceComparison) -> list[str]:
-    """Say the chief numbers, and the settings that differ."""
     if not found.compared:
         return ["no point has a loss in both"]
     percent = style.number(100 * found.loss.shares["median"].value, ".2g")

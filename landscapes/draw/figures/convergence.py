@@ -67,8 +67,7 @@ def _draw_setting(ax: Axes, one: SettingConvergence, found: ConvergenceRecord) -
     ax.set(xlim=(min(widths) / REACH**0.5, max(widths) * REACH**0.5), ylim=(min(values) / REACH, max(values) * REACH))
     _draw_design(ax, one)
     _draw_levels(ax, one, found)
-    for axis in (ax.xaxis, ax.yaxis):
-        page.log_axis(axis)
+    page.log_axis(ax.xaxis, ax.yaxis)
     page.name_axes(ax, WIDTHS[one.setting], "loss moves [share of the spread]" if found.spread else "loss moves")
     page.caption(ax, _title(one))
 

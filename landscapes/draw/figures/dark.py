@@ -49,17 +49,13 @@ def _darken(artist: Artist) -> None:
         found = to_rgba_array(value)
         if len(found):
             write(invert_greys(found) if np.ndim(value) == 2 else tuple(invert_greys(found)[0]))
-    strokes = [_gc(effect) for effect in artist.get_path_effects() or [] if isinstance(effect, withStroke)]
+    strokes: list[dict[str, Any]] = [
+        vars(effect)["_gc"] for effect in artist.get_path_effects() or [] if isinstance(effect, withStroke)
+    ]
     if strokes:
         grounds = [tuple(invert_greys(to_rgba_array(stroke["foreground"]))[0]) for stroke in strokes]
-        artist.set_path_effects(
-            [withStroke(**{**stroke, "foreground": ground}) for stroke, ground in zip(strokes, grounds, strict=True)]
-        )
-
-
-def _gc(effect: Any) -> dict[str, Any]:
-    found: dict[str, Any] = effect._gc
-    return found
+        effects = [stroke | {"foreground": ground} for stroke, ground in zip(strokes, grounds, strict=True)]
+        artist.set_path_effects([withStroke(**effect) for effect in effects])
 
 
 def invert_greys(colours: Colours) -> Colours:

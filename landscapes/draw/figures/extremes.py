@@ -78,8 +78,7 @@ def _draw_errors(ax: Axes, limits: Sequence[Limit], tolerance: float) -> None:
         reach = [cell.values[0] / limit.base for limit in drawn for cell in limit.scanned]
         ax.set_xlim(min(reach) / REACH, max(reach) * REACH)
     ax.set_ylim(LOWEST, HIGHEST)
-    for axis in (ax.xaxis, ax.yaxis):
-        page.log_axis(axis)
+    page.log_axis(ax.xaxis, ax.yaxis)
     label = f"accurate below {100 * tolerance:g} %"
     ax.axhline(100 * tolerance, **sheet.look(style.REFERENCE_LINE), label=label)
     ax.axvline(1.0, color=style.FAINT, linewidth=0.8 * sheet.weight, zorder=0)

@@ -131,7 +131,6 @@ def census_figure(census: Census, *, width: float | None = None) -> page.Picture
 
 
 def _words(census: Census) -> list[str]:
-    """Say how often each word fits, the most frequent first."""
     shares = sorted(census.words.items(), key=lambda one: -one[1].value)
     return [f"{word}: {_share(share)}" for word, share in shares if share.value > 0][: 2 * FOOT]
 

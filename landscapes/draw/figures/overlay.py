@@ -187,8 +187,8 @@ def _square(ax: Axes, scale: style.Scale) -> tuple[float, float]:
     else:
         low, high = low - 0.03 * (high - low), high + 0.03 * (high - low)
     ax.set(xlim=(low, high), ylim=(low, high))
-    for axis in (ax.xaxis, ax.yaxis) if scale.logarithmic else ():
-        page.log_axis(axis)
+    if scale.logarithmic:
+        page.log_axis(ax.xaxis, ax.yaxis)
     ax.plot([low, high], [low, high], color=style.FAINT, linewidth=page.sheet_of(ax).weight, zorder=1)
     return low, high
 

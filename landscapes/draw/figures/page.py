@@ -298,14 +298,15 @@ def dress(ax: Axes, plane: Plane | None = None) -> None:
             mark_decades((ax.xaxis, ax.yaxis)[number], DECADES[sheet.pitch > NARROW])
 
 
-def log_axis(axis: Axis) -> None:
-    """Make an axis logarithmic, with round values for what is drawn already, the fewer the less room a panel has."""
-    (axis.axes.set_xscale if axis is axis.axes.xaxis else axis.axes.set_yscale)("log")
-    low, high = np.log10(sorted(axis.get_view_interval()))
-    ticks = style.decades(low, high, DECADES[sheet_of(axis.axes).pitch > NARROW])
-    axis.set_major_locator(FixedLocator([10.0**tick for tick in ticks]))
-    axis.set_major_formatter(FuncFormatter(lambda value, _: style.write_power(math.log10(value))))
-    axis.set_minor_formatter(NullFormatter())
+def log_axis(*axes: Axis) -> None:
+    """Make axes logarithmic, with round values for what is drawn already, the fewer the less room a panel has."""
+    for axis in axes:
+        (axis.axes.set_xscale if axis is axis.axes.xaxis else axis.axes.set_yscale)("log")
+        low, high = np.log10(sorted(axis.get_view_interval()))
+        ticks = style.decades(low, high, DECADES[sheet_of(axis.axes).pitch > NARROW])
+        axis.set_major_locator(FixedLocator([10.0**tick for tick in ticks]))
+        axis.set_major_formatter(FuncFormatter(lambda value, _: style.write_power(math.log10(value))))
+        axis.set_minor_formatter(NullFormatter())
 
 
 def name_axes(ax: Axes, x: str | None = None, y: str | None = None) -> None:

@@ -17,13 +17,7 @@ from . import contour, page
 
 DPI = 120
 PITCH = 6.25  # room of a panel with its colour bar on a screen [inch]
-LEFT, RIGHT, HEAD, GAP, AXIS = (
-    0.8,
-    0.83,
-    1.08,
-    0.6,
-    0.55,
-)  # room at the sides, above, between, under panels there [inch]
+LEFT, RIGHT, HEAD, GAP, AXIS = 0.8, 0.83, 1.08, 0.6, 0.55  # room at the sides, over, between, under panels [inch]
 BESIDE, LINE = 0.93, 1.55  # share of a panel's room that its colour bar leaves; height of a line, in that of its type
 RATES, MIN_SECONDS = (10, 5, 4, 2), 4.0  # frames per second to choose from, so that a film lasts so many seconds
 
@@ -149,7 +143,6 @@ def frame_figure(sweep: Sweep, number: int, scales: Scales, *, width: float | No
 
 
 def _write(picture: page.Picture, layout: Layout, dataset: xr.Dataset) -> None:
-    """Write title and provenance."""
     sheet, left = layout.sheet, LEFT * layout.sheet.type
     room = sheet.width - left - page.MARGIN
     x, y, *_ = layout.box(left, layout.height - 0.36 * sheet.type, 0.0, 0.0)

@@ -323,7 +323,6 @@ def _label(sweep: Sweep, body: Relief, number: int) -> rr.Points3D:
 
 
 def _about_sweep(sweep: Sweep, scale: style.Scale) -> str:
-    """Say in Markdown what is to be seen, and where it comes from."""
     low, high, kind = _ends(scale)
     lines = [
         f"# {page.title(sweep.slices[0])}\n",

@@ -252,10 +252,25 @@ def test_equal_pictures_are_equal_files_and_settings_stay_as_they_were(tmp_path:
     assert re.search(r'<svg [^>]*width="240\.9\d*pt"', (tmp_path / "one.svg").read_text())
 
 
-@pytest.mark.parametrize("width", [20.0, 1000.0, float("nan")])
-def test_a_width_that_is_no_page_is_refused(width: float) -> None:
-    with pytest.raises(ValueError, match="a picture for print is 80 to 400 mm wide; got"):
-        landscape_figure(PLANE, width=width)
+WIDE = "a picture for print is 80 to 400 mm wide; got"
+EVENTS = r"'bounces' needs 60 whole numbers.*float64 of shape \(3,\)"
+REFUSED: list[tuple[str, Callable[[Callable[..., page.Picture]], page.Picture], str]] = [
+    ("landscape_figure", lambda draw: draw(LINE), "rank 1, so use profile_figure"),
+    ("profile_figure", lambda draw: draw(DATASET), "rank 2, so use landscape_figure"),
+    ("profile_figure", lambda draw: draw(LINE, events={"bounces": np.ones(3)}), EVENTS),
+    ("surface_figure", lambda draw: draw(LINE), "a slice of rank 1"),
+    ("wall_figure", lambda draw: draw([]), "got none"),
+    ("episode_figure", lambda draw: draw(Episode(torch.zeros(1), {})), "give Episode its `parts`"),
+    ("landscape_figure", lambda draw: draw(PLANE, width=20.0), WIDE),
+    ("landscape_figure", lambda draw: draw(PLANE, width=1000.0), WIDE),
+    ("landscape_figure", lambda draw: draw(PLANE, width=float("nan")), WIDE),
+]
+
+
+@pytest.mark.parametrize(("name", "make", "why"), REFUSED)
+def test_what_cannot_be_drawn_is_refused(name: str, make: Callable[..., page.Picture], why: str) -> None:
+    with pytest.raises(ValueError, match=why):
+        make(functions()[name])
 
 
 @pytest.mark.slow

@@ -35,19 +35,18 @@ def drawn(figure, name: str):
     return next((line for line in figure.axes[0].lines if line.get_gid() == name), None)
 
 
-def test_the_best_so_far_never_rises_and_ignores_failures():
-    line = drawn(run_figure(table([np.nan, 5.0, 7.0, np.nan, 3.0, 4.0])), "best")
-    np.testing.assert_array_equal(line.get_ydata(), [np.nan, 5, 5, 5, 3, 3])
-    assert line.get_label() == "best so far: 3"
-
-
-def test_every_episode_is_a_point_of_its_kind_or_a_failure():
-    figure = run_figure(table([4.0, np.nan, 2.0, 3.0], [1, 1, 2, 1]))
-    assert drawn(figure, "population").get_xdata().tolist() == [1, 4]
-    assert drawn(figure, "descent").get_xdata().tolist() == [3]
-    assert drawn(figure, "failed").get_xdata().tolist() == [2]
-    assert drawn(figure, "failed").get_label() == "failed: 1 of 4"
+def test_every_episode_is_a_point_of_its_kind_or_a_failure_under_the_best_so_far():
+    figure = run_figure(table([np.nan, 5.0, 7.0, np.nan, 3.0, 4.0], [1, 1, 1, 1, 2, 1]))
+    best, failed = drawn(figure, "best"), drawn(figure, "failed")
+    np.testing.assert_array_equal(best.get_ydata(), [np.nan, 5, 5, 5, 3, 3])
+    assert (best.get_label(), failed.get_label()) == ("best so far: 3", "failed: 2 of 6")
+    found = [drawn(figure, name).get_xdata().tolist() for name in ("population", "descent", "failed")]
+    assert found == [[2, 3, 6], [5], [1, 4]]
     assert drawn(figure, "policy") is None
+    assert figure.get_suptitle() == "hill · draft · cma-es · seed 3 · 6 of 20 episodes so far"
+    assert (figure.axes[0].get_xlabel(), figure.axes[0].get_ylabel()) == ("episodes", "loss [m]")
+    said = {line.get_label() for line in run_figure(table([np.nan, np.nan])).axes[0].lines}
+    assert said >= {"no episode has succeeded", "failed: 2 of 2"}
 
 
 @pytest.mark.parametrize(("loss", "scale"), [([0.1, 9.0, 2.0], "log"), ([-0.1, 9.0], "linear"), ([5.0, 9.0], "linear")])
@@ -59,18 +58,6 @@ def test_outliers_leave_the_picture_and_are_counted():
     ax = run_figure(table([*np.linspace(1, 3, 300), 1e9])).axes[0]
     assert ax.get_ylim()[1] < 10
     assert any("1 above the picture" in line.get_label() for line in ax.lines)
-
-
-def test_title_and_axes_say_what_is_shown():
-    figure = run_figure(table([4.0, 2.0]))
-    assert figure.get_suptitle() == "hill · draft · cma-es · seed 3 · 2 of 20 episodes so far"
-    assert figure.axes[0].get_ylabel() == "loss [m]"
-    assert figure.axes[0].get_xlabel() == "episodes"
-
-
-def test_a_run_without_any_success_says_so():
-    ax = run_figure(table([np.nan, np.nan])).axes[0]
-    assert {line.get_label() for line in ax.lines} >= {"no episode has succeeded", "failed: 2 of 2"}
 
 
 NAN = np.nan
@@ -132,20 +119,17 @@ def test_a_band_spans_the_interval_as_steps():
     assert inside == [True, True, True, False, False]
 
 
-def test_axes_name_their_units_and_are_logarithmic_where_the_targets_are():
-    losses, shares = race_figure(race()).axes
-    assert losses.get_ylabel() == "best loss so far [m]"
-    assert (losses.get_yscale(), losses.get_xlabel(), losses.get_xlim()) == ("log", "episodes", (1, 20))
+def test_the_figure_says_what_was_raced_in_which_units_and_how_much_of_it_is_sure():
+    figure = race_figure(race())
+    losses, shares = figure.axes
+    assert (losses.get_xlabel(), losses.get_ylabel()) == ("episodes", "best loss so far [m]")
+    assert (losses.get_yscale(), losses.get_xlim()) == ("log", (1, 20))
     assert shares.get_title() == "2 targets from 100 m down to 1 m, spaced logarithmically"
     plain, _ = race_figure(race(spacing="linear", targets=(2, 1.0, 3.0), loss_unit="")).axes
     assert (plain.get_yscale(), plain.get_ylim()[1], plain.get_ylabel()) == ("linear", 5, "best loss so far")
-
-
-def test_the_figure_says_what_was_raced_and_how_much_of_it_is_sure():
-    figure = race_figure(race())
     assert figure.get_suptitle() == "fluid · draft · 20 episodes · 2 seeds"
-    assert "cpu · 2026-11-21 · landscape race fluid" in figure.axes[0].get_title()
-    sure, *leads = figure.axes[0].texts[0].get_text().split("\n")
+    assert "cpu · 2026-11-21 · landscape race fluid" in losses.get_title()
+    sure, *leads = losses.texts[0].get_text().split("\n")
     assert sure == "mean of 2 seeds and 95 % bootstrap interval"
     assert " ".join(leads) == "none is first: bo-leap, of the best mean rank, is not distinguishable from cma-es"
     assert race_figure(race(seeds=1)).axes[0].texts[0].get_text().startswith("one seed: no interval\n")

@@ -1,7 +1,6 @@
 """The wall of landscapes: each slice on its own scale, under its name, over its words."""
 
 import numpy as np
-import pytest
 from matplotlib.colors import Normalize
 
 from gradscape.landscapes.draw.figures.multiples import Landscape, wall_figure
@@ -26,8 +25,3 @@ def test_every_landscape_has_its_own_scale_its_name_and_its_words() -> None:
     assert {"small", "large"} <= {text.get_text() for ax in picture.axes for text in ax.texts} | {
         ax.get_title() for ax in picture.axes
     }
-
-
-def test_a_wall_of_nothing_is_refused() -> None:
-    with pytest.raises(ValueError, match="got none"):
-        wall_figure([])

@@ -199,11 +199,6 @@ def test_a_sheet_says_what_was_simulated_what_came_out_and_how() -> None:
     assert figure.get_suptitle().endswith("no loss: not finite")
 
 
-def test_an_episode_without_parts_is_refused() -> None:
-    with pytest.raises(ValueError, match="give Episode its `parts`"):
-        next(frames(Episode(torch.zeros(1), {}), [0]))
-
-
 def test_a_lump_encloses_what_its_particles_fill() -> None:
     n, edge = 20, 0.2
     axis = (np.arange(n) + 0.5) / n * edge

@@ -29,11 +29,7 @@ def hill(x: torch.Tensor) -> torch.Tensor:
     return torch.where((x > 0.5).all(dim=1), torch.nan, loss)
 
 
-def cut(dims: tuple[str, ...] = ("a", "b")) -> xr.Dataset:
-    return sample(from_torch(hill, SPACE), Plane.through(SPACE, SPACE.center, dims, resolution=(24,) * len(dims)))
-
-
-DATASET = cut()
+DATASET = sample(from_torch(hill, SPACE), Plane.through(SPACE, SPACE.center, ("a", "b"), resolution=24))
 
 
 def drawn() -> tuple[np.ndarray, surface.Shown]:
@@ -172,11 +168,6 @@ def test_files_are_a_picture_and_a_model_that_needs_nothing_else(tmp_path: Path)
     eye = np.radians(RELIEF.azimuth)
     np.testing.assert_allclose(matrix @ [np.cos(eye), np.sin(eye), 0], [0, 0, 1], atol=1e-9)  # towards who opens it
     assert not list(tmp_path.glob(".*"))
-
-
-def test_a_line_has_no_surface() -> None:
-    with pytest.raises(ValueError, match="a slice of rank 1"):
-        surface.surface_figure(cut(("a",)))
 
 
 def test_triton_is_imported_before_anything_is_rendered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
