@@ -176,15 +176,30 @@ def draw_rows(
         interval(ax, ends[row, 1:], [row, row], within)
 
 
-def finish(picture: Picture, more: Sequence[Artist | str] = (), *, columns: int = 2, heading: str = "") -> None:
+def finish(
+    picture: Picture,
+    more: Sequence[Artist | str] = (),
+    *,
+    columns: int = 2,
+    heading: str = "",
+    like: Picture | None = None,
+) -> None:
     """Put the legend under the panels, with a small quiet `heading` if it has one, and fit the page's height.
+
+    A picture `like` another, of a film, has its height, and all in the same places.
 
     It has everything in the panels that has a label, once, and what is `more`, where a text stands without a sign.
     """
     signs = [Patch(visible=False, label=one) if isinstance(one, str) else one for one in more]
     if entries := sorted([*drawn_signs(picture), *signs], key=lambda one: one.get_gid() in ENDINGS):
         _key(picture, entries, columns, heading)
-    settle(picture)
+    if like is None:
+        settle(picture)
+        return
+    picture.set_size_inches(*like.get_size_inches())
+    for one, other in zip([*picture.axes, *picture.texts], [*like.axes, *like.texts], strict=True):
+        one.set_position(other.get_position())
+    _wrap(picture)
 
 
 def drawn_signs(picture: Picture) -> list[Artist]:

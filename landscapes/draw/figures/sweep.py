@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
+from matplotlib.axes import Axes
 
 from ...identity import plane_of
 from .. import film, style
@@ -17,8 +18,7 @@ from . import contour, page
 
 DPI = 120
 PITCH = 6.25  # room of a panel with its colour bar on a screen [inch]
-LEFT, RIGHT, HEAD, GAP, AXIS = 0.8, 0.83, 1.08, 0.6, 0.55  # room at the sides, over, between, under panels [inch]
-BESIDE, LINE = 0.93, 1.55  # share of a panel's room that its colour bar leaves; height of a line, in that of its type
+RANGE = 0.025  # height of the bar over the panels, against its width
 RATES, MIN_SECONDS = (10, 5, 4, 2), 4.0  # frames per second to choose from, so that a film lasts so many seconds
 
 
@@ -68,88 +68,26 @@ class Scales:
         return cls(style.Scale.of_loss(losses), slope)
 
 
-@dataclass(frozen=True)
-class Layout:
-    """Say where things are on every frame of a sweep [inch], so that nothing moves from one to the next."""
-
-    sheet: style.Sheet
-    panels: int
-    entries: int  # most in the legend of any frame
-
-    @property
-    def side(self) -> float:
-        """Of a panel; its colour bar takes seven per cent of the room for both."""
-        return BESIDE * (self.sheet.pitch - (LEFT + RIGHT) * self.sheet.type)
-
-    @property
-    def columns(self) -> int:
-        """Of the legend."""
-        return 2 * self.sheet.columns if self.sheet.zoom == 1 else self.sheet.columns
-
-    @property
-    def foot(self) -> float:
-        """Under the panels: their axes, the legend, the provenance."""
-        return AXIS * self.sheet.type + self.legend + 0.08 + 2 * LINE * self.sheet.small / 72
-
-    @property
-    def legend(self) -> float:
-        """Height of the legend."""
-        return -(-self.entries // self.columns) * LINE * self.sheet.tick / 72
-
-    @property
-    def height(self) -> float:
-        """Of the page."""
-        rows = -(-self.panels // self.sheet.columns)
-        return HEAD * self.sheet.type + rows * self.side + (rows - 1) * GAP * self.sheet.type + self.foot
-
-    def box(self, left: float, bottom: float, width: float, height: float) -> tuple[float, float, float, float]:
-        """Return a box [inch] as matplotlib has it."""
-        page_width = self.sheet.width
-        return (left / page_width, bottom / self.height, width / page_width, height / self.height)
-
-    def panel(self, number: int) -> tuple[float, float, float, float]:
-        """Return room for a square panel and its colour bar."""
-        row, column = divmod(number, self.sheet.columns)
-        down = HEAD * self.sheet.type + (row + 1) * self.side + row * GAP * self.sheet.type
-        left = column * self.sheet.pitch + LEFT * self.sheet.type
-        return self.box(left, self.height - down, self.side / BESIDE, self.side)
-
-
-def frame_figure(sweep: Sweep, number: int, scales: Scales, *, width: float | None = None) -> page.Picture:
-    """Draw one frame: loss map, arrows, the value and where in its range it is; nothing moves from frame to frame."""
-    dataset, panels = sweep.slices[number], 1 if scales.slope is None else 2
-    sheet = style.Sheet.of(width, pitch=PITCH, columns=panels)
-    ended = {code for one in sweep.slices for code in np.unique(one["status"]).tolist()} & {*style.ENDED}
-    layout = Layout(sheet, panels, 2 + len(ended))
-    picture = page.Picture(sheet, layout.height)
-    axes = [picture.add_axes(layout.panel(place)) for place in range(panels)]
-    contour.loss_panel(axes[0], dataset, scales.loss)
+def frame_figure(
+    sweep: Sweep, number: int, scales: Scales, *, width: float | None = None, like: page.Picture | None = None
+) -> page.Picture:
+    """Draw one frame: loss map, arrows, the value and where in its range it is; all stands where it does in `like`."""
+    dataset, panels = sweep.slices[number], ["loss"] if scales.slope is None else ["loss", "slope"]
+    plane, sheet = plane_of(dataset), style.Sheet.of(width, pitch=PITCH, columns=len(panels))
+    picture = page.Picture(sheet, sheet.width)
+    below = [panels] if sheet.columns == len(panels) else [[name] for name in panels]
+    rows: Any = [["range", *"." * (sheet.columns - 1)], *below]
+    axes = picture.subplot_mosaic(rows, height_ratios=[RANGE, *[1.0] * len(below)])
+    contour.loss_panel(axes["loss"], dataset, scales.loss)
     if scales.slope:
-        contour.arrow_panel(axes[1], dataset, scales.slope)
-    plane = plane_of(dataset)
-    for ax in axes:
-        contour.frame(ax, dataset, plane)
-        page.name_axes(ax, plane.labels[0])
-    _draw_range(picture, layout, sweep, sweep.values[number])
-    _write(picture, layout, dataset)
-    legend = picture.legend(
-        handles=page.drawn_signs(picture), loc="upper left", ncols=layout.columns,
-        bbox_to_anchor=layout.box(LEFT * sheet.type, layout.foot - AXIS * sheet.type, 0.0, 0.0)[:2],
-        fontsize=sheet.tick, frameon=False, handlelength=1.8, columnspacing=1.6, borderpad=0, borderaxespad=0,
-    )  # fmt: skip
-    for text in legend.get_texts():
-        text.set_parse_math(False)
+        contour.arrow_panel(axes["slope"], dataset, scales.slope)
+    for name in panels:
+        contour.frame(axes[name], dataset, plane)
+        page.name_axes(axes[name], plane.labels[0])
+    _draw_range(axes["range"], sweep, sweep.values[number])
+    page.entitle(picture, page.title(dataset))
+    page.finish(picture, columns=2 * sheet.columns, heading=page.provenance(dataset), like=like)
     return picture
-
-
-def _write(picture: page.Picture, layout: Layout, dataset: xr.Dataset) -> None:
-    sheet, left = layout.sheet, LEFT * layout.sheet.type
-    room = sheet.width - left - page.MARGIN
-    x, y, *_ = layout.box(left, layout.height - 0.36 * sheet.type, 0.0, 0.0)
-    picture.text(x, y, page.title(dataset), size=sheet.title, color=style.INK, parse_math=False)
-    x, y, *_ = layout.box(left, 0.08, 0.0, 0.0)
-    said = page.wrap_text(page.provenance(dataset), room, sheet.small)
-    picture.text(x, y, said, size=sheet.small, color=style.QUIET, parse_math=False)
 
 
 def save_films(sweep: Sweep, mp4: Path, gif: Path | None, *, dpi: int = DPI, loss: int = 18) -> None:
@@ -158,17 +96,19 @@ def save_films(sweep: Sweep, mp4: Path, gif: Path | None, *, dpi: int = DPI, los
     `loss` is that of `film.save_film`.
     """
     scales, count = Scales.of(sweep), len(sweep.slices)
-    pictures = (film.picture(frame_figure(sweep, number, scales), dpi=dpi) for number in range(count))
+    fullest = max(range(count), key=lambda number: len(np.unique(sweep.slices[number]["status"])))
+    like = frame_figure(sweep, fullest, scales)
+    pictures = (film.picture(frame_figure(sweep, number, scales, like=like), dpi=dpi) for number in range(count))
     rate = next((rate for rate in RATES if count / rate >= MIN_SECONDS), RATES[-1])
     film.save_film(pictures, mp4, gif, count=count, rate=rate, loss=loss)
 
 
-def _draw_range(picture: page.Picture, layout: Layout, sweep: Sweep, value: float) -> None:
+def _draw_range(ax: Axes, sweep: Sweep, value: float) -> None:
     """Say the value, and mark it on a bar from the lowest to the highest."""
-    ends, sheet = (sweep.values[0], sweep.values[-1]), layout.sheet
+    ends, sheet = (sweep.values[0], sweep.values[-1]), page.sheet_of(ax)
     low, high, here = ((math.log10(one) if sweep.logarithmic else one) for one in (*ends, value))
-    place = layout.box(LEFT * sheet.type, layout.height - 0.9 * sheet.type, layout.side, 0.16 * sheet.type)
-    ax = picture.add_axes(place, gid="range")
+    ax.set_gid("range")
+    ax.set_box_aspect(RANGE)
     ax.set_axis_off()
     ax.set_xlim(low, high)
     ax.set_ylim(-1, 1)
