@@ -155,7 +155,7 @@ def fidelity_figure(
     factor, unit = (1.0, "s") if reference.seconds >= 2.0 else (1e3, "ms")
     rows = [row for row in record.variants if row is not reference and not row.given_up]
     found = [_percentile(row.comparison, record) for row in rows]
-    errors = [end for one in found for end in (one.value, one.low, one.high) if end] or [1e-3 * REACH, 1 / REACH]
+    errors = [end for one in found for end in (one.value, one.low, one.high) if end] or [1e-3, 1.0]
     low, high = min(errors) / REACH, max(errors) * REACH
     marks = []
     for row, error in zip(rows, found, strict=True):

@@ -32,7 +32,6 @@ if TYPE_CHECKING:
 
 
 PITCH, MIN_PANEL = 3.6, 40.0  # room of a panel: on a screen [inch], and at least in print [mm]
-TALL = 1.05  # height of a row of panels, in that of their room
 
 
 @dataclass(frozen=True, eq=False)
