@@ -103,8 +103,8 @@ def _draw_marks(ax: Axes, marks: Iterable[_Mark], label: str, gid: str) -> None:
             page.interval(ax, [x, x], mark.up, label=None)
         if mark.across:
             page.interval(ax, mark.across, [y, y], label=None)
-    x, y = zip(*(mark.at for mark in drawn), strict=True)
-    ax.plot(x, y, **sheet.look(drawn[0].look), clip_on=False, gid=gid, label=label)
+    at = zip(*(mark.at for mark in drawn), strict=True)
+    ax.plot(*at, **sheet.look(drawn[0].look), clip_on=False, gid=gid, label=label)
 
 
 def _write_head(ax: Axes, record: FidelityRecord | ModelRecord, title: str, y: str) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -92,8 +92,8 @@ def _draw_design(ax: Axes, one: SettingConvergence) -> None:
     span = np.geomspace(*ax.get_xlim(), 32)
     if one.order.low is not None and one.order.high is not None and one.verdict == "converges":
         edges = [height * (span / middle) ** order for order in (one.order.low, one.order.high)]
-        look = {"color": style.BAND[0], "linewidth": 0.0, "zorder": 0, "gid": "observed"}
-        ax.fill_between(span, *edges, **look, label="observed order, 95 %")
+        band: dict[str, Any] = {"color": style.BAND[0], "linewidth": 0.0, "zorder": 0, "gid": "observed"}
+        ax.fill_between(span, *edges, **band, label="observed order, 95 %")
     if one.designed is not None:
         look = page.sheet_of(ax).look({"color": style.INK, "linewidth": 0.9, "linestyle": (0, (5, 2)), "zorder": 1})
         ax.plot(span, height * (span / middle) ** one.designed, **look, gid="design", label="designed order")
@@ -133,8 +133,8 @@ def _draw_distributions(ax: Axes, found: ConvergenceRecord) -> None:
     look = style.VARIANT_MARK | {"color": style.LOSS_LINE, "marker": "o"}
     page.draw_rows(ax, np.where(np.isfinite(ends), ends, ends[:, :1]), look, "", gid="distance")
     if limit := apart.noise_limit["wasserstein"]:
-        noise = {"color": style.BAND[0], "zorder": 0, "gid": "noise", "label": "noise: the reference twice (95 %)"}
-        ax.axvspan(0, limit, **noise)
+        said = "noise: the reference twice (95 %)"
+        ax.axvspan(0, limit, color=style.BAND[0], zorder=0, gid="noise", label=said)
     ax.set_yticks(range(len(apart.compared)), [one.name.removeprefix("reference-") for one in apart.compared])
     ax.set_xlim(left=0)
     ax.margins(y=0.15)

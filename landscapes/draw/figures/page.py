@@ -21,6 +21,7 @@ from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.cm import ScalarMappable
 from matplotlib.colorbar import Colorbar
+from matplotlib.container import ErrorbarContainer
 from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties
 from matplotlib.layout_engine import ConstrainedLayoutEngine
@@ -186,38 +187,34 @@ def finish(
 ) -> None:
     """Put the legend under the panels, with a small quiet `heading` if it has one, and fit the page's height.
 
-    A picture `like` another, of a film, has its height, and all in the same places.
-
-    It has everything in the panels that has a label, once, and what is `more`, where a text stands without a sign.
+    The legend has everything in the panels that has a label, once, and what is `more`: a text stands without a sign. A
+    picture `like` another, of a film, has its height, and all in the same places.
     """
+    drawn = [pair for ax in picture.axes for pair in zip(*ax.get_legend_handles_labels()[::-1], strict=True)]
     signs = [Patch(visible=False, label=one) if isinstance(one, str) else one for one in more]
-    if entries := sorted([*drawn_signs(picture), *signs], key=lambda one: one.get_gid() in ENDINGS):
-        _key(picture, entries, columns, heading)
+    entries: dict[str, Artist] = {}
+    for label, one in [*drawn, *((str(sign.get_label()), sign) for sign in signs)]:
+        entries.setdefault(label, one[0] if isinstance(one, ErrorbarContainer) else one)
+    if entries:
+        _key(picture, dict(sorted(entries.items(), key=lambda entry: entry[1].get_gid() in ENDINGS)), columns, heading)
     if like is None:
         settle(picture)
         return
     picture.set_size_inches(*like.get_size_inches())
-    for one, other in zip([*picture.axes, *picture.texts], [*like.axes, *like.texts], strict=True):
-        one.set_position(other.get_position())
+    for ax, other in zip(picture.axes, like.axes, strict=True):
+        ax.set_position(other.get_position())
+    for text, written in zip(picture.texts, like.texts, strict=True):
+        text.set_position(written.get_position())
     _wrap(picture)
 
 
-def drawn_signs(picture: Picture) -> list[Artist]:
-    """Return what has a label in the panels, the first that has it."""
-    found: dict[str, Artist] = {}
-    for ax in picture.axes:
-        for one, label in zip(*ax.get_legend_handles_labels(), strict=True):
-            found.setdefault(label, one)
-    return list(found.values())
-
-
-def _key(picture: Picture, entries: Sequence[Artist], columns: int, heading: str) -> None:
+def _key(picture: Picture, entries: Mapping[str, Artist], columns: int, heading: str) -> None:
     """Put a legend under the panels, in fewer columns where it would be wider than the page."""
     sheet, room = picture.sheet, picture.sheet.width - 2 * MARGIN
     wide = room - HANDLE * sheet.tick / 72
-    labels = [wrap_text(str(one.get_label()), wide, sheet.tick, lines=3) for one in entries]
+    labels = [wrap_text(label, wide, sheet.tick, lines=3) for label in entries]
     legend = picture.legend(
-        list(entries), labels, loc="outside lower center", ncols=columns, fontsize=sheet.tick, frameon=False,
+        list(entries.values()), labels, loc="outside lower center", ncols=columns, fontsize=sheet.tick, frameon=False,
         handlelength=1.8, columnspacing=1.6,
     )  # fmt: skip
     for text in legend.get_texts():
@@ -588,7 +585,7 @@ class _Crowd:
         """Take a box for a place, and the line that leads there, if neither points nor anything else is in its way."""
         own, others = self.origins[number], np.delete(self.origins, number, axis=0)
         box = Bbox([own + shift - half, own + shift + half])
-        inside = (box.min >= self.frame.min).all() and (box.max <= self.frame.max).all()
+        inside = np.all(box.min >= self.frame.min) and np.all(box.max <= self.frame.max)
         if not inside or box.count_overlaps(self.boxes):
             return False
         if box.count_contains(np.concatenate([points, self.origins, self.lines])):

@@ -119,7 +119,11 @@ def _scales(ax: Axes, steps: xr.Dataset, samples: xr.Dataset) -> None:
         for name, colour, marker in (("mean cosine", style.LOSS_LINE, "o"), ("uphill", style.SLOPE_LINE, "v")):
             ends = page.ends_of(row.uphill if name == "uphill" else row.cosine for row in rows)
             reach = np.abs(np.nan_to_num(ends[:, 1:] - ends[:, :1])).T
-            look = {"color": colour, "marker": marker, "markerfacecolor": colour if found is steps else "white"}
+            look: dict[str, Any] = {
+                "color": colour,
+                "marker": marker,
+                "markerfacecolor": colour if found is steps else "white",
+            }
             look |= sheet.look({"linewidth": 1.1, "markersize": 4.5, "markeredgewidth": 1.0, "capsize": 2.0})
             ax.errorbar([row.scale for row in rows], ends[:, 0], reach, **look, label=f"{name}, {where}")
     page.dress(ax)

@@ -38,8 +38,8 @@ def symmetry_figure(found: SymmetryRecord, *, width: float | None = None) -> pag
         ax.set_yticks(range(len(replicas)), [one.name for one in replicas])
         ax.set_ylim(len(replicas) - 0.5, -0.5)
     if np.isfinite(share.low):
-        look = {"color": style.BAND[0], "zorder": 0, "gid": "floor", "label": "all replicas together"}
-        axes[0].axvspan(100 * share.low, 100 * share.high, **look)
+        ends = 100 * share.low, 100 * share.high
+        axes[0].axvspan(*ends, color=style.BAND[0], zorder=0, gid="floor", label="all replicas together")
     axes[0].set_xlim(left=0)
     page.name_axes(axes[0], "losses apart [% of the range]")
     page.name_axes(axes[1], "cosine of gradients with the scene's")

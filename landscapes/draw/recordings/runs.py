@@ -48,8 +48,9 @@ def save_stream(dataset: xr.Dataset, runs: Runs, path: str | Path) -> None:
     what = "best loss so far, log10" if body.scale.logarithmic else "best loss so far"
     curves = rrb.TimeSeriesView(name=what, origin="best", plot_legend=rrb.Corner2D.RightTop)
     panel = rrb.TimePanel(timeline=TIMELINE, play_state="following", state="collapsed")
-    ends = {"start": rrb.TimeRangeBoundary.infinite(), "end": rrb.TimeRangeBoundary.cursor_relative()}
-    blueprint = _blueprint(dataset, body, curves, panel, rrb.VisibleTimeRange(TIMELINE, **ends))
+    start, end = rrb.TimeRangeBoundary.infinite(), rrb.TimeRangeBoundary.cursor_relative()
+    ranges = rrb.VisibleTimeRange(TIMELINE, start=start, end=end)
+    blueprint = _blueprint(dataset, body, curves, panel, ranges)
     with recording(digest(arrays), Path(path), blueprint) as stream:
         _log(stream, SURFACE, _surface(body, dataset))
         if "grad" in dataset:
