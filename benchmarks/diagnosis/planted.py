@@ -12,13 +12,14 @@ import gradscape as gs
 
 from .cases import Case
 from .plant import (
+    PLANT,
     Region,
     Spoil,
     between,
     by_units,
     clipped,
     clipped_norm,
-    objective,
+    in_numpy,
     permuted,
     scaled,
     transposed,
@@ -45,20 +46,12 @@ def planted(
 ) -> Case:
     """Return the case of a system whose gradient is spoiled, in a region of the box or everywhere."""
     names = system.space(dim).names
-    name = "-".join(filter(None, [kind.replace(" ", "-"), framework, system.loss.__name__, str(dim), note]))
-    spoiled = spoil if region is None else within(region, spoil)
     return Case(
-        name,
-        kind,
-        framework,
-        dim,
-        partial(objective, framework, system, dim, spoiled, precision, name),
-        causes=causes,
-        parameters=tuple(names[k] for k in which),
-        edges={names[k]: values for k, values in (edges or {}).items()},
-        region=region,
-        reference=lambda x: system.loss(np, x),
-    )
+        framework, kind, system.loss.__name__, PLANT[framework](system, within(region, spoil) if region else spoil),
+        system.space(dim), causes, tuple(names[k] for k in which),
+        edges={names[k]: values for k, values in (edges or {}).items()}, region=region,
+        reference=partial(system.loss, np), note=note, said={"precision": precision},
+    )  # fmt: skip
 
 
 def mean_of_batch(xp: Any, slope: Any, x: Any) -> Any:
@@ -167,4 +160,5 @@ def cases() -> list[Case]:
 def slab(direction: Sequence[float], lower: float, upper: float) -> gs.Environment:
     """Return a cart whose gradient has the wrong sign where a weighted sum of its forces is between two values [N]."""
     region: Region = lambda x: (x @ np.array(direction) > lower) & (x @ np.array(direction) < upper)  # noqa: E731
-    return objective("numpy", CART, len(direction), within(region, scaled(-1)), "float64", "slab")
+    spoiled = in_numpy(CART, within(region, scaled(-1)))
+    return gs.from_numpy(spoiled, CART.space(len(direction)), name="slab")
