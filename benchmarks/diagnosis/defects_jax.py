@@ -32,37 +32,36 @@ def pairs(p: Any) -> Any:
     return jnp.where(jnp.eye(5, dtype=bool), 0.0, (apart - 0.5) ** 2).sum()
 
 
-def _nan() -> list[Case]:
-    norm, where = ("norm at zero",), ("where over NaN",)
-    nan = partial(case, "nan", evidence="nan")
-    off = gs.ParameterSpace({"x": (-0.5, 2, "m"), "y": (-1, 0.25, "m")})
-    two, angles, metres = BOX(["x1", "y1", "x2", "y2"]), BOX(["a", "b"], unit="rad"), BOX(["x", "y"], unit="m")
-    particles = BOX([f"{axis}{k}" for k in range(5) for axis in "xy"])
-    return [
-        # squared distance from a target at the origin, by way of a norm
-        nan("length", lambda p: jnp.linalg.norm(p) ** 2, off, norm, place=(0.2, 0.8)),
-        # energy of a spring between two particles: no derivative where they coincide
-        nan("spring-pair", lambda p: (jnp.linalg.norm(p[:2] - p[2:]) - 0.7) ** 2, two, norm, place=(0.3, 0.6) * 2),
-        # squared angle between two directions, by the arc cosine of their product
-        nan("aligned", lambda p: jnp.arccos(jnp.cos(p[0]) * jnp.cos(p[1]) + jnp.sin(p[0]) * jnp.sin(p[1])) ** 2,
-            angles, (*norm, *where), place=0.5),
-        nan("pairs", pairs, particles, (*where, *norm)),
-        # a tendon that pulls with the root of its stretch, and not when it is slack
-        nan("tension", lambda p: (jnp.where(p[0] > 0.2, jnp.sqrt(p[0] - 0.2), 0.0) - 0.5) ** 2 + p[1] ** 2,
-            BOX(["stretch", "slip"]), where, edges={"stretch": (0.2,)}, region=lambda x: x[:, 0] < 0.2),
-        # losses in ten pipes, one with v^1.75 where it flows forwards
-        nan("friction", lambda p: ((p - 0.4) ** 2).sum() + (jnp.where(p[4] > 0, p[4] ** 1.75, 0.0) - 0.3) ** 2,
-            BOX(numbered("flow", 10)), where, edges={"flow 4": (0.0,)}, region=lambda x: x[:, 4] < 0),
-        # variance of ten parameters, by way of their standard deviation, and their mean
-        nan("spread", lambda p: jnp.std(p) ** 2 + (jnp.mean(p) - 0.3) ** 2, BOX([f"x{k}" for k in range(10)]), norm,
-            place=0.5),
-        # squared error of a heading, and a distance: no direction at the origin
-        nan("heading", lambda p: 0.1 * jnp.sin(jnp.arctan2(p[1], p[0]) - 0.4) ** 2 * (p[0] ** 2 + p[1] ** 2)
-            + (p[0] - 0.3) ** 2, metres, norm, place=0.5),
-        # kinetic energy of a bead that turns round at both ends of the box, by way of its speed
-        nan("turning-point", lambda p: (jnp.sqrt(1 - p[0] ** 2) ** 2 - 0.3) ** 2 + p[1] ** 2, BOX(["place", "slip"]),
-            norm, place=(1.0, 0.5)),
-    ]  # fmt: skip
+norm, where = ("norm at zero",), ("where over NaN",)
+nan = partial(case, "nan", evidence="nan")
+off = gs.ParameterSpace({"x": (-0.5, 2, "m"), "y": (-1, 0.25, "m")})
+two, angles, metres = BOX(["x1", "y1", "x2", "y2"]), BOX(["a", "b"], unit="rad"), BOX(["x", "y"], unit="m")
+particles = BOX([f"{axis}{k}" for k in range(5) for axis in "xy"])
+NAN = [
+    # squared distance from a target at the origin, by way of a norm
+    nan("length", lambda p: jnp.linalg.norm(p) ** 2, off, norm, place=(0.2, 0.8)),
+    # energy of a spring between two particles: no derivative where they coincide
+    nan("spring-pair", lambda p: (jnp.linalg.norm(p[:2] - p[2:]) - 0.7) ** 2, two, norm, place=(0.3, 0.6) * 2),
+    # squared angle between two directions, by the arc cosine of their product
+    nan("aligned", lambda p: jnp.arccos(jnp.cos(p[0]) * jnp.cos(p[1]) + jnp.sin(p[0]) * jnp.sin(p[1])) ** 2,
+        angles, (*norm, *where), place=0.5),
+    nan("pairs", pairs, particles, (*where, *norm)),
+    # a tendon that pulls with the root of its stretch, and not when it is slack
+    nan("tension", lambda p: (jnp.where(p[0] > 0.2, jnp.sqrt(p[0] - 0.2), 0.0) - 0.5) ** 2 + p[1] ** 2,
+        BOX(["stretch", "slip"]), where, edges={"stretch": (0.2,)}, region=lambda x: x[:, 0] < 0.2),
+    # losses in ten pipes, one with v^1.75 where it flows forwards
+    nan("friction", lambda p: ((p - 0.4) ** 2).sum() + (jnp.where(p[4] > 0, p[4] ** 1.75, 0.0) - 0.3) ** 2,
+        BOX(numbered("flow", 10)), where, edges={"flow 4": (0.0,)}, region=lambda x: x[:, 4] < 0),
+    # variance of ten parameters, by way of their standard deviation, and their mean
+    nan("spread", lambda p: jnp.std(p) ** 2 + (jnp.mean(p) - 0.3) ** 2, BOX([f"x{k}" for k in range(10)]), norm,
+        place=0.5),
+    # squared error of a heading, and a distance: no direction at the origin
+    nan("heading", lambda p: 0.1 * jnp.sin(jnp.arctan2(p[1], p[0]) - 0.4) ** 2 * (p[0] ** 2 + p[1] ** 2)
+        + (p[0] - 0.3) ** 2, metres, norm, place=0.5),
+    # kinetic energy of a bead that turns round at both ends of the box, by way of its speed
+    nan("turning-point", lambda p: (jnp.sqrt(1 - p[0] ** 2) ** 2 - 0.3) ** 2 + p[1] ** 2, BOX(["place", "slip"]),
+        norm, place=(1.0, 0.5)),
+]  # fmt: skip
 
 
 # ---- Cut off: detached, truncated, snapped.
@@ -98,16 +97,15 @@ def drop(p: Any) -> Any:
     return (y - 0.35) ** 2
 
 
-def _cut() -> list[Case]:
-    detached = ("detached parameter",)
-    return [
-        case("detached", "chain-stopped", lambda p: chain(jnp, p.at[57].set(stop(p[57]))), CHAIN.space(100), detached,
-             ("angle 57",), reference=partial(chain, np)),
-        case("detached", "springs-stopped", lambda p: springs(jnp, jnp.stack([stop(p[0]), p[1]])), SPRINGS.space(2),
-             detached, ("stiffness 0",)),
-        case("truncated", "swing", pendulum(15), SWING, ("truncated loop",), said={"horizon": "steps"}),
-        case("impact", "drop", drop, FALL, ("snapped time of impact",), warns=True, evidence="wide"),
-    ]  # fmt: skip
+detached = ("detached parameter",)
+CUT = [
+    case("detached", "chain-stopped", lambda p: chain(jnp, p.at[57].set(stop(p[57]))), CHAIN.space(100), detached,
+         ("angle 57",), reference=partial(chain, np)),
+    case("detached", "springs-stopped", lambda p: springs(jnp, jnp.stack([stop(p[0]), p[1]])), SPRINGS.space(2),
+         detached, ("stiffness 0",)),
+    case("truncated", "swing", pendulum(15), SWING, ("truncated loop",), said={"horizon": "steps"}),
+    case("impact", "drop", drop, FALL, ("snapped time of impact",), warns=True, evidence="wide"),
+]  # fmt: skip
 
 
 # ---- Solvers, steps and physics.
@@ -168,28 +166,23 @@ def looked_up(p: Any) -> Any:
     return (flow - 0.4) ** 2 + 0 * p.sum() + jnp.floor(20 * p[1]) / 20
 
 
-def _others() -> list[Case]:
-    start = gs.ParameterSpace({"angle": (-1.5, 1.5, "rad"), "rate": (-1, 1, "rad/s")})
-    population = gs.ParameterSpace({"growth": (3.7, 4.0), "start": (0.1, 0.9)})
-    forces, staircase = gs.ParameterSpace.box(numbered("force", 10), 0.5, 3, "N"), ("staircase",)
-    steps = {"draft": {"dt": 0.01, "steps": 100}, "standard": {"dt": 0.005, "steps": 200},
-             "reference": {"dt": 0.00025, "steps": 4000}}  # fmt: skip
-    return [
-        case("unconverged", "relaxed", relaxed, forces, ("unconverged solver",)),
-        case("late", "late", late, start, ("", "scaled", "sign", "truncated loop"), step=20,
-             said={"horizon": "steps"}),
-        case("chaos", "logistic", logistic, population, ("chaotic growth",), warns=True, evidence="growth",
-             said={"horizon": "steps", "mode": "forward"}),
-        case("physics", "stiff-ball", stiff_ball, FALL, ("discretisation",), warns=True, evidence="finer",
-             said={"fidelities": steps}),
-        case("staircase", "looked-up", looked_up, BOX(["valve", "lever"], lower=0), staircase, warns=True,
-             evidence="wide"),
-        # a cart whose forces are read by an encoder of 16 steps a newton
-        case("staircase", "encoder", lambda p: cart(jnp, jnp.floor(p * 16) / 16), CART.space(10), staircase,
-             warns=True, evidence="wide"),
-    ]  # fmt: skip
-
-
-def cases() -> list[Case]:
-    """Return the cases of this file."""
-    return [*_nan(), *_cut(), *_others()]
+start = gs.ParameterSpace({"angle": (-1.5, 1.5, "rad"), "rate": (-1, 1, "rad/s")})
+population = gs.ParameterSpace({"growth": (3.7, 4.0), "start": (0.1, 0.9)})
+forces, staircase = gs.ParameterSpace.box(numbered("force", 10), 0.5, 3, "N"), ("staircase",)
+steps = {"draft": {"dt": 0.01, "steps": 100}, "standard": {"dt": 0.005, "steps": 200},
+         "reference": {"dt": 0.00025, "steps": 4000}}  # fmt: skip
+OTHERS = [
+    case("unconverged", "relaxed", relaxed, forces, ("unconverged solver",)),
+    case("late", "late", late, start, ("", "scaled", "sign", "truncated loop"), step=20,
+         said={"horizon": "steps"}),
+    case("chaos", "logistic", logistic, population, ("chaotic growth",), warns=True, evidence="growth",
+         said={"horizon": "steps", "mode": "forward"}),
+    case("physics", "stiff-ball", stiff_ball, FALL, ("discretisation",), warns=True, evidence="finer",
+         said={"fidelities": steps}),
+    case("staircase", "looked-up", looked_up, BOX(["valve", "lever"], lower=0), staircase, warns=True,
+         evidence="wide"),
+    # a cart whose forces are read by an encoder of 16 steps a newton
+    case("staircase", "encoder", lambda p: cart(jnp, jnp.floor(p * 16) / 16), CART.space(10), staircase,
+         warns=True, evidence="wide"),
+]  # fmt: skip
+CASES = [*NAN, *CUT, *OTHERS]

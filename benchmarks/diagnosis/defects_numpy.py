@@ -112,25 +112,24 @@ def ranked(x: Any) -> Any:
     return loss / loss.max(), slope / loss.max()
 
 
-def _stateful() -> list[Case]:
-    stale, hidden, noise = ("stale buffer", "hidden state"), ("hidden state",), ("randomness",)
-    warm = (*hidden, "unconverged solver")
-    adds = partial(fresh, "accumulates", "accumulating", evidence="repeat")
-    noisy = partial(fresh, "randomness", "noisy", evidence="repeat")
-    return [
-        case("nan", "cone", cone, DISC, ("norm at zero",), evidence="nan", place=0.5),
-        fresh("stale", "previous", partial(Previous, SPRINGS), SPRINGS.space(2), stale),
-        fresh("stale", "previous", partial(Previous, CART), CART.space(10), stale),
-        adds(partial(Accumulating, THROW), THROW.space(2), stale),
-        adds(partial(Accumulating, CHAIN), CHAIN.space(10), stale),
-        adds(partial(Accumulating, SPRINGS), SPRINGS.space(100), stale),
-        fresh("hidden state", "warmstart", WarmStart, FORCES[2], warm, evidence="repeat"),
-        fresh("hidden state", "warmstart", WarmStart, FORCES[10], warm, evidence="repeat"),
-        fresh("hidden state", "counting", Counting, THROW.space(2), hidden, evidence="repeat"),
-        noisy(partial(Noisy, THROW, 0.1), THROW.space(2), noise),
-        noisy(partial(Noisy, SPRINGS, 1e-4), SPRINGS.space(10), noise, warns=True),
-        case("rows leak", "ranked", ranked, THROW.space(2), ("rows that leak",), evidence="rows"),
-    ]
+stale, hidden, noise = ("stale buffer", "hidden state"), ("hidden state",), ("randomness",)
+warm = (*hidden, "unconverged solver")
+adds = partial(fresh, "accumulates", "accumulating", evidence="repeat")
+noisy = partial(fresh, "randomness", "noisy", evidence="repeat")
+STATEFUL = [
+    case("nan", "cone", cone, DISC, ("norm at zero",), evidence="nan", place=0.5),
+    fresh("stale", "previous", partial(Previous, SPRINGS), SPRINGS.space(2), stale),
+    fresh("stale", "previous", partial(Previous, CART), CART.space(10), stale),
+    adds(partial(Accumulating, THROW), THROW.space(2), stale),
+    adds(partial(Accumulating, CHAIN), CHAIN.space(10), stale),
+    adds(partial(Accumulating, SPRINGS), SPRINGS.space(100), stale),
+    fresh("hidden state", "warmstart", WarmStart, FORCES[2], warm, evidence="repeat"),
+    fresh("hidden state", "warmstart", WarmStart, FORCES[10], warm, evidence="repeat"),
+    fresh("hidden state", "counting", Counting, THROW.space(2), hidden, evidence="repeat"),
+    noisy(partial(Noisy, THROW, 0.1), THROW.space(2), noise),
+    noisy(partial(Noisy, SPRINGS, 1e-4), SPRINGS.space(10), noise, warns=True),
+    case("rows leak", "ranked", ranked, THROW.space(2), ("rows that leak",), evidence="rows"),
+]
 
 
 # ---- Differences, rounding.
@@ -149,23 +148,22 @@ def far_differences(x: Any) -> Any:
     return loss, np.stack([(throw(np, x + step) - loss) / step.max() for step in steps], 1)
 
 
-def _rounded() -> list[Case]:
-    bad = ("differences with a bad step",)
-    grain = partial(case, "grain", causes=("float32 grain", *bad), said={"differences": 1e-6})
-    energy = lambda x: 20 * gas(np, x)  # noqa: E731 -- of a tank [J]
-    return [
-        grain("tank", lambda x: (1e6 + energy(x)).astype(np.float32), GAS.space(2), reference=energy),
-        grain("meter", lambda x: (500 + 10 * nozzle(np, x)).astype(np.float32), NOZZLE.space(3),
-              reference=lambda x: 10 * nozzle(np, x)),
-        grain("scale", lambda x: springs(np, x).astype(np.float32), SPRINGS.space(10), reference=partial(springs, np)),
-        # a surface with ten waves across the box
-        case("differences", "waves", lambda x: np.sin(20 * x[:, 0]) + np.cos(15 * x[:, 1]) + (x**2).sum(1), DISC, bad,
-             said={"differences": 0.1}),
-        case("differences", "far-differences", far_differences, THROW.space(2), bad),
-        case("differences", "own-differences", own_differences, CART.space(10), bad),
-        case("differences", "vessel", lambda x: 1e6 + energy(x), GAS.space(2), bad, said={"differences": 1e-11},
-             reference=energy),
-    ]  # fmt: skip
+bad = ("differences with a bad step",)
+grain = partial(case, "grain", causes=("float32 grain", *bad), said={"differences": 1e-6})
+energy = lambda x: 20 * gas(np, x)  # noqa: E731 -- of a tank [J]
+ROUNDED = [
+    grain("tank", lambda x: (1e6 + energy(x)).astype(np.float32), GAS.space(2), reference=energy),
+    grain("meter", lambda x: (500 + 10 * nozzle(np, x)).astype(np.float32), NOZZLE.space(3),
+          reference=lambda x: 10 * nozzle(np, x)),
+    grain("scale", lambda x: springs(np, x).astype(np.float32), SPRINGS.space(10), reference=partial(springs, np)),
+    # a surface with ten waves across the box
+    case("differences", "waves", lambda x: np.sin(20 * x[:, 0]) + np.cos(15 * x[:, 1]) + (x**2).sum(1), DISC, bad,
+         said={"differences": 0.1}),
+    case("differences", "far-differences", far_differences, THROW.space(2), bad),
+    case("differences", "own-differences", own_differences, CART.space(10), bad),
+    case("differences", "vessel", lambda x: 1e6 + energy(x), GAS.space(2), bad, said={"differences": 1e-11},
+         reference=energy),
+]  # fmt: skip
 
 
 # ---- Solvers and adjoints.
@@ -214,20 +212,15 @@ def crooked(x: Any) -> Any:
     return (residual**2).sum(1), 2 * residual @ A.T
 
 
-def _adjoints() -> list[Case]:
-    moving = gs.ParameterSpace({"speed": (-2, 1, "m/s"), "place": (-1, 1, "m")})
-    damped = gs.ParameterSpace({"k": gs.log(1, 1e4, "N/m"), "c": (0.5, 5, "N s/m")})
-    return [
-        case("unconverged", "tolerant", tolerant, FORCES[10], ("unconverged solver",)),
-        case("truncated", "short-adjoint", short_adjoint, CART.space(100), ("truncated loop", "detached parameter"),
-             tuple(numbered("force", 60))),
-        case("missing term", "unpunished", unpunished, PENDULUM.space(10), ("",)),
-        case("region", "drag", drag, moving, ("sign", ""), edges={"speed": (0.0,)}, region=lambda x: x[:, 0] < 0),
-        case("units", "by-decade", by_decade, damped, ("units",), ("k",)),
-        case("transposed", "crooked", crooked, DISC, ("transposed", "")),
-    ]  # fmt: skip
-
-
-def cases() -> list[Case]:
-    """Return the cases of this file."""
-    return [*_stateful(), *_rounded(), *_adjoints()]
+moving = gs.ParameterSpace({"speed": (-2, 1, "m/s"), "place": (-1, 1, "m")})
+damped = gs.ParameterSpace({"k": gs.log(1, 1e4, "N/m"), "c": (0.5, 5, "N s/m")})
+ADJOINTS = [
+    case("unconverged", "tolerant", tolerant, FORCES[10], ("unconverged solver",)),
+    case("truncated", "short-adjoint", short_adjoint, CART.space(100), ("truncated loop", "detached parameter"),
+         tuple(numbered("force", 60))),
+    case("missing term", "unpunished", unpunished, PENDULUM.space(10), ("",)),
+    case("region", "drag", drag, moving, ("sign", ""), edges={"speed": (0.0,)}, region=lambda x: x[:, 0] < 0),
+    case("units", "by-decade", by_decade, damped, ("units",), ("k",)),
+    case("transposed", "crooked", crooked, DISC, ("transposed", "")),
+]  # fmt: skip
+CASES = [*STATEFUL, *ROUNDED, *ADJOINTS]

@@ -53,28 +53,27 @@ def molecule(x: Any) -> Any:
     return torch.where(energy < 1000, energy, torch.full_like(energy, 1000))
 
 
-def _nan() -> list[Case]:
-    norm, where = ("norm at zero",), ("where over NaN",)
-    nan = partial(case, "nan", evidence="nan")
-    fall = gs.ParameterSpace({"height": (-1, 1, "m"), "speed": (-2, 2, "m/s")})
-    hundred = gs.ParameterSpace.box(numbered("gap", 100), -1, 2, "mm")
-    switch = gs.ParameterSpace({"switch": (-1.5, 1, "V"), "slip": (-1, 1, "m")})
-    return [
-        # squared length, by way of a length [m²]
-        nan("distance", lambda x: ((x**2).sum(1)).sqrt() ** 2, BOX([f"x{k}" for k in range(10)]), norm, place=0.5),
-        nan("reach", reach, fall, where, edges={"height": (0.0,)}, region=lambda x: x[:, 0] < 0),
-        # Hertz contact at one of 100 gaps: a force with depth^1.5 where the gap is closed
-        nan("gaps", lambda x: ((x - 0.3) ** 2).sum(1) / 10
-            + (torch.where(x[:, 37] > 0, x[:, 37] ** 1.5, 0 * x[:, 37]) - 0.5) ** 2, hundred, where,
-            edges={"gap 37": (0.0,)}, region=lambda x: x[:, 37] < 0),
-        # squared angle of a rotation by its trace [rad²], which is 0 at no rotation
-        nan("turn", lambda x: torch.acos((1 + 2 * torch.cos(torch.sqrt((x**2).sum(1))) - 1) / 2) ** 2,
-            BOX(["roll", "pitch", "yaw"], unit="rad"), (*norm, *where), place=0.5),
-        nan("molecule", molecule, BOX(["x1", "y1", "x2", "y2"], unit="nm"), (*where, *norm), place=(0.3, 0.6) * 2),
-        # a steep switch, by a sigmoid whose exponential overflows
-        nan("switched", lambda x: (1 / (1 + torch.exp(-800 * x[:, 0])) - 0.4) ** 2 + x[:, 1] ** 2, switch,
-            (*where, ""), edges={"switch": (-0.887,)}, region=lambda x: x[:, 0] < -0.887),
-    ]  # fmt: skip
+norm, where = ("norm at zero",), ("where over NaN",)
+nan = partial(case, "nan", evidence="nan")
+fall = gs.ParameterSpace({"height": (-1, 1, "m"), "speed": (-2, 2, "m/s")})
+hundred = gs.ParameterSpace.box(numbered("gap", 100), -1, 2, "mm")
+switch = gs.ParameterSpace({"switch": (-1.5, 1, "V"), "slip": (-1, 1, "m")})
+NAN = [
+    # squared length, by way of a length [m²]
+    nan("distance", lambda x: ((x**2).sum(1)).sqrt() ** 2, BOX([f"x{k}" for k in range(10)]), norm, place=0.5),
+    nan("reach", reach, fall, where, edges={"height": (0.0,)}, region=lambda x: x[:, 0] < 0),
+    # Hertz contact at one of 100 gaps: a force with depth^1.5 where the gap is closed
+    nan("gaps", lambda x: ((x - 0.3) ** 2).sum(1) / 10
+        + (torch.where(x[:, 37] > 0, x[:, 37] ** 1.5, 0 * x[:, 37]) - 0.5) ** 2, hundred, where,
+        edges={"gap 37": (0.0,)}, region=lambda x: x[:, 37] < 0),
+    # squared angle of a rotation by its trace [rad²], which is 0 at no rotation
+    nan("turn", lambda x: torch.acos((1 + 2 * torch.cos(torch.sqrt((x**2).sum(1))) - 1) / 2) ** 2,
+        BOX(["roll", "pitch", "yaw"], unit="rad"), (*norm, *where), place=0.5),
+    nan("molecule", molecule, BOX(["x1", "y1", "x2", "y2"], unit="nm"), (*where, *norm), place=(0.3, 0.6) * 2),
+    # a steep switch, by a sigmoid whose exponential overflows
+    nan("switched", lambda x: (1 / (1 + torch.exp(-800 * x[:, 0])) - 0.4) ** 2 + x[:, 1] ** 2, switch,
+        (*where, ""), edges={"switch": (-0.887,)}, region=lambda x: x[:, 0] < -0.887),
+]  # fmt: skip
 
 
 # ---- Cut off: detached, truncated, snapped.
@@ -114,27 +113,26 @@ def collide(x: Any) -> Any:
     return (other - 1.2) ** 2
 
 
-def _cut() -> list[Case]:
-    detached, truncated = ("detached parameter",), ("truncated loop",)
-    lengths = gs.ParameterSpace({"length": (0.5, 1.5, "m"), "damping": (0, 1, "1/s")})
-    balls = gs.ParameterSpace({"x1": (-0.1, 0.1, "m"), "v1": (0.6, 1.4, "m/s")})
-    return [
-        # a cart whose controller hands two of its forces over as numbers
-        case("detached", "cart-detached", lambda x: cart(torch, torch.stack(
-            [x[:, k].detach() if k in (2, 7) else x[:, k] for k in range(10)], 1)), CART.space(10), detached,
-            ("force 2", "force 7"), reference=partial(cart, np)),
-        # a throw whose speed goes through NumPy on its way to the loss
-        case("detached", "measured", lambda x: throw(torch, torch.stack(
-            [x[:, 0], torch.from_numpy(x[:, 1].detach().numpy().copy())], 1)), THROW.space(2), detached, ("speed",)),
-        # a chain that is simulated in NumPy; its losses carry a gradient of zeros
-        case("detached", "all-measured", lambda x: torch.from_numpy(chain(np, x.detach().numpy())) + 0 * x.sum(1),
-             CHAIN.space(10), detached, CHAIN.space(10).names),
-        case("truncated", "pendulum-truncated", pendulum_truncated, PENDULUM.space(10), (*truncated, *detached),
-             tuple(numbered("torque", 7))),
-        case("truncated", "swing-truncated", swing_truncated, lengths, truncated, said={"horizon": "steps"}),
-        case("impact", "collide", collide, balls, ("snapped time of impact", *detached), ("x1",), warns=True,
-             evidence="wide"),
-    ]  # fmt: skip
+detached, truncated = ("detached parameter",), ("truncated loop",)
+lengths = gs.ParameterSpace({"length": (0.5, 1.5, "m"), "damping": (0, 1, "1/s")})
+balls = gs.ParameterSpace({"x1": (-0.1, 0.1, "m"), "v1": (0.6, 1.4, "m/s")})
+CUT = [
+    # a cart whose controller hands two of its forces over as numbers
+    case("detached", "cart-detached", lambda x: cart(torch, torch.stack(
+        [x[:, k].detach() if k in (2, 7) else x[:, k] for k in range(10)], 1)), CART.space(10), detached,
+        ("force 2", "force 7"), reference=partial(cart, np)),
+    # a throw whose speed goes through NumPy on its way to the loss
+    case("detached", "measured", lambda x: throw(torch, torch.stack(
+        [x[:, 0], torch.from_numpy(x[:, 1].detach().numpy().copy())], 1)), THROW.space(2), detached, ("speed",)),
+    # a chain that is simulated in NumPy; its losses carry a gradient of zeros
+    case("detached", "all-measured", lambda x: torch.from_numpy(chain(np, x.detach().numpy())) + 0 * x.sum(1),
+         CHAIN.space(10), detached, CHAIN.space(10).names),
+    case("truncated", "pendulum-truncated", pendulum_truncated, PENDULUM.space(10), (*truncated, *detached),
+         tuple(numbered("torque", 7))),
+    case("truncated", "swing-truncated", swing_truncated, lengths, truncated, said={"horizon": "steps"}),
+    case("impact", "collide", collide, balls, ("snapped time of impact", *detached), ("x1",), warns=True,
+         evidence="wide"),
+]  # fmt: skip
 
 
 # ---- Solvers, state and batches.
@@ -198,20 +196,19 @@ class Growing:
         return work[:, 0]
 
 
-def _stateful() -> list[Case]:
-    forces, hidden, leaking = gs.ParameterSpace.box(numbered("force", 2), 0.5, 3, "N"), "hidden state", "rows that leak"
-    return [
-        case("unconverged", "settle", settled, forces, ("unconverged solver",)),
-        fresh("hidden state", "smoothed", Smoothed, SPRINGS.space(10), (hidden, leaking), evidence="repeat"),
-        fresh("stale", "buffered", Buffered, SPRINGS.space(10), ("stale buffer", hidden)),
-        # angles of a chain in standard deviations of the batch
-        case("rows leak", "normalised", lambda x: chain(torch, (x - x.mean(0)) / (x.std(0, unbiased=False) + 1.0)),
-             CHAIN.space(10), (leaking,), evidence="rows"),
-        # forces of a cart, a tenth of which are lost at random
-        case("randomness", "dropped", lambda x: cart(torch, torch.nn.functional.dropout(x, 0.1)), CART.space(10),
-             ("randomness",), evidence="repeat"),
-        fresh("memory", "growing", Growing, THROW.space(2), ("memory growth",), warns=True, evidence="memory"),
-    ]  # fmt: skip
+forces, hidden, leaking = gs.ParameterSpace.box(numbered("force", 2), 0.5, 3, "N"), "hidden state", "rows that leak"
+STATEFUL = [
+    case("unconverged", "settle", settled, forces, ("unconverged solver",)),
+    fresh("hidden state", "smoothed", Smoothed, SPRINGS.space(10), (hidden, leaking), evidence="repeat"),
+    fresh("stale", "buffered", Buffered, SPRINGS.space(10), ("stale buffer", hidden)),
+    # angles of a chain in standard deviations of the batch
+    case("rows leak", "normalised", lambda x: chain(torch, (x - x.mean(0)) / (x.std(0, unbiased=False) + 1.0)),
+         CHAIN.space(10), (leaking,), evidence="rows"),
+    # forces of a cart, a tenth of which are lost at random
+    case("randomness", "dropped", lambda x: cart(torch, torch.nn.functional.dropout(x, 0.1)), CART.space(10),
+         ("randomness",), evidence="repeat"),
+    fresh("memory", "growing", Growing, THROW.space(2), ("memory growth",), warns=True, evidence="memory"),
+]  # fmt: skip
 
 
 # ---- Overwritten, otherwise with gradients, a missing term.
@@ -298,35 +295,30 @@ def softened(x: Any) -> Any:
     return (depth - 0.3) ** 2 + x[:, 1] ** 2
 
 
-def _others() -> list[Case]:
-    start = gs.ParameterSpace({"angle": (-1.5, 1.5, "rad"), "rate": (-1, 1, "rad/s")})
-    contact = gs.ParameterSpace({"depth": (-0.5, 1, "m"), "slip": (-1, 1, "m")})
-    overwritten, depends = ("tape overwritten",), ("loss depends on the gradient",)
-    steps = {"draft": {"dt": 0.02, "steps": 50}, "standard": {"dt": 0.01, "steps": 100},
-             "reference": {"dt": 0.0005, "steps": 2000}}  # fmt: skip
-    return [
-        *(case("overwritten", "drive", drive, gs.ParameterSpace.box(numbered("force", dim), 0, 4, "N"), overwritten)
-          for dim in (10, 2)),
-        case("depends on grad", "softened", softened, contact, depends, evidence="losses"),
-        # a rod that takes fewer sources into account where somebody will ask for its gradient
-        case("depends on grad", "coarser", lambda x: rod(torch, 0.98 * x if x.requires_grad else x), ROD.space(10),
-             depends, evidence="losses"),
-        # a cart whose effort does not reach the gradient
-        case("missing term", "effort", lambda x: cart(torch, x) + _Effort.apply(x), CART.space(2), ("",)),
-        # a cart, one force of which is limited, with a gradient beyond the limit
-        case("region", "straight-through", lambda x: cart(torch, torch.cat([_Limit.apply(x[:, :1]), x[:, 1:]], 1)),
-             CART.space(10), ("",), edges={"force 0": (1.0,)}, region=lambda x: x[:, 0] > 1),
-        case("late", "late-sign", late_sign, start, ("sign", "", "truncated loop"), step=25, said={"horizon": "steps"}),
-        # a cart whose forces come in steps of 0.25 N
-        case("staircase", "servo", lambda x: cart(torch, torch.round(4 * x) / 4), CART.space(10), ("staircase",),
-             warns=True, evidence="wide"),
-        case("chaos", "tumble", tumble, BOX(numbered("nudge", 10)), ("chaotic growth",), warns=True,
-             evidence="growth", said={"horizon": "steps"}),
-        case("physics", "penalty-ball", penalty_ball, FALL, ("discretisation",), warns=True, evidence="finer",
-             said={"fidelities": steps}),
-    ]  # fmt: skip
-
-
-def cases() -> list[Case]:
-    """Return the cases of this file."""
-    return [*_nan(), *_cut(), *_stateful(), *_others()]
+start = gs.ParameterSpace({"angle": (-1.5, 1.5, "rad"), "rate": (-1, 1, "rad/s")})
+contact = gs.ParameterSpace({"depth": (-0.5, 1, "m"), "slip": (-1, 1, "m")})
+overwritten, depends = ("tape overwritten",), ("loss depends on the gradient",)
+steps = {"draft": {"dt": 0.02, "steps": 50}, "standard": {"dt": 0.01, "steps": 100},
+         "reference": {"dt": 0.0005, "steps": 2000}}  # fmt: skip
+OTHERS = [
+    *(case("overwritten", "drive", drive, gs.ParameterSpace.box(numbered("force", dim), 0, 4, "N"), overwritten)
+      for dim in (10, 2)),
+    case("depends on grad", "softened", softened, contact, depends, evidence="losses"),
+    # a rod that takes fewer sources into account where somebody will ask for its gradient
+    case("depends on grad", "coarser", lambda x: rod(torch, 0.98 * x if x.requires_grad else x), ROD.space(10),
+         depends, evidence="losses"),
+    # a cart whose effort does not reach the gradient
+    case("missing term", "effort", lambda x: cart(torch, x) + _Effort.apply(x), CART.space(2), ("",)),
+    # a cart, one force of which is limited, with a gradient beyond the limit
+    case("region", "straight-through", lambda x: cart(torch, torch.cat([_Limit.apply(x[:, :1]), x[:, 1:]], 1)),
+         CART.space(10), ("",), edges={"force 0": (1.0,)}, region=lambda x: x[:, 0] > 1),
+    case("late", "late-sign", late_sign, start, ("sign", "", "truncated loop"), step=25, said={"horizon": "steps"}),
+    # a cart whose forces come in steps of 0.25 N
+    case("staircase", "servo", lambda x: cart(torch, torch.round(4 * x) / 4), CART.space(10), ("staircase",),
+         warns=True, evidence="wide"),
+    case("chaos", "tumble", tumble, BOX(numbered("nudge", 10)), ("chaotic growth",), warns=True,
+         evidence="growth", said={"horizon": "steps"}),
+    case("physics", "penalty-ball", penalty_ball, FALL, ("discretisation",), warns=True, evidence="finer",
+         said={"fidelities": steps}),
+]  # fmt: skip
+CASES = [*NAN, *CUT, *STATEFUL, *OTHERS]

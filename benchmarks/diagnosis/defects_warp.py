@@ -258,29 +258,27 @@ class Shaken:
         return of_kernel(_shaken_kernel, self.calls)(x)
 
 
-def cases() -> list[Case]:
-    """Return the cases of this file."""
-    fall = gs.ParameterSpace({"height": (0.8, 1.2, "m"), "speed": (-0.5, 0.5, "m/s")})
-    ten = gs.ParameterSpace.box([f"x{k}" for k in range(10)], -1, 1)
-    case, sign, overwritten = partial(Case, "warp"), ("sign",), "tape overwritten"
-    root, bounce = of_kernel(_root_kernel), of_kernel(_bounce_kernel)
-    return [
-        case("nan", "length", of_kernel(_length_kernel), POINTS, ("norm at zero",), evidence="nan", place=0.5),
-        case("nan", "root", root, POINTS, ("where over NaN",), edges={"x": (0.0,)}, region=lambda x: x[:, 0] < 0,
-             evidence="nan"),
-        case("factor 2", "half", of_kernel(_half_kernel), POINTS, ("factor 2",)),
-        case("sign", "cosine", of_kernel(_cosine_kernel), POINTS, sign),
-        case("sign of one", "cosine", of_kernel(_one_sign_kernel), ten, sign, ("x6",)),
-        case("too long", "cube", of_kernel(_cube_kernel), ten, ("scaled",)),
-        case("region", "slab", of_kernel(_slab_kernel), POINTS, sign, edges={"x": (0.3, 0.5)},
-             region=lambda x: (x[:, 0] > 0.3) & (x[:, 0] < 0.5)),
-        case("detached", "host", read_back, THROW.space(2), ("detached parameter",), ("speed",),
-             reference=partial(throw, np)),
-        case("overwritten", "drag", drive, FORCES, (overwritten,)),
-        case("overwritten", "loop", of_kernel(_loop_kernel), POINTS, (overwritten, "truncated loop", "")),
-        case("impact", "bounce", bounce, fall, ("snapped time of impact",), warns=True, evidence="wide"),
-        case("rows leak", "total", shared, POINTS, ("rows that leak",), evidence="rows"),
-        case("randomness", "shaken", Shaken, POINTS, ("randomness", "hidden state"), evidence="repeat", fresh=True),
-        case("staircase", "cells", of_kernel(_cells_kernel), POINTS, ("staircase",), warns=True, evidence="wide"),
-        case("depends on grad", "contact", softened, POINTS, ("loss depends on the gradient",), evidence="losses"),
-    ]  # fmt: skip
+fall = gs.ParameterSpace({"height": (0.8, 1.2, "m"), "speed": (-0.5, 0.5, "m/s")})
+ten = gs.ParameterSpace.box([f"x{k}" for k in range(10)], -1, 1)
+case, sign, overwritten = partial(Case, "warp"), ("sign",), "tape overwritten"
+root, bounce = of_kernel(_root_kernel), of_kernel(_bounce_kernel)
+CASES = [
+    case("nan", "length", of_kernel(_length_kernel), POINTS, ("norm at zero",), evidence="nan", place=0.5),
+    case("nan", "root", root, POINTS, ("where over NaN",), edges={"x": (0.0,)}, region=lambda x: x[:, 0] < 0,
+         evidence="nan"),
+    case("factor 2", "half", of_kernel(_half_kernel), POINTS, ("factor 2",)),
+    case("sign", "cosine", of_kernel(_cosine_kernel), POINTS, sign),
+    case("sign of one", "cosine", of_kernel(_one_sign_kernel), ten, sign, ("x6",)),
+    case("too long", "cube", of_kernel(_cube_kernel), ten, ("scaled",)),
+    case("region", "slab", of_kernel(_slab_kernel), POINTS, sign, edges={"x": (0.3, 0.5)},
+         region=lambda x: (x[:, 0] > 0.3) & (x[:, 0] < 0.5)),
+    case("detached", "host", read_back, THROW.space(2), ("detached parameter",), ("speed",),
+         reference=partial(throw, np)),
+    case("overwritten", "drag", drive, FORCES, (overwritten,)),
+    case("overwritten", "loop", of_kernel(_loop_kernel), POINTS, (overwritten, "truncated loop", "")),
+    case("impact", "bounce", bounce, fall, ("snapped time of impact",), warns=True, evidence="wide"),
+    case("rows leak", "total", shared, POINTS, ("rows that leak",), evidence="rows"),
+    case("randomness", "shaken", Shaken, POINTS, ("randomness", "hidden state"), evidence="repeat", fresh=True),
+    case("staircase", "cells", of_kernel(_cells_kernel), POINTS, ("staircase",), warns=True, evidence="wide"),
+    case("depends on grad", "contact", softened, POINTS, ("loss depends on the gradient",), evidence="losses"),
+]  # fmt: skip

@@ -43,40 +43,39 @@ def hinge(x: Any) -> Any:
     return depth**2 + 0.1 * np.abs(x[:, 1]), np.stack([2 * depth, 0.1 * np.sign(x[:, 1])], 1)
 
 
-def _plain() -> list[Case]:
-    scales = gs.ParameterSpace({"small": (-1e-9, 1e-9, "m"), "large": (-1e9, 1e9, "Pa")})
-    far = gs.ParameterSpace({"x": (-1e6, 1e6, "m"), "y": (-1e6, 1e6, "m")})
-    rosen = lambda x: (100 * (x[:, 1:] - x[:, :-1] ** 2) ** 2 + (1 - x[:, :-1]) ** 2).sum(1)  # noqa: E731
-    return [
-        case("torch", "drag", lambda x: (x * x.abs()).sum(1)),
-        case("torch", "cubic", lambda x: (x**3).sum(1)),
-        case("torch", "power-1.5", lambda x: x.abs().pow(1.5).sum(1)),
-        case("torch", "maximum", lambda x: torch.maximum(x[:, 0], x[:, 1]) + 0.1 * (x**2).sum(1)),
-        case("jax", "minimum", lambda p: jnp.min(p**2) + jnp.max(p), TEN),
-        case("jax", "safe-norm", lambda p: jnp.sqrt(jnp.sum(p**2) + 1e-12)),
-        case("torch", "offset-1e9", lambda x: 1e9 + (x**2).sum(1)),
-        case("jax", "offset-1e8", lambda p: 1e8 + jnp.sum(jnp.sin(3 * p)), TEN),
-        case("torch", "float32-inside", lambda x: ((x.float() - 0.3) ** 2).sum(1),
-             reference=lambda x: ((x - 0.3) ** 2).sum(1)),
-        case("torch", "float32-offset", lambda x: (1000 + torch.sin(2 * x[:, 0]) + x[:, 1] ** 2).float(),
-             reference=lambda x: np.sin(2 * x[:, 0]) + x[:, 1] ** 2),
-        case("jax", "float32-offset", lambda p: 1000 + jnp.sum((p - 0.3) ** 2), TEN, precision="float32",
-             reference=lambda x: ((x - 0.3) ** 2).sum(1)),
-        case("torch", "decades", lambda x: torch.exp(20 * x[:, 0]) + x[:, 1] ** 2),
-        case("torch", "scales", lambda x: (1e9 * x[:, 0] - 0.3) ** 2 + (1e-9 * x[:, 1] + 0.2) ** 2, scales),
-        case("torch", "tiny", lambda x: 1e-17 * ((x - 0.3) ** 2).sum(1)),
-        case("jax", "huge", lambda p: 1e20 * jnp.sum((p - 0.3) ** 2), TEN),
-        case("torch", "abs", lambda x: (x - 0.2).abs().sum(1)),
-        case("numpy", "hinge", hinge),
-        case("torch", "jump", lambda x: torch.where(x[:, 0] > 0.3, x[:, 0] + 1, x[:, 0]) + x[:, 1] ** 2),
-        case("torch", "constant", lambda x: 3.0 + 0 * x.sum(1)),
-        case("jax", "linear", lambda p: 2 * p[0] - 3 * p[1] + 0.5),
-        case("torch", "one", lambda x: torch.sin(3 * x[:, 0]), gs.ParameterSpace({"a": (-2, 2)})),
-        case("torch", "rosenbrock", rosen, TEN),
-        case("torch", "far", lambda x: (1 + (x**2).sum(1)).sqrt() + 0.1 * x[:, 0], far),
-        case("torch", "outside", lambda x: ((x - 1.5) ** 2).sum(1).sqrt()),
-        case("torch", "maximized", lambda x: (x * (1 - x)).sum(1), UNIT, maximize=True),
-    ]  # fmt: skip
+scales = gs.ParameterSpace({"small": (-1e-9, 1e-9, "m"), "large": (-1e9, 1e9, "Pa")})
+far = gs.ParameterSpace({"x": (-1e6, 1e6, "m"), "y": (-1e6, 1e6, "m")})
+rosen = lambda x: (100 * (x[:, 1:] - x[:, :-1] ** 2) ** 2 + (1 - x[:, :-1]) ** 2).sum(1)  # noqa: E731
+PLAIN = [
+    case("torch", "drag", lambda x: (x * x.abs()).sum(1)),
+    case("torch", "cubic", lambda x: (x**3).sum(1)),
+    case("torch", "power-1.5", lambda x: x.abs().pow(1.5).sum(1)),
+    case("torch", "maximum", lambda x: torch.maximum(x[:, 0], x[:, 1]) + 0.1 * (x**2).sum(1)),
+    case("jax", "minimum", lambda p: jnp.min(p**2) + jnp.max(p), TEN),
+    case("jax", "safe-norm", lambda p: jnp.sqrt(jnp.sum(p**2) + 1e-12)),
+    case("torch", "offset-1e9", lambda x: 1e9 + (x**2).sum(1)),
+    case("jax", "offset-1e8", lambda p: 1e8 + jnp.sum(jnp.sin(3 * p)), TEN),
+    case("torch", "float32-inside", lambda x: ((x.float() - 0.3) ** 2).sum(1),
+         reference=lambda x: ((x - 0.3) ** 2).sum(1)),
+    case("torch", "float32-offset", lambda x: (1000 + torch.sin(2 * x[:, 0]) + x[:, 1] ** 2).float(),
+         reference=lambda x: np.sin(2 * x[:, 0]) + x[:, 1] ** 2),
+    case("jax", "float32-offset", lambda p: 1000 + jnp.sum((p - 0.3) ** 2), TEN, precision="float32",
+         reference=lambda x: ((x - 0.3) ** 2).sum(1)),
+    case("torch", "decades", lambda x: torch.exp(20 * x[:, 0]) + x[:, 1] ** 2),
+    case("torch", "scales", lambda x: (1e9 * x[:, 0] - 0.3) ** 2 + (1e-9 * x[:, 1] + 0.2) ** 2, scales),
+    case("torch", "tiny", lambda x: 1e-17 * ((x - 0.3) ** 2).sum(1)),
+    case("jax", "huge", lambda p: 1e20 * jnp.sum((p - 0.3) ** 2), TEN),
+    case("torch", "abs", lambda x: (x - 0.2).abs().sum(1)),
+    case("numpy", "hinge", hinge),
+    case("torch", "jump", lambda x: torch.where(x[:, 0] > 0.3, x[:, 0] + 1, x[:, 0]) + x[:, 1] ** 2),
+    case("torch", "constant", lambda x: 3.0 + 0 * x.sum(1)),
+    case("jax", "linear", lambda p: 2 * p[0] - 3 * p[1] + 0.5),
+    case("torch", "one", lambda x: torch.sin(3 * x[:, 0]), gs.ParameterSpace({"a": (-2, 2)})),
+    case("torch", "rosenbrock", rosen, TEN),
+    case("torch", "far", lambda x: (1 + (x**2).sum(1)).sqrt() + 0.1 * x[:, 0], far),
+    case("torch", "outside", lambda x: ((x - 1.5) ** 2).sum(1).sqrt()),
+    case("torch", "maximized", lambda x: (x * (1 - x)).sum(1), UNIT, maximize=True),
+]  # fmt: skip
 
 
 # ---- Wells, plateaus, staircases, ripples, saturation.
@@ -129,62 +128,57 @@ def wiggle(p: Any) -> Any:
     return jnp.where(p[0] == 0, 0.0, safe**3 * jnp.sin(1 / safe)) + p[1] ** 2
 
 
-def _steep() -> list[Case]:
-    """Functions that are steep, nearly singular, sorted, wrapped or limited, or given in float32 at large values."""
-    late = gs.ParameterSpace({"time": (1e6, 1e6 + 1e-3, "s"), "x": (-1, 1)})
-    hundred = gs.ParameterSpace.box(numbered("gap", 100), -1, 1, "mm")
-    return [
-        case("torch", "steep", lambda x: torch.tanh(1e3 * (x[:, 0] - 0.1)) + x[:, 1] ** 2),
-        case("torch", "peak", lambda x: 1e-3 / (((x - 0.3) ** 2).sum(1) + 1e-6)),
-        case("jax", "pole", lambda p: jnp.tan(2 * p[0]) + p[1] ** 2),
-        case("jax", "sorted", lambda p: jnp.dot(jnp.sort(p), jnp.arange(10.0)) + jnp.median(p), TEN),
-        case("torch", "sawtooth", lambda x: torch.remainder(x[:, 0], 0.3) + 0.2 * x[:, 1] ** 2),
-        case("torch", "limited", lambda x: (x.clamp(-0.9, 0.6) - 0.2).pow(2).sum(1)),
-        case("numpy", "terrain", terrain),
-        case("torch", "contacts", lambda x: torch.relu(x - 0.3).sum(1) + 0.5 * torch.relu(-x - 0.2).sum(1), hundred),
-        case("jax", "wiggle", wiggle),
-        case("torch", "late", lambda x: torch.sin(3e3 * (x[:, 0] - 1e6)) + x[:, 1] ** 2, late),
-        case("torch", "gas-float32", partial(gas, torch), GAS.space(2), precision="float32",
-             reference=partial(gas, np)),
-        case("jax", "nozzle-float32", partial(nozzle, jnp), NOZZLE.space(3), precision="float32",
-             reference=partial(nozzle, np)),
-        case("torch", "cart-float32", partial(cart, torch), CART.space(100), precision="float32",
-             reference=partial(cart, np)),
-        case("torch", "throw-float32", partial(throw, torch), THROW.space(2), precision="float32",
-             reference=partial(throw, np)),
-        case("torch", "log-loss", lambda x: torch.log10(1e-6 + ((x - 0.3) ** 2).sum(1))),
-    ]  # fmt: skip
+late = gs.ParameterSpace({"time": (1e6, 1e6 + 1e-3, "s"), "x": (-1, 1)})
+hundred = gs.ParameterSpace.box(numbered("gap", 100), -1, 1, "mm")
+STEEP = [
+    case("torch", "steep", lambda x: torch.tanh(1e3 * (x[:, 0] - 0.1)) + x[:, 1] ** 2),
+    case("torch", "peak", lambda x: 1e-3 / (((x - 0.3) ** 2).sum(1) + 1e-6)),
+    case("jax", "pole", lambda p: jnp.tan(2 * p[0]) + p[1] ** 2),
+    case("jax", "sorted", lambda p: jnp.dot(jnp.sort(p), jnp.arange(10.0)) + jnp.median(p), TEN),
+    case("torch", "sawtooth", lambda x: torch.remainder(x[:, 0], 0.3) + 0.2 * x[:, 1] ** 2),
+    case("torch", "limited", lambda x: (x.clamp(-0.9, 0.6) - 0.2).pow(2).sum(1)),
+    case("numpy", "terrain", terrain),
+    case("torch", "contacts", lambda x: torch.relu(x - 0.3).sum(1) + 0.5 * torch.relu(-x - 0.2).sum(1), hundred),
+    case("jax", "wiggle", wiggle),
+    case("torch", "late", lambda x: torch.sin(3e3 * (x[:, 0] - 1e6)) + x[:, 1] ** 2, late),
+    case("torch", "gas-float32", partial(gas, torch), GAS.space(2), precision="float32",
+         reference=partial(gas, np)),
+    case("jax", "nozzle-float32", partial(nozzle, jnp), NOZZLE.space(3), precision="float32",
+         reference=partial(nozzle, np)),
+    case("torch", "cart-float32", partial(cart, torch), CART.space(100), precision="float32",
+         reference=partial(cart, np)),
+    case("torch", "throw-float32", partial(throw, torch), THROW.space(2), precision="float32",
+         reference=partial(throw, np)),
+    case("torch", "log-loss", lambda x: torch.log10(1e-6 + ((x - 0.3) ** 2).sum(1))),
+]  # fmt: skip
 
 
-def _shapes() -> list[Case]:
-    hundred = gs.ParameterSpace.box([f"x{k}" for k in range(100)], -1, 1)
-    three = gs.ParameterSpace.box([f"x{k}" for k in range(300)], -1, 1)
-    whole = gs.ParameterSpace({"n": (0, 9), "m": (0, 9)})
-    doses = gs.ParameterSpace({"count": (1, 9), "dose": (0.1, 1, "mg")})
-    decades = gs.ParameterSpace({"k": gs.log(1e-2, 1e6, "N/m"), "c": (0, 5, "N s/m")})
-    return [
-        case("torch", "well", lambda x: 1 - torch.exp(-200 * ((x - 0.6) ** 2).sum(1)), place=0.78),
-        case("jax", "narrow-well", lambda p: -jnp.exp(-50 * jnp.sum((p - 0.2) ** 2)), TEN, place=0.62),
-        case("torch", "plateau", lambda x: (torch.relu(x - 0.5) ** 2).sum(1), place=0.9),
-        case("torch", "stairs", lambda x: ((x.round() - 3) ** 2).sum(1) + 0 * x.sum(1), whole, place=0.42),
-        case("numpy", "count-and-dose", count_and_dose, doses, place=0.4),
-        case("jax", "dead", lambda p: (p[0] - 0.3) ** 2 + 0 * p[1]),
-        case("torch", "relu-network", relu_network, TEN),
-        case("torch", "ripples-1e-3", lambda x: (x**2).sum(1) + 1e-3 * torch.sin(3e4 * x[:, 0])),
-        case("jax", "ripples-1e-6", lambda p: jnp.sum(p**2) + 1e-6 * jnp.sin(1e6 * p[0])),
-        case("jax", "softmax", lambda p: jnp.sum(jax.nn.softmax(60 * p) * jnp.arange(10.0)), TEN),
-        case("torch", "saturated", lambda x: cart(torch, 2 * torch.tanh(8 * x)), TEN),
-        case("torch", "barrier", barrier, place=0.6),
-        case("numpy", "fails", fails, UNIT, vectorized=False, place=0.3),
-        case(
-            "torch", "sparse", lambda x: (x[:, 13] - 0.3) ** 2 + x[:, 13] * x[:, 71] + torch.sin(2 * x[:, 71]), hundred
-        ),
-        case("jax", "sparse", lambda p: jnp.sin(3 * p[5]) + p[5] * p[90], hundred),
-        case("torch", "300", lambda x: torch.log1p((x**2).sum(1)) + 0.1 * torch.sin(3 * x).sum(1), three),
-        case("jax", "periodic", lambda p: jnp.sum(jnp.cos(5 * jnp.pi * p)), TEN),
-        case("numpy", "rastrigin", lambda x: ((x**2 - np.cos(9 * x)).sum(1), 2 * x + 9 * np.sin(9 * x)), TEN),
-        case("torch", "log-scale", lambda x: (x[:, 1] / (2 * x[:, 0].sqrt()) - 1) ** 2, decades),
-    ]
+hundred = gs.ParameterSpace.box([f"x{k}" for k in range(100)], -1, 1)
+three = gs.ParameterSpace.box([f"x{k}" for k in range(300)], -1, 1)
+whole = gs.ParameterSpace({"n": (0, 9), "m": (0, 9)})
+doses = gs.ParameterSpace({"count": (1, 9), "dose": (0.1, 1, "mg")})
+decades = gs.ParameterSpace({"k": gs.log(1e-2, 1e6, "N/m"), "c": (0, 5, "N s/m")})
+SHAPES = [
+    case("torch", "well", lambda x: 1 - torch.exp(-200 * ((x - 0.6) ** 2).sum(1)), place=0.78),
+    case("jax", "narrow-well", lambda p: -jnp.exp(-50 * jnp.sum((p - 0.2) ** 2)), TEN, place=0.62),
+    case("torch", "plateau", lambda x: (torch.relu(x - 0.5) ** 2).sum(1), place=0.9),
+    case("torch", "stairs", lambda x: ((x.round() - 3) ** 2).sum(1) + 0 * x.sum(1), whole, place=0.42),
+    case("numpy", "count-and-dose", count_and_dose, doses, place=0.4),
+    case("jax", "dead", lambda p: (p[0] - 0.3) ** 2 + 0 * p[1]),
+    case("torch", "relu-network", relu_network, TEN),
+    case("torch", "ripples-1e-3", lambda x: (x**2).sum(1) + 1e-3 * torch.sin(3e4 * x[:, 0])),
+    case("jax", "ripples-1e-6", lambda p: jnp.sum(p**2) + 1e-6 * jnp.sin(1e6 * p[0])),
+    case("jax", "softmax", lambda p: jnp.sum(jax.nn.softmax(60 * p) * jnp.arange(10.0)), TEN),
+    case("torch", "saturated", lambda x: cart(torch, 2 * torch.tanh(8 * x)), TEN),
+    case("torch", "barrier", barrier, place=0.6),
+    case("numpy", "fails", fails, UNIT, vectorized=False, place=0.3),
+    case("torch", "sparse", lambda x: (x[:, 13] - 0.3) ** 2 + x[:, 13] * x[:, 71] + torch.sin(2 * x[:, 71]), hundred),
+    case("jax", "sparse", lambda p: jnp.sin(3 * p[5]) + p[5] * p[90], hundred),
+    case("torch", "300", lambda x: torch.log1p((x**2).sum(1)) + 0.1 * torch.sin(3 * x).sum(1), three),
+    case("jax", "periodic", lambda p: jnp.sum(jnp.cos(5 * jnp.pi * p)), TEN),
+    case("numpy", "rastrigin", lambda x: ((x**2 - np.cos(9 * x)).sum(1), 2 * x + 9 * np.sin(9 * x)), TEN),
+    case("torch", "log-scale", lambda x: (x[:, 1] / (2 * x[:, 0].sqrt()) - 1) ** 2, decades),
+]
 
 
 # ---- Simulations.
@@ -276,36 +270,35 @@ def rotated(x: Any) -> Any:
     return (2 * (a * b - w * c) - 0.5) ** 2 + (2 * (a * c + w * b) + 0.3) ** 2
 
 
-def _simulations() -> list[Case]:
-    growth = gs.ParameterSpace({"growth": (3.6, 3.9), "start": (0.2, 0.8)})
-    angles = gs.ParameterSpace({"a": (-2.5, 2.5, "rad"), "b": (-2.5, 2.5, "rad")})
-    fall = gs.ParameterSpace({"height": (0.6, 1.0, "m"), "speed": (-0.5, 0.5, "m/s")})
-    forces = gs.ParameterSpace.box(numbered("force", 10), 0.5, 3, "N")
-    springs = gs.ParameterSpace({"stiff": (-1, 1, "mm"), "soft": (-1, 1, "m")})
-    return [
-        case("jax", "logistic-30", partial(logistic, steps=30), growth),
-        case("jax", "logistic-60", partial(logistic, steps=60), growth, mode="forward", place=(0.785, 0.4)),
-        case("jax", "double-pendulum", double_pendulum, angles),
-        case("torch", "soft-contact", soft_contact, fall),
-        case("torch", "exact-bounce", exact_bounce, fall),
-        case("torch", "stiff", stiff, springs),
-        case("numpy", "implicit", implicit, forces),
-        case("jax", "unrolled", unrolled, forces),
-        case("jax", "seeded", seeded),
-        case("jax", "mean-of-seeds", seeded, TEN, seeds=4),
-        case("numpy", "mean-of-seeds", seeded_array, TEN, seeds=4),
-        case("jax", "horizon", pendulum(), SWING, horizon="steps"),
-        case("numpy", "microseconds", one_point, vectorized=False),
-        case("torch", "rotated", rotated, gs.ParameterSpace.box(["a", "b", "c"], -1, 1)),
-        case("numpy", "differences", partial(nozzle, np), NOZZLE.space(3), differences=1e-5),
-        case("numpy", "differences", partial(cart, np), CART.space(10), differences=1e-5),
-        case("torch", "gas", partial(gas, torch), GAS.space(2)),
-        case("jax", "throw", partial(throw, jnp), THROW.space(2)),
-        case("torch", "rod", partial(rod, torch), ROD.space(100)),
-        case("jax", "chain", partial(chain, jnp), CHAIN.space(100), precision="float32",
-             reference=partial(chain, np)),
-        case("numpy", "chain", partial(right, CHAIN), CHAIN.space(100)),
-    ]  # fmt: skip
+growth = gs.ParameterSpace({"growth": (3.6, 3.9), "start": (0.2, 0.8)})
+angles = gs.ParameterSpace({"a": (-2.5, 2.5, "rad"), "b": (-2.5, 2.5, "rad")})
+fall = gs.ParameterSpace({"height": (0.6, 1.0, "m"), "speed": (-0.5, 0.5, "m/s")})
+forces = gs.ParameterSpace.box(numbered("force", 10), 0.5, 3, "N")
+springs = gs.ParameterSpace({"stiff": (-1, 1, "mm"), "soft": (-1, 1, "m")})
+SIMULATIONS = [
+    case("jax", "logistic-30", partial(logistic, steps=30), growth),
+    case("jax", "logistic-60", partial(logistic, steps=60), growth, mode="forward", place=(0.785, 0.4)),
+    case("jax", "double-pendulum", double_pendulum, angles),
+    case("torch", "soft-contact", soft_contact, fall),
+    case("torch", "exact-bounce", exact_bounce, fall),
+    case("torch", "stiff", stiff, springs),
+    case("numpy", "implicit", implicit, forces),
+    case("jax", "unrolled", unrolled, forces),
+    case("jax", "seeded", seeded),
+    case("jax", "mean-of-seeds", seeded, TEN, seeds=4),
+    case("numpy", "mean-of-seeds", seeded_array, TEN, seeds=4),
+    case("jax", "horizon", pendulum(), SWING, horizon="steps"),
+    case("numpy", "microseconds", one_point, vectorized=False),
+    case("torch", "rotated", rotated, gs.ParameterSpace.box(["a", "b", "c"], -1, 1)),
+    case("numpy", "differences", partial(nozzle, np), NOZZLE.space(3), differences=1e-5),
+    case("numpy", "differences", partial(cart, np), CART.space(10), differences=1e-5),
+    case("torch", "gas", partial(gas, torch), GAS.space(2)),
+    case("jax", "throw", partial(throw, jnp), THROW.space(2)),
+    case("torch", "rod", partial(rod, torch), ROD.space(100)),
+    case("jax", "chain", partial(chain, jnp), CHAIN.space(100), precision="float32",
+         reference=partial(chain, np)),
+    case("numpy", "chain", partial(right, CHAIN), CHAIN.space(100)),
+]  # fmt: skip
 
 
 # ---- Warp.
@@ -362,15 +355,10 @@ def drive_exactly(x: Any) -> Any:
     return (speed - 1) ** 2
 
 
-def _warp() -> list[Case]:
-    wave = lambda x: np.sin(3 * x[:, 0]) + x[:, 1] ** 2  # noqa: E731
-    return [
-        case("warp", "throw", throw_double, THROW.space(2), precision="float64"),
-        case("warp", "drive", drive, FORCES, reference=drive_exactly),
-        case("warp", "offset", of_kernel(_wave_kernel), reference=wave),
-    ]
-
-
-def cases() -> list[Case]:
-    """Return the cases of this file."""
-    return [*_plain(), *_steep(), *_shapes(), *_simulations(), *_warp()]
+wave = lambda x: np.sin(3 * x[:, 0]) + x[:, 1] ** 2  # noqa: E731
+WARP = [
+    case("warp", "throw", throw_double, THROW.space(2), precision="float64"),
+    case("warp", "drive", drive, FORCES, reference=drive_exactly),
+    case("warp", "offset", of_kernel(_wave_kernel), reference=wave),
+]
+CASES = [*PLAIN, *STEEP, *SHAPES, *SIMULATIONS, *WARP]
