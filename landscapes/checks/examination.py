@@ -111,6 +111,17 @@ class Examination:
         """Return the random points of some kinds."""
         return [row for row, one in enumerate(self.random.judged) if one.kind in kinds]
 
+    def describe_place(self, row: int) -> str:
+        """Say what is wrong along a line through a special place."""
+        (names, ladder), one = self.places, self.places[1].judged[row]
+        axis, loss = int(ladder.lines.direction[row].abs().argmax()), float(ladder.lines.loss[row])
+        if one.kind == Kind.NAN:
+            return f"the gradient is NaN at {names[row]}, where the loss is {loss:.4g}"
+        sides = [side.value for side in (one.behind, one.ahead) if side is not None]
+        rise = " and ".join(f"{value:.3g}" for value in sides) or f"{one.slope.value:.3g}" if one.slope else "otherwise"
+        gradient = f"by {self.names[axis]}, the gradient is {one.exact:.3g}"
+        return f"at {names[row]}, {gradient} and the loss rises by {rise} to either side"
+
     def parameters(self) -> tuple[ParameterRow, ...]:
         """Return the table of parameters."""
         return by_parameter.table(self.names, self.found, self.axes, self.blamed or set(), self.stepped)
@@ -186,16 +197,9 @@ def _more(probe: Probe, engine: SobolEngine, count: int, seed: int, before: Draw
     steps = tuple(sorted({*first.steps, *ladder.steps}))
     joined = Lines(*(torch.cat([getattr(first.lines, one), getattr(lines, one)]) for one in lines.__dataclass_fields__))
     joined = replace(joined, point=torch.arange(len(joined)))
-    walked = torch.cat([_on(one, steps) for one in (first, ladder)], dim=2)
+    walked = torch.cat([one.on(steps) for one in (first, ladder)], dim=2)
     both = Evaluation.join([before[1], found], dim=u.shape[1], grad=found.grad is not None)
     return torch.cat([before[0], u]), both, Ladder(joined, steps, walked, first.judged + ladder.judged)
-
-
-def _on(ladder: Ladder, steps: tuple[float, ...]) -> Tensor:
-    """Return what was walked, on a ladder of more steps."""
-    walked = torch.full((2, len(steps), len(ladder.lines)), torch.nan, dtype=torch.float64)
-    walked[:, [steps.index(one) for one in ladder.steps]] = ladder.walked
-    return walked
 
 
 def _look_closer(result: Examination) -> None:

@@ -18,8 +18,9 @@ from ..sampling.memory import ADVICE, is_out_of_memory
 from . import examination, extremes, growth
 from . import parameters as by_parameter
 from .causes import causes
-from .conclude import Calls, Further, conclude, conclude_jumps, conclude_memory, conclude_physics
+from .conclude import Further, conclude, conclude_jumps, conclude_memory, conclude_physics
 from .diagnosis import Diagnosis
+from .evidence import Evidence
 from .examination import Examination, examine, percent
 from .extremes import ExtremeCase
 from .finding import FAIL, PASS, SKIP, UNEXPECTED, WARN, Finding, one_line, skip, verdict, within
@@ -27,7 +28,6 @@ from .history import observe
 from .horizons import FirstWrong, first_wrong_step
 from .memory import memory_growth
 from .physics import compare_time_steps
-from .places import describe
 from .probe import Lines, Probe
 from .slopes import BAD, UNJUDGED, Kind, counts, measure
 from .subject import Subject, difference
@@ -49,10 +49,10 @@ LEAST_SHARE = 0.25  # share of slopes to compare for a step to be judged by
 
 @dataclass(eq=False)
 class Results:
-    """What `check` gathers besides findings, once it is done: what was measured, and what is concluded."""
+    """What `check` gathers besides findings, once it is done: what was measured, also of calls, and is concluded."""
 
     examination: Examination | None = None
-    calls: Calls = dataclasses.field(default_factory=Calls)
+    calls: Evidence = dataclasses.field(default_factory=dict)
     diagnoses: tuple[Diagnosis, ...] = ()
     usefulness: tuple[Usefulness, ...] = ()
 
@@ -184,15 +184,14 @@ def _checks(
 ) -> Iterator[tuple[str, Callable[[], Finding]]]:
     other = _other(subject, how.twin, made)
     for name, run in PROMISES.items():
-        yield name, partial(_keep_promise, name, run, subject, results)
+        yield name, partial(_keep_promise, run, subject, results)
     yield "order of calls", partial(_check_calls, subject, results)
     other = _usable(other)
     exact = other if subject.precision == "float32" else None
     best = exact or (lambda: subject)
     yield "gradient", lambda: _check_gradient(best(), how, results)
-    yield "special places", partial(_check_places, results)
-    yield "parameters", partial(_check_parameters, results)
-    yield "usefulness", partial(_check_usefulness, results)
+    for name, judge in JUDGED.items():
+        yield name, partial(_of_gradient, judge, results)
     yield "shorter time steps", partial(_check_time_steps, how, results)
     yield "memory", partial(_check_memory, subject, how.memory_seconds, results)
     yield "second backward", lambda: _check_second_backward(subject, results)
@@ -201,22 +200,21 @@ def _checks(
     yield from extremes.checks(subject, other, how.variants)
 
 
-def _keep_promise(name: str, run: Callable[[Subject], Finding], subject: Subject, results: Results) -> Finding:
-    """Make a check of calls, and remember its name where it fails: it tells causes."""
+def _keep_promise(run: Callable[[Subject], Finding], subject: Subject, results: Results) -> Finding:
     found = run(subject)
-    if found.outcome == FAIL:
-        results.calls = replace(results.calls, broken=(*results.calls.broken, name))
+    if run is _check_loss_without_gradient:  # which tells a cause
+        results.calls["depends"] = float(found.outcome == FAIL)
     return found
 
 
 def _check_calls(subject: Subject, results: Results) -> Finding:
     """Call the same points in several orders: what an evaluation gives depends on no other."""
     seen = observe(subject.objective, subject.x)
-    results.calls = replace(results.calls, history=seen)
-    limits = subject.repeatable
-    figure = f"losses {seen.loss:.1e} and gradients {seen.gradient:.1e} of themselves apart"
-    ok = seen.loss <= limits[0] and seen.gradient <= limits[1] and not (seen.stale or seen.grows)
-    return verdict(ok, "same bits" if max(seen.loss, seen.gradient) == 0 else figure, "an evaluation remembers others")
+    results.calls |= seen
+    loss, gradient, limits = seen["loss_moves"], seen["gradient_moves"], subject.repeatable
+    figure = f"losses {loss:.1e} and gradients {gradient:.1e} of themselves apart"
+    ok = loss <= limits[0] and gradient <= limits[1] and not (seen["stale"] or seen["grows"])
+    return verdict(ok, "same bits" if max(loss, gradient) == 0 else figure, "an evaluation remembers others")
 
 
 def _check_gradient(subject: Subject, how: Settings, results: Results) -> Finding:
@@ -322,29 +320,25 @@ def _check_memory(subject: Subject, seconds: float, results: Results) -> Finding
     return Finding("", WARN if found else PASS, figure, found[0].what if found else "")
 
 
-def _check_places(results: Results) -> Finding:
+def _of_gradient(judge: Callable[[Examination, Results], Finding], results: Results) -> Finding:
     seen = results.examination
-    if seen is None or seen.found.grad is None:
-        return skip("no gradient")
+    return skip("no gradient") if seen is None or seen.found.grad is None else judge(seen, results)
+
+
+def _check_places(seen: Examination, results: Results) -> Finding:
     names, ladder = seen.places
     places = ", ".join(dict.fromkeys(names))
     bad = [row for row, one in enumerate(ladder.judged) if one.kind in BAD]
     if not bad:
         told = sum(one.kind not in UNJUDGED for one in ladder.judged)
         return verdict(True, f"{told} slopes at {places}: between those to either side") if told else skip(places)
-    said = []
-    for row in bad:
-        axis = int(ladder.lines.direction[row].abs().argmax())
-        said.append(describe(names[row], ladder.judged[row], seen.names[axis], float(ladder.lines.loss[row])))
+    said = (seen.describe_place(row) for row in bad)
     figure = f"{len(bad)} of {len(ladder.judged)} slopes at {places} are wrong"
     numbers: dict[str, float | None] = {"wrong": float(len(bad)), "compared": float(len(ladder.judged))}
     return Finding("", FAIL, figure, "; ".join(list(dict.fromkeys(said))[:SAID_PLACES]), numbers)
 
 
-def _check_parameters(results: Results) -> Finding:
-    seen = results.examination
-    if seen is None or seen.found.grad is None:
-        return skip("no gradient")
+def _check_parameters(seen: Examination, results: Results) -> Finding:
     rows = seen.parameters()
     verdicts = [row.verdict for row in rows]
     figure = ", ".join(f"{verdicts.count(one)} {one}" for one in dict.fromkeys(verdicts))
@@ -358,11 +352,8 @@ def _check_parameters(results: Results) -> Finding:
     return verdict(True, figure)
 
 
-def _check_usefulness(results: Results) -> Finding:
+def _check_usefulness(seen: Examination, results: Results) -> Finding:
     """Say how far a gradient holds: useless over an optimiser's step is the landscape's fault, and a warning."""
-    seen = results.examination
-    if seen is None or seen.found.grad is None:
-        return skip("no gradient")
     results.usefulness = usefulness(seen.probe, seen.random)
     if not any(one.outcome == FAIL for one in results.diagnoses):
         results.diagnoses += conclude_jumps(results.usefulness)
@@ -385,11 +376,14 @@ def _check_usefulness(results: Results) -> Finding:
     return Finding("", PASS if useful else WARN, figure, "" if useful else why, numbers)
 
 
+JUDGED = {"special places": _check_places, "parameters": _check_parameters, "usefulness": _check_usefulness}
+
+
 def _check_second_backward(subject: Subject, results: Results) -> Finding:
     found = growth.second_backward(subject)
     if found.outcome == FAIL and results.examination is not None and not results.diagnoses:
-        calls = replace(results.calls, second_backward=1.0)
-        results.diagnoses = conclude(results.examination, calls)
+        results.calls["second_backward"] = 1.0
+        results.diagnoses = conclude(results.examination, results.calls)
     return found
 
 
@@ -479,7 +473,7 @@ def _check_refusal_of_nan(subject: Subject) -> Finding:
         found = evaluate(subject.objective, x, grad=True)
     except ValueError:
         return verdict(True, "refused")
-    others = subject.rows(torch.arange(1, len(x)))
+    others = subject.first.rows(torch.arange(1, len(x)))
     clean = subject.agree(found.rows(slice(1, None)), others)
     status = Status(int(found.status[0]))
     why = "the other rows changed with it" if not clean else f"a row of nan was given a loss and status {status.name}"
@@ -510,7 +504,7 @@ def _check_order_of_rows(subject: Subject) -> Finding:
 
 
 def _compare(subject: Subject, found: Evaluation, rows: Tensor) -> Finding:
-    apart = subject.differences(found, subject.rows(rows))
+    apart = subject.differences(found, subject.first.rows(rows))
     limits = subject.tolerances
     figure = "same bits" if max(apart) == 0 else f"loss {apart[0]:.1e} of its range, gradient {apart[1]:.1e} apart"
     why = f"at most {limits[0]:.0e} and {limits[1]:.0e} is wanted: a row depends on the rows it is evaluated with"
