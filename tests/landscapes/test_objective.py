@@ -129,13 +129,6 @@ def test_evaluations_of_several_batches_are_joined_in_order():
         Evaluation.join([*parts, blind], dim=3, grad=True)
 
 
-def test_the_first_name_of_raw_results_still_works() -> None:
-    loss = torch.tensor([1.0, torch.nan])
-    torch.testing.assert_close(
-        Evaluation.judged(loss, None).loss, Evaluation.from_results(loss, None).loss, equal_nan=True
-    )
-
-
 def test_a_loss_without_a_gradient_is_kept():
     nan, inf = float("nan"), float("inf")
     loss = torch.tensor([1.0, 2.0, nan, 4.0, 5.0, inf], dtype=torch.float64)
@@ -149,7 +142,7 @@ def test_a_loss_without_a_gradient_is_kept():
     assert found.has_loss.tolist() == [True, True, False, False, True, False]
     assert found.has_gradient.tolist() == [True, *[False] * 5]
     assert found.failed.tolist() == (~found.has_loss).tolist()
-    alone = Evaluation.from_results(loss, None, found.status)
+    alone = Evaluation.judged(loss, None, found.status)  # by its first name
     assert alone.status.tolist()[:2] == [Status.OK] * 2
     assert not alone.has_gradient.any()
 
