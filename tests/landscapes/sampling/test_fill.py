@@ -142,41 +142,51 @@ def test_without_gradients_none_is_asked_for_and_none_stored(tmp_path):
     objective = Wave()
     assert "grad" not in sample(objective, PLANE, store_at(tmp_path / "s.zarr", grad=False), gradients=0)
     assert objective.count(True) == 0
+    other = Plane.through(SPACE, SPACE.center, ["x", "y"], resolution=16)
+    with pytest.raises(StoreError, match=r"plane\.basis"):
+        sample(Wave(), other, store_at(tmp_path / "t.zarr"))
     with pytest.raises(StoreError, match="gradients: wanted True, found False"):
         sample(Wave(), PLANE, store_at(tmp_path / "s.zarr", grad=False))
 
 
-def test_another_plane_than_the_stores_is_refused(tmp_path):
-    other = Plane.through(SPACE, SPACE.center, ["x", "y"], resolution=16)
-    with pytest.raises(StoreError, match=r"plane\.basis"):
-        sample(Wave(), other, store_at(tmp_path / "s.zarr"))
+class Bent(Wave):
+    """A wave whose answer is changed."""
+
+    def __init__(self, change):
+        super().__init__()
+        self.change = change
+
+    def answer(self, x, *, grad):
+        return self.change(super().answer(x, grad=grad))
 
 
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (lambda e: Evaluation(e.loss[:-1], e.grad, e.status), r"bent must return loss of shape \(16,\).*got \(15,\)"),
+        (
+            lambda e: Evaluation(e.loss[:-1], e.grad, e.status),
+            r"counted must return loss of shape \(16,\).*got \(15,\)",
+        ),
         (lambda e: Evaluation(e.loss, e.grad[:, :2], e.status), r"grad of shape \(16, 3\).*got \(16, 2\)"),
         (lambda e: Evaluation(e.loss, None, e.status), "asked for gradients and returned none"),
         (lambda e: Evaluation(e.loss, e.grad, 0 * e.status), "got status MISSING"),
+        (lambda e: Evaluation(e.loss, e.grad, 0 * e.status + Status.INTERPOLATED), "got status INTERPOLATED"),
     ],
 )
 def test_an_objective_that_breaks_the_protocol_is_named(change, said):
-    class Bent(Wave):
-        def evaluate(self, x, *, grad=True):
-            return change(super().evaluate(x, grad=grad))
-
     with pytest.raises(ValueError, match=said):
-        sample(Bent(), PLANE)
+        sample(Bent(change), PLANE)
 
 
 def test_a_silent_nan_becomes_a_status():
-    class Silent(Wave):
-        def evaluate(self, x, *, grad=True):
-            gradient = torch.zeros_like(x)
-            gradient[0, 1] = torch.inf
-            return Evaluation(x[:, 0], gradient, torch.full((len(x),), Status.OK))
+    def silent(found):
+        first = torch.arange(len(found.loss))[:, None] == 0
+        return Evaluation(
+            0 * found.status.double(),
+            torch.where(first, torch.inf, 0.0 * found.grad.nan_to_num()),
+            0 * found.status + 1,
+        )
 
-    dataset = sample(Silent(), PLANE)
+    dataset = sample(Bent(silent), PLANE)
     assert (dataset["status"] == Status.NO_GRADIENT).sum() == len(SliceStore.in_memory(PLANE, SPACE).tiles())
     assert not dataset["loss"].isnull().any()

@@ -288,17 +288,6 @@ def test_it_says_what_it_came_to() -> None:
     assert Refined.of(sample(from_torch(waves, SPACE), plane(5))) is None
 
 
-def test_an_objective_may_not_interpolate() -> None:
-    class Guessing(Objective):
-        space, name = SPACE, "guessing"
-
-        def evaluate(self, x: Tensor, *, grad: bool = True) -> Evaluation:
-            return Evaluation(x[:, 0], x if grad else None, torch.full((len(x),), int(Status.INTERPOLATED)))
-
-    with pytest.raises(ValueError, match="how every point ended; got status INTERPOLATED"):
-        sample(Guessing(), plane(3))
-
-
 def test_a_function_that_raises_says_so() -> None:
     def raising(x: object) -> object:
         raise RuntimeError("no more")
