@@ -17,7 +17,7 @@ from .finding import FAIL
 from .horizons import FirstWrong
 from .memory import MemoryGrowth
 from .parameters import AGREES, WRONG
-from .slopes import UNJUDGED, Judgement, Kind
+from .slopes import UNJUDGED, Kind
 from .usefulness import Usefulness
 
 OVERWRITES = "writes to what it has read"  # how a simulator says so
@@ -165,8 +165,10 @@ def _of_wrong(seen: Examination, calls: Evidence, further: Further) -> Iterator[
     names = names or _named(seen, early)
     evidence |= {"overwrites": float(OVERWRITES in begins), "early": float(bool(early))}
     evidence |= {"horizon": float(further.has_length)}
+    when = f"; it begins in {begins}" if begins else ""
     if late is not None and late.right is not None:
         evidence |= {"right_until": late.right, "first_wrong": late.length}
+        when = f"; it is right in episodes up to a length of {late.right:g}, and wrong from {late.length:g} on{when}"
     texts = {
         "by": _by(names),
         "where": _where(region),
@@ -180,14 +182,7 @@ def _of_wrong(seen: Examination, calls: Evidence, further: Further) -> Iterator[
     what = f"the gradient{texts['by']} is not the slope of the loss{texts['where']}; no known cause fits"
     found = _recognised("wrong", evidence, texts, names, region)
     found = found or (Diagnosis("", FAIL, "certain", what, REMEDY, names, region, evidence),)
-    yield replace(found[0], what=found[0].what + _when(late) + (f"; it begins in {begins}" if begins else ""))
-
-
-def _when(late: FirstWrong | None) -> str:
-    """Say from which length of an episode on a gradient is wrong."""
-    if late is None or late.right is None:
-        return ""
-    return f"; it is right in episodes up to a length of {late.right:g}, and wrong from {late.length:g} on"
+    yield replace(found[0], what=found[0].what + when)
 
 
 def _early(seen: Examination) -> set[int]:
@@ -225,12 +220,9 @@ def _wrong_numbers(seen: Examination) -> Evidence:
     if found.get("zero", 0) < 1:
         found |= numbers_of.as_difference(seen.probe, axes, lines)
         found |= numbers_of.roughness(seen.probe, seen.u[:16])
-    noise = [one.noise / (seen.probe.eps * abs(float(seen.found.loss[row])) or 1) for row, one in _lines(seen)]
+    noisy = [(row, one) for row, one in enumerate(seen.random.judged) if math.isfinite(one.noise)]
+    noise = [one.noise / (seen.probe.eps * abs(float(seen.found.loss[row])) or 1) for row, one in noisy]
     return found | ({"noise_ratio": float(np.median(noise))} if noise else {})
-
-
-def _lines(seen: Examination) -> list[tuple[int, Judgement]]:
-    return [(row, one) for row, one in enumerate(seen.random.judged) if math.isfinite(one.noise)]
 
 
 def _of_zero(seen: Examination) -> Iterator[Diagnosis]:
@@ -254,11 +246,11 @@ def _of_steep(seen: Examination) -> Iterator[Diagnosis]:
 
 
 def _of_noise(seen: Examination) -> Iterator[Diagnosis]:
-    lines = [one for _, one in _lines(seen)]
-    if not lines:
+    noises = [one.noise for one in seen.random.judged if math.isfinite(one.noise)]
+    if not noises:
         return
     loss = float(seen.found.loss[seen.found.loss.isfinite()].abs().median())
-    noise = float(np.median([one.noise for one in lines]))
+    noise = float(np.median(noises))
     evidence = {
         "single": float(seen.probe.single),
         "noise": noise,

@@ -158,7 +158,8 @@ def examine(probe: Probe, power: float, seed: int, say: Callable[[str], None] = 
     wanted = points_for(power)
     drawn = 2 ** math.ceil(math.log2(wanted))
     u, found, ladder = _random(probe, engine, drawn, seed)
-    while Share.of(ladder.judged).judged < wanted and len(u) < MOST_TIMES * wanted and _worth(ladder):
+    while len(u) / 2 <= Share.of(ladder.judged).judged < wanted and len(u) < MOST_TIMES * wanted:
+        # where most could not be judged, more would not tell more
         u, found, ladder = _more(probe, engine, drawn, seed, (u, found, ladder))
     wrong = sum(one.kind in BAD for one in ladder.judged)
     if 0 < wrong < FEW_WRONG and len(u) < MOST_TIMES * wanted:
@@ -171,11 +172,6 @@ def examine(probe: Probe, power: float, seed: int, say: Callable[[str], None] = 
     say("where gradients are wrong")
     _look_closer(result)
     return result
-
-
-def _worth(ladder: Ladder) -> bool:
-    """Say whether more points would tell more: where most could not be judged, they would not."""
-    return Share.of(ladder.judged).judged >= len(ladder.judged) / 2
 
 
 Drawn = tuple[Tensor, Evaluation, Ladder]

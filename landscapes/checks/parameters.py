@@ -134,13 +134,9 @@ def halve(
             return None
         first = False
         blamed |= {group[0] for group in wrong if len(group) == 1}
-        groups = [half for group in wrong if len(group) > 1 for half in _halves(group)]
+        cuts = [(group, len(group) // 2) for group in wrong if len(group) > 1]
+        groups = [half for group, middle in cuts for half in (group[:middle], group[middle:])]
     return blamed
-
-
-def _halves(group: list[int]) -> tuple[list[int], list[int]]:
-    middle = len(group) // 2
-    return group[:middle], group[middle:]
 
 
 def _judge_groups(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import gc
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from typing import Any
@@ -107,7 +108,9 @@ def check(objective: Objective, settings: Settings | None = None, results: Resul
     shapes = _try("shapes", lambda: _check_shapes(objective, x))
     yield shapes.excuse(how.expected)
     if shapes.outcome == FAIL:
-        results.diagnoses = _of_error(shapes)
+        if "writes to what it has read" in shapes.why or "modified by an inplace operation" in shapes.why:
+            (cause,) = [one for one in causes() if one.name == "tape overwritten"]
+            results.diagnoses = (Diagnosis(cause.name, FAIL, "certain", shapes.why, cause.remedy),)
         yield Finding("all else", SKIP, "not checked", "evaluations of the wrong form can be judged no further")
         return
     how.follow("repeats")
@@ -126,14 +129,6 @@ def check(objective: Objective, settings: Settings | None = None, results: Resul
         yield _try(name, run).excuse(how.expected)
     for name in left:
         yield Finding(name, UNEXPECTED, "not checked", "a failure is expected of it, but there is no such check")
-
-
-def _of_error(finding: Finding) -> tuple[Diagnosis, ...]:
-    """Return what an error says of its cause: an array that was overwritten."""
-    if "writes to what it has read" not in finding.why and "modified by an inplace operation" not in finding.why:
-        return ()
-    (cause,) = [one for one in causes() if one.name == "tape overwritten"]
-    return (Diagnosis(cause.name, FAIL, "certain", finding.why, cause.remedy),)
 
 
 def episodes(dim: int, power: float, horizons: Sequence[float] = ()) -> tuple[int, int]:
@@ -161,16 +156,6 @@ def _other(
     return cache(observe_twin)
 
 
-def _usable(other: Callable[[], Subject] | None) -> Callable[[], Subject] | None:
-    """Return what evaluates the twin, None where it refuses to be evaluated: kernels written for one precision."""
-    if other is not None:
-        try:
-            other()
-        except ValueError:
-            return None
-    return other
-
-
 def _give_back(made: Sequence[Objective]) -> None:
     """Give back the memory of a device that environments hold between evaluations: another one takes all there is."""
     if any(one.device != "cpu" for one in made):
@@ -186,7 +171,11 @@ def _checks(
     for name, run in PROMISES.items():
         yield name, partial(_keep_promise, run, subject, results)
     yield "order of calls", partial(_check_calls, subject, results)
-    other = _usable(other)
+    if other is not None:
+        try:
+            other()
+        except ValueError:  # kernels written for one precision
+            other = None
     exact = other if subject.precision == "float32" else None
     best = exact or (lambda: subject)
     yield "gradient", lambda: _check_gradient(best(), how, results)
@@ -452,17 +441,14 @@ def _check_status(subject: Subject) -> Finding:
 def _check_refusal_of_shapes(subject: Subject) -> Finding:
     x, dim = subject.x, subject.objective.space.dim
     shapes = {"(2, dim + 1)": x.new_zeros(2, dim + 1), "(dim,)": x[0], "(1, 1, dim)": x[None, :1]}
-    taken = [shape for shape, wrong in shapes.items() if not _refuses(subject.objective, wrong)]
+    taken = list(shapes)
+    for shape, wrong in shapes.items():
+        with suppress(ValueError):
+            subject.objective.evaluate(wrong)
+            continue
+        taken.remove(shape)
     why = f"ValueError is wanted; x of shape {' and '.join(taken)} was taken"
     return verdict(not taken, f"{len(shapes) - len(taken)} of {len(shapes)} shapes refused", why)
-
-
-def _refuses(objective: Objective, x: Tensor) -> bool:
-    try:
-        objective.evaluate(x)
-    except ValueError:
-        return True
-    return False
 
 
 def _check_refusal_of_nan(subject: Subject) -> Finding:
