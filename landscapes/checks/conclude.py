@@ -129,7 +129,7 @@ def _limit(seen: Examination) -> float:
 def _of_nan(seen: Examination, further: Further) -> Iterator[Diagnosis]:
     rows = seen.rows(Kind.NAN)
     names, ladder = seen.places
-    places = [row for row, one in enumerate(ladder.judged) if one.kind == Kind.NAN]
+    places = ladder.rows(Kind.NAN)
     if not rows and not places:
         return
     region = seen.region if rows else None
@@ -151,9 +151,8 @@ def _of_nan(seen: Examination, further: Further) -> Iterator[Diagnosis]:
 
 def _of_wrong(seen: Examination, calls: Evidence, further: Further) -> Iterator[Diagnosis]:
     rows = seen.rows(Kind.WRONG)
-    axes = [one for one in seen.axes.ladder.judged if one.kind == Kind.WRONG]
-    if not rows and not axes:
-        for place in [row for row, one in enumerate(seen.places[1].judged) if one.kind == Kind.WRONG][:1]:
+    if not rows and not seen.axes.rows(Kind.WRONG):
+        for place in seen.places[1].rows(Kind.WRONG)[:1]:
             remedy = "Look at what divides by zero or chooses a branch there."
             yield Diagnosis("", FAIL, "certain", seen.describe_place(place), remedy)
         return
@@ -216,7 +215,7 @@ def _wrong_numbers(seen: Examination) -> Evidence:
     found |= numbers_of.cut_off(seen.probe, wrong, Samples.of(seen.axes, wrong=False))
     if seen.found.grad is not None:
         found |= numbers_of.same_length(seen.found.grad[seen.found.has_gradient])
-    lines = [row for row, one in enumerate(axes.ladder.judged) if one.kind == Kind.WRONG]
+    lines = axes.rows(Kind.WRONG)
     if found.get("zero", 0) < 1:
         found |= numbers_of.as_difference(seen.probe, axes, lines)
         found |= numbers_of.roughness(seen.probe, seen.u[:16])

@@ -68,7 +68,8 @@ def memory_growth(
     found = []
     for where, read, floor in [_of_process(), *([_OF_GPU] if on_gpu else [])]:
         least = max(floor, BATCHES * batch)
-        for between in (lambda: None, gc.collect):  # the latter where memory grows without
+        ways: tuple[Callable[[], object], ...] = (lambda: None, gc.collect)  # the latter where memory grows without
+        for between in ways:
             one = _judge(where, _measure(evaluate, read, blocks, count, between), count, least)
             if not one.grows:
                 break

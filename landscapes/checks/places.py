@@ -63,9 +63,8 @@ def measure_places(probe: Probe, seed: int) -> tuple[tuple[str, ...], Ladder]:
     direction = torch.eye(dim, dtype=torch.float64)[axes].repeat(len(u), 1)
     lines = Lines.through(probe, u, direction, point, probe.gradient(u))
     ladder = measure(probe, lines, STEPS)
-    wrong = [row for row, one in enumerate(ladder.judged) if one.kind == Kind.WRONG]
     judged = list(ladder.judged)
-    for row in wrong:
+    for row in ladder.rows(Kind.WRONG):
         if _is_within_neighbours(probe, lines, row):
             judged[row] = Judgement(Kind.KINK, judged[row].exact)
     names = tuple(list(found)[one] for one in point.tolist())

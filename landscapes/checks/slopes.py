@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -103,6 +103,19 @@ class Ladder:
     judged: tuple[Judgement, ...]
 
     @property
+    def axis(self) -> Int[Tensor, " line"]:
+        """The parameter that moves most along each line: the only one along an axis."""
+        return self.lines.direction.abs().argmax(dim=1)
+
+    def rows(self, *kinds: Kind) -> list[int]:
+        """Return the lines of some kinds."""
+        return [row for row, one in enumerate(self.judged) if one.kind in kinds]
+
+    def along(self, axis: int) -> list[Judgement]:
+        """Return what was judged of the lines along one parameter."""
+        return [self.judged[row] for row in (self.axis == axis).nonzero().flatten().tolist()]
+
+    @property
     def differences(self) -> Float[Tensor, "step line"]:
         """Central differences, one-sided where the box ends, NaN where neither is there."""
         steps = torch.tensor(self.steps, dtype=torch.float64)[:, None]
@@ -141,11 +154,8 @@ def measure(probe: Probe, lines: Lines, steps: Sequence[float] = STEPS) -> Ladde
 
 def _forgive_few(ladder: Ladder) -> Ladder:
     """Let few small disagreements in float32 be noise: losses that jump between steps of time hide below rounding."""
-    small = [
-        row
-        for row, one in enumerate(ladder.judged)
-        if one.kind == Kind.WRONG and one.slope is not None and _alike(one.slope.value, one.exact, SMALL)
-    ]
+    wrong = [(row, ladder.judged[row]) for row in ladder.rows(Kind.WRONG)]
+    small = [row for row, one in wrong if one.slope is not None and _alike(one.slope.value, one.exact, SMALL)]
     return ladder.with_kind(small, Kind.NOISE) if len(small) < MANY * len(ladder.judged) else ladder
 
 
@@ -156,13 +166,10 @@ def _distrust(ladder: Ladder) -> Ladder:
     float32 may see none, and others above.
     """
     differences, distrusted = ladder.differences.numpy(), list[int]()
-    right = [
-        (row, one.slope.step, one.exact)
-        for row, one in enumerate(ladder.judged)
-        if one.kind == Kind.AGREES and one.slope
-    ]
-    for row, one in enumerate(ladder.judged):
-        if one.kind != Kind.WRONG or one.slope is None:
+    agreeing = [(row, ladder.judged[row]) for row in ladder.rows(Kind.AGREES)]
+    right = [(row, one.slope.step, one.exact) for row, one in agreeing if one.slope]
+    for row in ladder.rows(Kind.WRONG):
+        if (one := ladder.judged[row]).slope is None:
             continue
         level = ladder.steps.index(one.slope.step)
         others = [(differences[level, other], exact) for other, step, exact in right if step != one.slope.step]

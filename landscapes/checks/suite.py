@@ -233,7 +233,7 @@ def _judge_gradient(seen: Examination, results: Results) -> Finding:
     }
     failing = [one.what for one in results.diagnoses if one.outcome == FAIL]
     on_average = any(one.outcome == FAIL and {*ON_AVERAGE} & {*one.numbers} for one in results.diagnoses)
-    if share.wrong or on_average or any(one.kind == Kind.WRONG for one in seen.axes.ladder.judged):
+    if share.wrong or on_average or seen.axes.rows(Kind.WRONG):
         figure = f"wrong at {share.describe()}: {told}" if share.wrong else f"{share.points} points: {told}"
         return Finding("", FAIL, figure, "; ".join(failing), numbers, seen.table())
     if counted[Kind.FAILED] == share.points:
@@ -281,7 +281,7 @@ def _is_wrong(seen: Examination, rows: Sequence[int], objective: Objective) -> b
     lines = seen.random.lines.rows(chosen)
     found = probe.gradient(lines.u)
     ladder = measure(probe, Lines.through(probe, lines.u, lines.direction, torch.arange(len(rows)), found))
-    return any(one.kind in BAD for one in ladder.judged)
+    return bool(ladder.rows(*BAD))
 
 
 def _check_time_steps(how: Settings, results: Results) -> Finding:
@@ -317,7 +317,7 @@ def _of_gradient(judge: Callable[[Examination, Results], Finding], results: Resu
 def _check_places(seen: Examination, results: Results) -> Finding:
     names, ladder = seen.places
     places = ", ".join(dict.fromkeys(names))
-    bad = [row for row, one in enumerate(ladder.judged) if one.kind in BAD]
+    bad = ladder.rows(*BAD)
     if not bad:
         told = sum(one.kind not in UNJUDGED for one in ladder.judged)
         return verdict(True, f"{told} slopes at {places}: between those to either side") if told else skip(places)

@@ -123,7 +123,7 @@ def describe(objective: Objective) -> dict[str, dict[str, Any]]:
 
 def check_store(store: SliceStore, objective: Objective, plane: Plane, *, grad: bool | None = None) -> None:
     """Raise StoreMismatchError where a store is of another plane or parameters, or lacks gradients or has some."""
-    wanted = {"plane": plane.record(), **record_parameters(objective.space)}
+    wanted: dict[str, Any] = {"plane": plane.record(), **record_parameters(objective.space)}
     wanted |= {} if grad is None else {"gradients": grad}
     check_identity(store.path, wanted=wanted, found={name: store.identity[name] for name in wanted})
 
