@@ -4,7 +4,6 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gradscape.landscapes.plane import Plane
 from gradscape.landscapes.space import ParameterSpace, log
 
 SPACE = ParameterSpace(
@@ -43,12 +42,6 @@ def test_parameters_are_named_with_their_bounds_and_units_in_one_go():
     assert space.lower.dtype == torch.float64
 
 
-@pytest.mark.parametrize("kind", [list, tuple, np.array, torch.tensor])
-def test_bounds_are_lists_arrays_or_tensors(kind):
-    space = ParameterSpace(["a", "b"], kind([0, 1]), kind([2, 3]))
-    assert (space.lower.tolist(), space.upper.tolist(), space.units) == ([0, 1], [2, 3], ("", ""))
-
-
 @pytest.mark.parametrize(
     ("given", "said"),
     [
@@ -73,13 +66,6 @@ def test_bounds_are_lists_arrays_or_tensors(kind):
 def test_what_is_no_space_is_refused_by_name(given, said):
     with pytest.raises(ValueError, match=said):
         ParameterSpace(*given)
-
-
-def test_planes_go_through_lists_and_arrays_too():
-    for point in ([1.0, 0.25], (1.0, 0.25), np.array([1.0, 0.25]), torch.tensor([1.0, 0.25])):
-        plane = Plane.through(SPACE, point, ["angle"], resolution=3)
-        assert plane.lift(torch.tensor([[0.5]]).double()).tolist() == [[1.0, 0.5]]
-    assert Plane.span([0, 0], [[1, 0], [0, 2]], resolution=3).basis.tolist() == [[1, 0], [0, 2]]
 
 
 DECADES = ParameterSpace({"k": log(1e-2, 1e6, "N/m"), "c": (0, 5)})

@@ -69,12 +69,6 @@ def test_gradients_are_those_of_the_whole_slice_where_they_are(plane: Plane, eve
     assert same(open_slice(tmp_path / "threads"), found)
 
 
-def test_no_more_gradients_are_asked_for_than_are_kept() -> None:
-    counted = Torn()
-    sample(counted, PLANE, gradients=4)
-    assert (counted.count(True), counted.count(False)) == (5 * 6, 18 * 21 - 5 * 6)  # of 18 and 21 samples
-
-
 def test_one_that_was_stopped_goes_on_to_the_same_bits(tmp_path: Path) -> None:
     SliceJob.of(Torn(), PLANE, command="", out=tmp_path / "whole", gradients=3).run()
     for _ in range(100):

@@ -135,28 +135,6 @@ def test_tiles_that_a_kill_left_beside_a_finished_slice_go(tmp_path):
     assert open_slice(path).identical(whole)
 
 
-def test_another_process_that_finishes_first_is_followed(tmp_path):
-    path = tmp_path / "slice.zarr"
-    slow, tile = make(path), make(path).tiles()[0]
-    whole = open_slice(finished(path).path)
-    slow.write(tile, evaluated(slow.points(tile)))  # too late, and not needed
-    assert slow.dataset().identical(whole)
-    assert slow.pending() == []
-    assert open_slice(path).identical(whole)
-
-
-def test_a_nan_result_is_finished_and_not_missing(tmp_path):
-    store = make(tmp_path / "s.zarr")
-    tile = store.tiles()[0]
-    count = store.tiling.count(tile)
-    nan = torch.full((count,), torch.nan).double()
-    store.write(tile, Evaluation.from_results(nan, nan[:, None].expand(-1, 3)))
-    assert tile not in store.pending()
-    status = store.dataset()["status"].to_numpy()
-    assert (status == Status.NONFINITE).sum() == count
-    assert (status == Status.MISSING).sum() == status.size - count
-
-
 def test_tiles_come_in_squares_and_the_coarse_picture_grows_with_them():
     store = SliceStore.in_memory(PLANE, SPACE)
     assert store.coarse() is None
