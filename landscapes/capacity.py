@@ -50,7 +50,8 @@ def require(what: str, value: int, need: Callable[[int], Need], folder: Path | N
         fits, too_large = (middle, too_large) if _fits(need(middle), there) else (fits, middle)
     wanted = need(min(value, ENDLESS))
     name = "memory" if wanted.memory > there.memory else "disk"
-    most = f"{what} {_round_down(fits)} would fit" if fits else f"not even {what} 1 would fit, so make room"
+    digit: int = 10 ** max(0, len(str(fits)) - 2)  # two digits: more would pretend to more accuracy than there is
+    most = f"{what} {fits // digit * digit} would fit" if fits else f"not even {what} 1 would fit, so make room"
     raise TooLargeError(
         f"{what} {value} takes about {size(getattr(wanted, name))} of {name}, and {size(getattr(there, name))} are "
         f"free here; {most}"
@@ -82,12 +83,6 @@ def size(count: float) -> str:
     unit = next((at for at, _ in enumerate(UNITS) if count < 1000.0 ** (at + 2)), len(UNITS) - 1)
     amount = count / 1000.0 ** (unit + 1)
     return f"{amount:.0f} {UNITS[unit]}" if unit < 2 else f"{amount:.1f} {UNITS[unit]}"
-
-
-def _round_down(value: int) -> int:
-    """Round a value down to two digits: more would pretend to more accuracy than an estimate has."""
-    digit: int = 10 ** max(0, len(str(value)) - 2)
-    return value // digit * digit
 
 
 def _fits(wanted: Need, there: Need) -> bool:

@@ -81,7 +81,9 @@ def frame(dataset: xr.Dataset) -> pd.DataFrame:
     columns[labelled("loss", unit)] = dataset["loss"].to_numpy().ravel()
     for name in ("status", "kind"):
         if name in dataset:
-            columns[name] = _name_codes(dataset[name])
+            about, codes = dataset[name].attrs, dataset[name].to_numpy().ravel().tolist()
+            words = dict(zip(about["flag_values"], str(about["flag_meanings"]).split(), strict=True))
+            columns[name] = np.array([words[code] for code in codes])
     for name in ("forwards", "seconds"):
         if name in dataset:
             columns[labelled(name, str(dataset[name].attrs.get("units", "")))] = dataset[name].to_numpy()
@@ -105,10 +107,3 @@ def _points(run: xr.Dataset) -> dict[str, np.ndarray]:
     values = to_values(torch.from_numpy(run["x"].to_numpy()), stored_scales(run)).numpy().T
     named = {labelled(*one): column for one, column in zip(parameters_of(run), values, strict=True)}
     return {"episode": run["episodes"].to_numpy(), **named}
-
-
-def _name_codes(codes: xr.DataArray) -> np.ndarray:
-    """Return the words that codes stand for."""
-    words = str(codes.attrs["flag_meanings"]).split()
-    by_code = dict(zip(codes.attrs["flag_values"], words, strict=True))
-    return np.array([by_code[code] for code in codes.to_numpy().ravel().tolist()])

@@ -181,7 +181,9 @@ def check_identity(
         return
     differ = differing_settings(wanted, found)
     if differ.keys() == {MODEL_VERSION} and MODEL_VERSION in wanted and MODEL_VERSION in found:
-        raise StoreMismatchError(_other_model(path, wanted, found, what))
+        name, theirs, ours = wanted.get("objective", "its"), found[MODEL_VERSION], wanted[MODEL_VERSION]
+        said = f"the {what} in {path or 'memory'} was made by {name} model {theirs}; this is model {ours}."
+        raise StoreMismatchError(f"{said} Use --out, or --force to replace it.")
     said = [f"{name}: wanted {ours}, found {theirs}" for name, (ours, theirs) in differ.items()][:LISTED_SETTINGS]
     if len(differ) > LISTED_SETTINGS:
         said.append(f"and {len(differ) - LISTED_SETTINGS} more")
@@ -189,13 +191,6 @@ def check_identity(
         f"{path or 'the store'} holds a {what} made by other settings ({'; '.join(said)}); "
         "write elsewhere with --out, or replace it with --force"
     )
-
-
-def _other_model(path: Path | None, wanted: Mapping[str, Any], found: Mapping[str, Any], what: str) -> str:
-    """Say that a store is of another version of a model, and what to do."""
-    name, theirs, ours = wanted.get("objective", "its"), found[MODEL_VERSION], wanted[MODEL_VERSION]
-    said = f"the {what} in {path or 'memory'} was made by {name} model {theirs}; this is model {ours}."
-    return f"{said} Use --out, or --force to replace it."
 
 
 def differing_settings(ours: Mapping[str, Any], theirs: Mapping[str, Any]) -> dict[str, tuple[str, str]]:

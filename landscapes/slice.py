@@ -126,7 +126,9 @@ class Slice:
             return landscape_figure(self.data, floor=self.floor_map, width=width)
         from .draw.figures.profile import profile_figure
 
-        return profile_figure(self.data, events=self._events(), floor=self.floor_map, width=width)
+        points = self.plane.lift(self.plane.axes()[0][:, None])
+        events = dict(self.remake().events(points)) if self.remake is not None else {}
+        return profile_figure(self.data, events=events, floor=self.floor_map, width=width)
 
     def report(self, points: int = 6, seed: int = 0) -> Profile:
         """Measure what the landscape is like here: ruggedness, noise, jumps, gradients at several scales, in words.
@@ -166,9 +168,3 @@ class Slice:
         numerics = f"; {self.floor.sentence()}" if self.floor else ""
         over = ", ".join(self.plane.labels)
         return f"<Slice of {' · '.join(about)} over {over}: {points} points, {finite}{numerics}{raised}{where}>"
-
-    def _events(self) -> dict[str, Any]:
-        """Count what happens in the episodes along a line, where an environment says what does."""
-        if self.remake is None:
-            return {}
-        return dict(self.remake().events(self.plane.lift(self.plane.axes()[0][:, None])))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from .identity import plane_of
 
@@ -24,15 +23,11 @@ def smooth(dataset: xr.Dataset, width: float) -> xr.Dataset:
     if width == 0:
         return losses
     lower, upper = (side.numpy() for side in (plane_of(dataset).lower, plane_of(dataset).upper))
-    u, v = (_weights(losses[name].to_numpy(), width * (upper - lower)[axis]) for axis, name in enumerate(("u", "v")))
+    places = [losses[name].to_numpy() for name in ("u", "v")]
+    apart = [(at[:, None] - at) / (width * side) for at, side in zip(places, upper - lower, strict=True)]
+    u, v = (np.exp(-(one**2) / 2) for one in apart)
     loss = losses["loss"].to_numpy()
     there = np.isfinite(loss)
     total, weight = (v @ np.where(there, part, 0.0) @ u.T for part in (loss, 1.0))
     mean = np.where(there, total / np.where(there, weight, 1.0), np.nan)
     return losses.assign(loss=losses["loss"].copy(data=mean))
-
-
-def _weights(places: NDArray[np.float64], width: float) -> NDArray[np.float64]:
-    apart = (places[:, None] - places) / width
-    weights: NDArray[np.float64] = np.exp(-(apart**2) / 2)
-    return weights

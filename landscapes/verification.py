@@ -172,46 +172,36 @@ def _apart(one: Tensor, other: Tensor) -> Tensor:
     return torch.where(one.isfinite() & other.isfinite(), (one - other).abs(), 0.0)
 
 
-@dataclass(frozen=True, eq=False)
-class _Suspect:
-    """A stored point whose bits are others now, and what is known of it: evaluated `now`, and `again` in other ways."""
+def _differences(
+    probe: _Probe,
+    now: Evaluation,
+    again: Sequence[Evaluation],
+    statuses: set[int],
+    precision: str,
+    names: Sequence[str],
+) -> tuple[str, str, str]:
+    """Say how losses, statuses and gradients of a point are others now; empty by rounding, noise, or what happens too.
 
-    probe: _Probe
-    now: Evaluation
-    again: Sequence[Evaluation]
-    precision: str
-    statuses: set[int]
-
-    def differing_loss(self, names: Sequence[str]) -> str:
-        """Return both losses, nothing where they differ by no more than rounding and noise."""
-        then, now = self.probe.then.loss, self.now.loss
-        noise = max(float(_apart(now, one.loss)) for one in self.again)
-        size = PLACES * LAST_PLACE[self.precision] * abs(float(now.nan_to_num(0.0)))
-        allowed = max(ROUNDING[self.precision] * self.probe.spread, size, MARGIN * noise)
-        if float(_apart(then, now)) <= allowed:
-            return ""
-        return f"losses are others now: {_both(float(then), float(now))}"
-
-    def differing_status(self, names: Sequence[str]) -> str:
-        """Return how the point ended and ends now, nothing where it ends either way."""
-        then, now = int(self.probe.then.status), int(self.now.status)
-        if then in self.statuses:
-            return ""
-        return f"points end otherwise now: {Status(then).name} then, {Status(now).name} now"
-
-    def differing_gradient(self, names: Sequence[str]) -> str:
-        """Return both gradients by the parameter in which they differ most in widths of the box, nothing as above."""
-        then, now, widths = self.probe.then.grad, self.now.grad, self.probe.widths
-        if then is None or now is None:
-            return ""
-        shift = (_apart(then, now) * widths)[0]
-        noise = max(float((_apart(now, one.grad) * widths).max()) for one in self.again if one.grad is not None)
-        size = max(self.probe.slope, float((now.nan_to_num(0.0).abs() * widths).max()))
-        if float(shift.max()) <= max(ROUNDING[self.precision] * size, MARGIN * noise):
-            return ""
+    `again` was evaluated in other ways, of which `statuses` are all ends. Gradients are said by the parameter in which
+    they differ most in widths of the box.
+    """
+    then, loss, status, gradient = probe.then, "", "", ""
+    noise = max(float(_apart(now.loss, one.loss)) for one in again)
+    size = PLACES * LAST_PLACE[precision] * abs(float(now.loss.nan_to_num(0.0)))
+    if float(_apart(then.loss, now.loss)) > max(ROUNDING[precision] * probe.spread, size, MARGIN * noise):
+        loss = f"losses are others now: {_both(float(then.loss), float(now.loss))}"
+    if int(then.status) not in statuses:
+        ends = f"{Status(int(then.status)).name} then, {Status(int(now.status)).name} now"
+        status = f"points end otherwise now: {ends}"
+    if then.grad is not None and now.grad is not None:
+        shift = (_apart(then.grad, now.grad) * probe.widths)[0]
+        noise = max(float((_apart(now.grad, one.grad) * probe.widths).max()) for one in again if one.grad is not None)
+        size = max(probe.slope, float((now.grad.nan_to_num(0.0).abs() * probe.widths).max()))
         axis = int(shift.argmax())
-        both = _both(float(then[0, axis]), float(now[0, axis]))
-        return f"gradients are others now: gradient by {names[axis]} {both}"
+        if float(shift[axis]) > max(ROUNDING[precision] * size, MARGIN * noise):
+            both = _both(float(then.grad[0, axis]), float(now.grad[0, axis]))
+            gradient = f"gradients are others now: gradient by {names[axis]} {both}"
+    return loss, status, gradient
 
 
 def _compare(objective: Objective, probes: Sequence[_Probe], now: Evaluation, *, grad: bool, todo: str) -> None:
@@ -222,17 +212,19 @@ def _compare(objective: Objective, probes: Sequence[_Probe], now: Evaluation, *,
     if grad and any(int(probe.then.status) not in known for probe, known in zip(probes, statuses, strict=True)):
         for known, status in zip(statuses, _evaluate(objective, x, grad=False).status, strict=True):
             known.add(int(status))  # a point that failed may have been asked for its loss alone
-    suspects = [
-        _Suspect(probe, _row(now, number), [_row(one, number) for one in others], precision, statuses[number])
+    names = objective.space.names
+    differ = [
+        _differences(
+            probe, _row(now, number), [_row(one, number) for one in others], statuses[number], precision, names
+        )
         for number, probe in enumerate(probes)
     ]
-    for differing in (_Suspect.differing_loss, _Suspect.differing_status, _Suspect.differing_gradient):
-        for one in suspects:
-            if said := differing(one, objective.space.names):
-                stored = one.probe.stored
+    for kind in zip(*differ, strict=True):  # losses of all points come first
+        for probe, said in zip(probes, kind, strict=True):
+            if said:
                 raise StoreMismatchError(
-                    f"{stored.path} holds a {stored.what} of {objective.name} whose {said}, at x = "
-                    f"{_point(objective.space.to_values(one.probe.x))}; {todo}"
+                    f"{probe.stored.path} holds a {probe.stored.what} of {objective.name} whose {said}, at x = "
+                    f"{_point(objective.space.to_values(probe.x))}; {todo}"
                 )
 
 

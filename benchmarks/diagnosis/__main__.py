@@ -25,30 +25,27 @@ from .examine import WIDTHS, Result, Slabs, examine, power
 from .peers import ask_peers, show_peers
 from .tables import Share, table
 
-FOUND, CAUSE, PLACE = 0.97, 0.85, 0.85  # goals: shares of what there is
+GOALS = {"found": 0.97, "cause": 0.85, "place": 0.85}  # shares of what there is
 SLAB = 0.05  # of the box
 SLABS_FOUND = (34, 31)  # of 36 across a parameter, and at an angle: of 95 %, fewer are found once in a hundred runs
 
 
 def by_kind(results: Sequence[Result]) -> str:
     """Return the table of the defects by kind, with what all come to at the end."""
-    kinds = [*dict.fromkeys(one.kind for one in results)]
-    groups = [(kind, [one for one in results if one.kind == kind]) for kind in kinds] + [("all", [*results])]
-    return table(("kind", "found", "cause", "parameter or region", "seconds"), [_row(*group) for group in groups])
-
-
-def _row(kind: str, results: Sequence[Result]) -> tuple[str, ...]:
-    shares = (Share.among(getattr(one, field) for one in results) for field in ("found", "cause", "place"))
-    return kind, *map(str, shares), f"{sum(one.seconds for one in results):.1f}"
+    rows = []
+    for kind in [*dict.fromkeys(one.kind for one in results), "all"]:
+        group = [one for one in results if kind in (one.kind, "all")]
+        shares = (Share.among(getattr(one, field) for one in group) for field in GOALS)
+        rows.append((kind, *map(str, shares), f"{sum(one.seconds for one in group):.1f}"))
+    return table(("kind", "found", "cause", "parameter or region", "seconds"), rows)
 
 
 def missed(results: Sequence[Result], slabs: Sequence[Slabs]) -> list[str]:
     """Return the goals that are missed, in words."""
     sick, failed = [one for one in results if not one.healthy], [one.case for one in results if _wrongly_failed(one)]
-    goals = [("found", FOUND), ("cause", CAUSE), ("place", PLACE)]
     words = [
         f"{field}: {share}, and the goal is {goal:.0%}"
-        for field, goal in goals
+        for field, goal in GOALS.items()
         if not (share := Share.among(getattr(one, field) for one in sick)).reaches(goal)
     ]
     words += [f"healthy and failed: {', '.join(failed)}"] * bool(failed)
@@ -70,7 +67,7 @@ def describe(result: Result) -> str:
         return f"{result.case}: healthy, and failed: {result.said}"
     if result.healthy:
         return ""
-    lacks = [field for field in ("found", "cause", "place") if getattr(result, field) is False]
+    lacks = [field for field in GOALS if getattr(result, field) is False]
     return f"{result.case}: not {', '.join(lacks)}; said: {result.said}" if lacks else ""
 
 

@@ -10,9 +10,9 @@ DEFECTS = (planted, defects_torch, defects_jax, defects_numpy, defects_warp)
 
 def defects() -> list[Case]:
     """Return the planted defects."""
-    return [case for module in DEFECTS for case in module.cases()]
+    return [case for module in DEFECTS for case in module.CASES]
 
 
 def healthy_functions() -> list[Case]:
     """Return the healthy functions that are awkward to judge."""
-    return healthy.cases()
+    return healthy.CASES

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -12,31 +11,29 @@ import gradscape as gs
 
 from .cases import Case
 from .plant import right
-from .systems import CART, CHAIN, GAS, NOZZLE, PENDULUM, SPRINGS, THROW, System, cart, gas, nozzle, springs, throw
+from .systems import (
+    CART,
+    CHAIN,
+    GAS,
+    NOZZLE,
+    PENDULUM,
+    SPRINGS,
+    THROW,
+    System,
+    at_rest,
+    cart,
+    gas,
+    nozzle,
+    numbered,
+    settle,
+    springs,
+    throw,
+)
 
 DISC = gs.ParameterSpace({"x": (-1, 1, "m"), "y": (-1, 1, "m")})
-
-
-def case(
-    kind: str, dim: int, fn: Callable[..., Any], space: gs.ParameterSpace, causes: tuple[str, ...], **how: Any
-) -> Case:
-    """Return a case of a function of NumPy; `how` are fields of `Case`, and `said` keywords of `from_numpy`."""
-    said = how.pop("said", {})
-    name = f"{kind.replace(' ', '-')}-numpy-{fn.__name__.replace('_', '-')}-{dim}"
-    return Case(name, kind, "numpy", dim, lambda: gs.from_numpy(fn, space, name=name, **said), causes, **how)
-
-
-def fresh(
-    kind: str, dim: int, make: Callable[[], Any], space: gs.ParameterSpace, causes: tuple[str, ...], **how: Any
-) -> Case:
-    """Return a case of an object that keeps something from call to call: each objective has its own."""
-    said = how.pop("said", {})
-    word = make.func.__name__ if isinstance(make, partial) else make.__name__
-    name = f"{kind.replace(' ', '-')}-numpy-{word.lower()}-{dim}"
-    return Case(name, kind, "numpy", dim, lambda: gs.from_numpy(make(), space, name=name, **said), causes, **how)
-
-
-# ---- NaN beside a finite loss.
+FORCES = {dim: gs.ParameterSpace.box(numbered("force", dim), 0.5, 3, "N") for dim in (2, 10)}
+case = partial(Case, "numpy")
+fresh = partial(case, fresh=True)
 
 
 def cone(x: Any) -> Any:
@@ -82,10 +79,8 @@ class WarmStart:
 
     def __call__(self, x: Any) -> Any:
         rest = np.broadcast_to(self.rest, x.shape) if self.rest.shape == x.shape else 0 * x + self.rest.mean()
-        for _ in range(3):
-            rest = rest - 0.2 * (rest + rest**3 - x)
-        self.rest = rest
-        return ((rest - 0.4) ** 2).sum(1), 2 * (rest - 0.4) / (1 + 3 * rest**2)
+        self.rest = settle(rest, x, 0.2, 3)
+        return at_rest(self.rest)
 
 
 class Counting:
@@ -117,52 +112,27 @@ def ranked(x: Any) -> Any:
     return loss / loss.max(), slope / loss.max()
 
 
-def _stateful() -> list[Case]:
-    forces = {dim: gs.ParameterSpace.box([f"force {k}" for k in range(dim)], 0.5, 3, "N") for dim in (2, 10)}
-    stale, noise = ("stale buffer", "hidden state"), ("randomness",)
-    warm = ("hidden state", "unconverged solver")
-    return [
-        case("nan", 2, cone, DISC, ("norm at zero",), evidence="nan", place=0.5),
-        fresh("stale", 2, partial(Previous, SPRINGS), SPRINGS.space(2), stale),
-        fresh("stale", 10, partial(Previous, CART), CART.space(10), stale),
-        fresh("accumulates", 2, partial(Accumulating, THROW), THROW.space(2), stale, evidence="repeat"),
-        fresh("accumulates", 10, partial(Accumulating, CHAIN), CHAIN.space(10), stale, evidence="repeat"),
-        fresh("accumulates", 100, partial(Accumulating, SPRINGS), SPRINGS.space(100), stale, evidence="repeat"),
-        fresh("hidden state", 2, WarmStart, forces[2], warm, evidence="repeat"),
-        fresh("hidden state", 10, WarmStart, forces[10], warm, evidence="repeat"),
-        fresh("hidden state", 2, Counting, THROW.space(2), ("hidden state",), evidence="repeat"),
-        fresh("randomness", 2, partial(Noisy, THROW, 0.1), THROW.space(2), noise, evidence="repeat"),
-        fresh("randomness", 10, partial(Noisy, SPRINGS, 1e-4), SPRINGS.space(10), noise, evidence="repeat", warns=True),
-        case("rows leak", 2, ranked, THROW.space(2), ("rows that leak",), evidence="rows"),
-    ]
+stale, hidden, noise = ("stale buffer", "hidden state"), ("hidden state",), ("randomness",)
+warm = (*hidden, "unconverged solver")
+adds = partial(fresh, "accumulates", "accumulating", evidence="repeat")
+noisy = partial(fresh, "randomness", "noisy", evidence="repeat")
+STATEFUL = [
+    case("nan", "cone", cone, DISC, ("norm at zero",), evidence="nan", place=0.5),
+    fresh("stale", "previous", partial(Previous, SPRINGS), SPRINGS.space(2), stale),
+    fresh("stale", "previous", partial(Previous, CART), CART.space(10), stale),
+    adds(partial(Accumulating, THROW), THROW.space(2), stale),
+    adds(partial(Accumulating, CHAIN), CHAIN.space(10), stale),
+    adds(partial(Accumulating, SPRINGS), SPRINGS.space(100), stale),
+    fresh("hidden state", "warmstart", WarmStart, FORCES[2], warm, evidence="repeat"),
+    fresh("hidden state", "warmstart", WarmStart, FORCES[10], warm, evidence="repeat"),
+    fresh("hidden state", "counting", Counting, THROW.space(2), hidden, evidence="repeat"),
+    noisy(partial(Noisy, THROW, 0.1), THROW.space(2), noise),
+    noisy(partial(Noisy, SPRINGS, 1e-4), SPRINGS.space(10), noise, warns=True),
+    case("rows leak", "ranked", ranked, THROW.space(2), ("rows that leak",), evidence="rows"),
+]
 
 
 # ---- Differences, rounding.
-
-
-def tank(x: Any) -> Any:
-    """Energy of a tank [J] in float32, with an offset of a million."""
-    return (1e6 + 20 * gas(np, x)).astype(np.float32)
-
-
-def vessel(x: Any) -> Any:
-    """Energy of a tank [J] in float64, with an offset of a million."""
-    return 1e6 + 20 * gas(np, x)
-
-
-def meter(x: Any) -> Any:
-    """A flow's error in float32, with an offset of 500."""
-    return (500 + 10 * nozzle(np, x)).astype(np.float32)
-
-
-def scale(x: Any) -> Any:
-    """Springs whose loss is rounded to float32."""
-    return springs(np, x).astype(np.float32)
-
-
-def waves(x: Any) -> Any:
-    """A surface with ten waves across the box."""
-    return np.sin(20 * x[:, 0]) + np.cos(15 * x[:, 1]) + (x**2).sum(1)
 
 
 def own_differences(x: Any) -> Any:
@@ -178,19 +148,22 @@ def far_differences(x: Any) -> Any:
     return loss, np.stack([(throw(np, x + step) - loss) / step.max() for step in steps], 1)
 
 
-def _rounded() -> list[Case]:
-    grain, bad = ("float32 grain", "differences with a bad step"), ("differences with a bad step",)
-    step = {"differences": 1e-6}
-    return [
-        case("grain", 2, tank, GAS.space(2), grain, said=step, reference=lambda x: 20 * gas(np, x)),
-        case("grain", 3, meter, NOZZLE.space(3), grain, said=step, reference=lambda x: 10 * nozzle(np, x)),
-        case("grain", 10, scale, SPRINGS.space(10), grain, said=step, reference=lambda x: springs(np, x)),
-        case("differences", 2, waves, DISC, bad, said={"differences": 0.1}),
-        case("differences", 2, far_differences, THROW.space(2), bad),
-        case("differences", 10, own_differences, CART.space(10), bad),
-        case("differences", 2, vessel, GAS.space(2), bad, said={"differences": 1e-11},
-             reference=lambda x: 20 * gas(np, x)),
-    ]  # fmt: skip
+bad = ("differences with a bad step",)
+grain = partial(case, "grain", causes=("float32 grain", *bad), said={"differences": 1e-6})
+energy = lambda x: 20 * gas(np, x)  # noqa: E731 -- of a tank [J]
+ROUNDED = [
+    grain("tank", lambda x: (1e6 + energy(x)).astype(np.float32), GAS.space(2), reference=energy),
+    grain("meter", lambda x: (500 + 10 * nozzle(np, x)).astype(np.float32), NOZZLE.space(3),
+          reference=lambda x: 10 * nozzle(np, x)),
+    grain("scale", lambda x: springs(np, x).astype(np.float32), SPRINGS.space(10), reference=partial(springs, np)),
+    # a surface with ten waves across the box
+    case("differences", "waves", lambda x: np.sin(20 * x[:, 0]) + np.cos(15 * x[:, 1]) + (x**2).sum(1), DISC, bad,
+         said={"differences": 0.1}),
+    case("differences", "far-differences", far_differences, THROW.space(2), bad),
+    case("differences", "own-differences", own_differences, CART.space(10), bad),
+    case("differences", "vessel", lambda x: 1e6 + energy(x), GAS.space(2), bad, said={"differences": 1e-11},
+         reference=energy),
+]  # fmt: skip
 
 
 # ---- Solvers and adjoints.
@@ -202,7 +175,7 @@ def tolerant(x: Any) -> Any:
     for _ in range(50):
         residual = rest + rest**3 - x
         rest = np.where(np.abs(residual) > 0.1, rest - 0.12 * residual, rest)
-    return ((rest - 0.4) ** 2).sum(1), 2 * (rest - 0.4) / (1 + 3 * rest**2)
+    return at_rest(rest)
 
 
 def short_adjoint(x: Any) -> Any:
@@ -239,22 +212,15 @@ def crooked(x: Any) -> Any:
     return (residual**2).sum(1), 2 * residual @ A.T
 
 
-def _adjoints() -> list[Case]:
-    forces = gs.ParameterSpace.box([f"force {k}" for k in range(10)], 0.5, 3, "N")
-    early = tuple(f"force {k}" for k in range(60))
-    return [
-        case("unconverged", 10, tolerant, forces, ("unconverged solver",)),
-        case("truncated", 100, short_adjoint, CART.space(100), ("truncated loop", "detached parameter"),
-             parameters=early),
-        case("missing term", 10, unpunished, PENDULUM.space(10), ("",)),
-        case("region", 2, drag, gs.ParameterSpace({"speed": (-2, 1, "m/s"), "place": (-1, 1, "m")}), ("sign", ""),
-             edges={"speed": (0.0,)}, region=lambda x: x[:, 0] < 0),
-        case("units", 2, by_decade, gs.ParameterSpace({"k": gs.log(1, 1e4, "N/m"), "c": (0.5, 5, "N s/m")}),
-             ("units",), parameters=("k",)),
-        case("transposed", 2, crooked, DISC, ("transposed", ""), ),
-    ]  # fmt: skip
-
-
-def cases() -> list[Case]:
-    """Return the cases of this file."""
-    return [*_stateful(), *_rounded(), *_adjoints()]
+moving = gs.ParameterSpace({"speed": (-2, 1, "m/s"), "place": (-1, 1, "m")})
+damped = gs.ParameterSpace({"k": gs.log(1, 1e4, "N/m"), "c": (0.5, 5, "N s/m")})
+ADJOINTS = [
+    case("unconverged", "tolerant", tolerant, FORCES[10], ("unconverged solver",)),
+    case("truncated", "short-adjoint", short_adjoint, CART.space(100), ("truncated loop", "detached parameter"),
+         tuple(numbered("force", 60))),
+    case("missing term", "unpunished", unpunished, PENDULUM.space(10), ("",)),
+    case("region", "drag", drag, moving, ("sign", ""), edges={"speed": (0.0,)}, region=lambda x: x[:, 0] < 0),
+    case("units", "by-decade", by_decade, damped, ("units",), ("k",)),
+    case("transposed", "crooked", crooked, DISC, ("transposed", "")),
+]  # fmt: skip
+CASES = [*STATEFUL, *ROUNDED, *ADJOINTS]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,10 +12,10 @@ import warp as wp
 import gradscape as gs
 
 from .cases import Case
-from .systems import THROW, throw
+from .systems import THROW, numbered, throw
 
 POINTS = gs.ParameterSpace({"x": (-1, 1, "m"), "y": (-1, 1, "m")})
-FORCES = gs.ParameterSpace.box([f"force {k}" for k in range(10)], 0, 4, "N")
+FORCES = gs.ParameterSpace.box(numbered("force", 10), 0, 4, "N")
 
 
 @wp.func
@@ -257,37 +258,27 @@ class Shaken:
         return of_kernel(_shaken_kernel, self.calls)(x)
 
 
-def case(
-    kind: str, word: str, fn: Callable[[], Any], causes: tuple[str, ...], space: gs.ParameterSpace = POINTS, **how: Any
-) -> Case:
-    """Return a case of a function of Warp, made again for each objective; nothing looks for overwritten arrays."""
-    name = f"{kind.replace(' ', '-')}-warp-{word}-{space.dim}"
-    build = lambda: gs.from_warp(fn(), space, name=name, device="cpu", check_overwrites=False)  # noqa: E731
-    return Case(name, kind, "warp", space.dim, build, causes, **how)
-
-
-def cases() -> list[Case]:
-    """Return the cases of this file."""
-    fall = gs.ParameterSpace({"height": (0.8, 1.2, "m"), "speed": (-0.5, 0.5, "m/s")})
-    ten = gs.ParameterSpace.box([f"x{k}" for k in range(10)], -1, 1)
-    return [
-        case("nan", "length", lambda: of_kernel(_length_kernel), ("norm at zero",), evidence="nan", place=0.5),
-        case("nan", "root", lambda: of_kernel(_root_kernel), ("where over NaN",), edges={"x": (0.0,)},
-             region=lambda x: x[:, 0] < 0, evidence="nan"),
-        case("factor 2", "half", lambda: of_kernel(_half_kernel), ("factor 2",)),
-        case("sign", "cosine", lambda: of_kernel(_cosine_kernel), ("sign",)),
-        case("sign of one", "cosine", lambda: of_kernel(_one_sign_kernel), ("sign",), ten, parameters=("x6",)),
-        case("too long", "cube", lambda: of_kernel(_cube_kernel), ("scaled",), ten),
-        case("region", "slab", lambda: of_kernel(_slab_kernel), ("sign",), edges={"x": (0.3, 0.5)},
-             region=lambda x: (x[:, 0] > 0.3) & (x[:, 0] < 0.5)),
-        case("detached", "host", lambda: read_back, ("detached parameter",), THROW.space(2), parameters=("speed",),
-             reference=lambda x: throw(np, x)),
-        case("overwritten", "drag", lambda: drive, ("tape overwritten",), FORCES),
-        case("overwritten", "loop", lambda: of_kernel(_loop_kernel), ("tape overwritten", "truncated loop", "")),
-        case("impact", "bounce", lambda: of_kernel(_bounce_kernel), ("snapped time of impact",), fall, warns=True,
-             evidence="wide"),
-        case("rows leak", "total", lambda: shared, ("rows that leak",), evidence="rows"),
-        case("randomness", "shaken", Shaken, ("randomness", "hidden state"), evidence="repeat"),
-        case("staircase", "cells", lambda: of_kernel(_cells_kernel), ("staircase",), warns=True, evidence="wide"),
-        case("depends on grad", "contact", lambda: softened, ("loss depends on the gradient",), evidence="losses"),
-    ]  # fmt: skip
+fall = gs.ParameterSpace({"height": (0.8, 1.2, "m"), "speed": (-0.5, 0.5, "m/s")})
+ten = gs.ParameterSpace.box([f"x{k}" for k in range(10)], -1, 1)
+case, sign, overwritten = partial(Case, "warp"), ("sign",), "tape overwritten"
+root, bounce = of_kernel(_root_kernel), of_kernel(_bounce_kernel)
+CASES = [
+    case("nan", "length", of_kernel(_length_kernel), POINTS, ("norm at zero",), evidence="nan", place=0.5),
+    case("nan", "root", root, POINTS, ("where over NaN",), edges={"x": (0.0,)}, region=lambda x: x[:, 0] < 0,
+         evidence="nan"),
+    case("factor 2", "half", of_kernel(_half_kernel), POINTS, ("factor 2",)),
+    case("sign", "cosine", of_kernel(_cosine_kernel), POINTS, sign),
+    case("sign of one", "cosine", of_kernel(_one_sign_kernel), ten, sign, ("x6",)),
+    case("too long", "cube", of_kernel(_cube_kernel), ten, ("scaled",)),
+    case("region", "slab", of_kernel(_slab_kernel), POINTS, sign, edges={"x": (0.3, 0.5)},
+         region=lambda x: (x[:, 0] > 0.3) & (x[:, 0] < 0.5)),
+    case("detached", "host", read_back, THROW.space(2), ("detached parameter",), ("speed",),
+         reference=partial(throw, np)),
+    case("overwritten", "drag", drive, FORCES, (overwritten,)),
+    case("overwritten", "loop", of_kernel(_loop_kernel), POINTS, (overwritten, "truncated loop", "")),
+    case("impact", "bounce", bounce, fall, ("snapped time of impact",), warns=True, evidence="wide"),
+    case("rows leak", "total", shared, POINTS, ("rows that leak",), evidence="rows"),
+    case("randomness", "shaken", Shaken, POINTS, ("randomness", "hidden state"), evidence="repeat", fresh=True),
+    case("staircase", "cells", of_kernel(_cells_kernel), POINTS, ("staircase",), warns=True, evidence="wide"),
+    case("depends on grad", "contact", softened, POINTS, ("loss depends on the gradient",), evidence="losses"),
+]  # fmt: skip

@@ -6,6 +6,7 @@ import re
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -66,44 +67,32 @@ class Slabs:
 def examine(case: Case, seed: int = 0) -> Result:
     """Check a case, and hold what is said against what is true. A check that raises has found nothing."""
     env, start = case.build(), time.perf_counter()
+    placed = bool(case.parameters or case.edges or case.step)  # must be named
+    result = partial(Result, case.name, case.kind, case.framework, case.healthy)
     try:
         report = gs.check(env, power=POWER, seed=seed)
     except Exception as error:  # of any kind: it is a result, too
-        return _raised(case, error, time.perf_counter() - start)
+        said = f"raised {type(error).__name__}: {' '.join(str(error).split())[:160]}"
+        wrong, nowhere = None if case.healthy else False, False if placed else None
+        return result(False, False, wrong, nowhere, said, time.perf_counter() - start)
     seconds, told = time.perf_counter() - start, report.diagnoses
     if case.healthy:
         bad = [f"{one.check}: {one.why or one.figure}" for one in report.findings if one.bad]
         said = "; ".join([_name(one) for one in told if one.outcome == "fail"] or bad)
-        return Result(*_head(case), report.passed, False, None, None, said, seconds)
+        return result(report.passed, False, None, None, said, seconds)
     fitting = [one for one in told if one.cause in case.causes]
     found = not report.passed or (case.warns and bool(fitting))
     named = bool(fitting) and (case.warns or told[0].cause in case.causes)
     unnamed = "" in case.causes and not report.passed and not told
-    place = found and is_placed(case, env.space, fitting or told[:1]) if has_place(case) else None
+    place = found and is_placed(case, env.space, fitting or told[:1]) if placed else None
     said = "; ".join(map(_name, told)) or "no diagnosis"
-    return Result(*_head(case), report.passed, found, found and (named or unnamed), place, said, seconds)
-
-
-def _head(case: Case) -> tuple[str, str, str, bool]:
-    return case.name, case.kind, case.framework, case.healthy
-
-
-def _raised(case: Case, error: Exception, seconds: float) -> Result:
-    said = f"raised {type(error).__name__}: {' '.join(str(error).split())[:160]}"
-    wrong = None if case.healthy else False
-    place = False if has_place(case) else None
-    return Result(*_head(case), passed=False, found=False, cause=wrong, place=place, said=said, seconds=seconds)
+    return result(report.passed, found, found and (named or unnamed), place, said, seconds)
 
 
 def _name(diagnosis: Diagnosis) -> str:
     where = f" ({diagnosis.region.rule})" if diagnosis.region else ""
     who = f" [{', '.join(diagnosis.parameters[:4])}{', ...' if len(diagnosis.parameters) > 4 else ''}]"
     return f"{diagnosis.cause or 'none'}{who if diagnosis.parameters else ''}{where}"
-
-
-def has_place(case: Case) -> bool:
-    """Whether a parameter, a region or a step must be named."""
-    return bool(case.parameters or case.edges or case.step)
 
 
 def is_placed(case: Case, space: gs.ParameterSpace, told: Sequence[Diagnosis]) -> bool:

@@ -16,43 +16,25 @@ import warp as wp
 import gradscape as gs
 
 from .cases import Case, Losses
+from .defects_jax import SWING, logistic, pendulum
 from .defects_warp import FORCES, empty, of_kernel
 from .plant import right
-from .systems import CART, CHAIN, GAS, NOZZLE, ROD, THROW, cart, chain, gas, nozzle, rod, throw
+from .systems import CART, CHAIN, GAS, NOZZLE, ROD, THROW, at_rest, cart, chain, gas, nozzle, numbered, rod, throw
 
 PLANE = gs.ParameterSpace({"a": (-1, 1), "b": (-1, 1)})
 UNIT = gs.ParameterSpace({"a": (0, 1), "b": (0, 1)})
 TEN = gs.ParameterSpace.box([f"x{k}" for k in range(10)], -1, 1)
-ADAPT: dict[str, Any] = {"torch": gs.from_torch, "jax": gs.from_jax, "numpy": gs.from_numpy, "warp": gs.from_warp}
 
 
 def case(
-    framework: str,
-    name: str,
-    fn: Callable[..., Any],
-    space: gs.ParameterSpace = PLANE,
-    *,
-    reference: Losses | None = None,
-    place: float | tuple[float, ...] | None = None,
-    **said: Any,
-) -> Case:
+    framework: str, word: str, fn: Callable[..., Any], space: gs.ParameterSpace = PLANE, *,
+    reference: Losses | None = None, place: float | tuple[float, ...] | None = None, **said: Any,
+) -> Case:  # fmt: skip
     """Return the case of a healthy function; `said` are keywords of its `from_...`."""
-    name = f"healthy-{name}-{framework}-{space.dim}"
-    build = partial(ADAPT[framework], fn, space, name=name, **said)
-    return Case(name, "healthy", framework, space.dim, build, reference=reference, place=place)
+    return Case(framework, "healthy", word, fn, space, reference=reference, place=place, said=said)
 
 
 # ---- Polynomials, kinks, offsets and scales.
-
-
-def rounded(x: Any) -> Any:
-    """Squares in float32, for points in float64."""
-    return ((x.float() - 0.3) ** 2).sum(1)
-
-
-def lifted(x: Any) -> Any:
-    """A smooth loss in float32 with an offset of 1000."""
-    return (1000 + torch.sin(2 * x[:, 0]) + x[:, 1] ** 2).float()
 
 
 def hinge(x: Any) -> Any:
@@ -61,38 +43,39 @@ def hinge(x: Any) -> Any:
     return depth**2 + 0.1 * np.abs(x[:, 1]), np.stack([2 * depth, 0.1 * np.sign(x[:, 1])], 1)
 
 
-def _plain() -> list[Case]:
-    scales = gs.ParameterSpace({"small": (-1e-9, 1e-9, "m"), "large": (-1e9, 1e9, "Pa")})
-    far = gs.ParameterSpace({"x": (-1e6, 1e6, "m"), "y": (-1e6, 1e6, "m")})
-    rosen = lambda x: (100 * (x[:, 1:] - x[:, :-1] ** 2) ** 2 + (1 - x[:, :-1]) ** 2).sum(1)  # noqa: E731
-    return [
-        case("torch", "drag", lambda x: (x * x.abs()).sum(1)),
-        case("torch", "cubic", lambda x: (x**3).sum(1)),
-        case("torch", "power-1.5", lambda x: x.abs().pow(1.5).sum(1)),
-        case("torch", "maximum", lambda x: torch.maximum(x[:, 0], x[:, 1]) + 0.1 * (x**2).sum(1)),
-        case("jax", "minimum", lambda p: jnp.min(p**2) + jnp.max(p), TEN),
-        case("jax", "safe-norm", lambda p: jnp.sqrt(jnp.sum(p**2) + 1e-12)),
-        case("torch", "offset-1e9", lambda x: 1e9 + (x**2).sum(1)),
-        case("jax", "offset-1e8", lambda p: 1e8 + jnp.sum(jnp.sin(3 * p)), TEN),
-        case("torch", "float32-inside", rounded, reference=lambda x: ((x - 0.3) ** 2).sum(1)),
-        case("torch", "float32-offset", lifted, reference=lambda x: np.sin(2 * x[:, 0]) + x[:, 1] ** 2),
-        case("jax", "float32-offset", lambda p: 1000 + jnp.sum((p - 0.3) ** 2), TEN, precision="float32",
-             reference=lambda x: ((x - 0.3) ** 2).sum(1)),
-        case("torch", "decades", lambda x: torch.exp(20 * x[:, 0]) + x[:, 1] ** 2),
-        case("torch", "scales", lambda x: (1e9 * x[:, 0] - 0.3) ** 2 + (1e-9 * x[:, 1] + 0.2) ** 2, scales),
-        case("torch", "tiny", lambda x: 1e-17 * ((x - 0.3) ** 2).sum(1)),
-        case("jax", "huge", lambda p: 1e20 * jnp.sum((p - 0.3) ** 2), TEN),
-        case("torch", "abs", lambda x: (x - 0.2).abs().sum(1)),
-        case("numpy", "hinge", hinge),
-        case("torch", "jump", lambda x: torch.where(x[:, 0] > 0.3, x[:, 0] + 1, x[:, 0]) + x[:, 1] ** 2),
-        case("torch", "constant", lambda x: 3.0 + 0 * x.sum(1)),
-        case("jax", "linear", lambda p: 2 * p[0] - 3 * p[1] + 0.5),
-        case("torch", "one", lambda x: torch.sin(3 * x[:, 0]), gs.ParameterSpace({"a": (-2, 2)})),
-        case("torch", "rosenbrock", rosen, TEN),
-        case("torch", "far", lambda x: (1 + (x**2).sum(1)).sqrt() + 0.1 * x[:, 0], far),
-        case("torch", "outside", lambda x: ((x - 1.5) ** 2).sum(1).sqrt()),
-        case("torch", "maximized", lambda x: (x * (1 - x)).sum(1), UNIT, maximize=True),
-    ]  # fmt: skip
+scales = gs.ParameterSpace({"small": (-1e-9, 1e-9, "m"), "large": (-1e9, 1e9, "Pa")})
+far = gs.ParameterSpace({"x": (-1e6, 1e6, "m"), "y": (-1e6, 1e6, "m")})
+rosen = lambda x: (100 * (x[:, 1:] - x[:, :-1] ** 2) ** 2 + (1 - x[:, :-1]) ** 2).sum(1)  # noqa: E731
+PLAIN = [
+    case("torch", "drag", lambda x: (x * x.abs()).sum(1)),
+    case("torch", "cubic", lambda x: (x**3).sum(1)),
+    case("torch", "power-1.5", lambda x: x.abs().pow(1.5).sum(1)),
+    case("torch", "maximum", lambda x: torch.maximum(x[:, 0], x[:, 1]) + 0.1 * (x**2).sum(1)),
+    case("jax", "minimum", lambda p: jnp.min(p**2) + jnp.max(p), TEN),
+    case("jax", "safe-norm", lambda p: jnp.sqrt(jnp.sum(p**2) + 1e-12)),
+    case("torch", "offset-1e9", lambda x: 1e9 + (x**2).sum(1)),
+    case("jax", "offset-1e8", lambda p: 1e8 + jnp.sum(jnp.sin(3 * p)), TEN),
+    case("torch", "float32-inside", lambda x: ((x.float() - 0.3) ** 2).sum(1),
+         reference=lambda x: ((x - 0.3) ** 2).sum(1)),
+    case("torch", "float32-offset", lambda x: (1000 + torch.sin(2 * x[:, 0]) + x[:, 1] ** 2).float(),
+         reference=lambda x: np.sin(2 * x[:, 0]) + x[:, 1] ** 2),
+    case("jax", "float32-offset", lambda p: 1000 + jnp.sum((p - 0.3) ** 2), TEN, precision="float32",
+         reference=lambda x: ((x - 0.3) ** 2).sum(1)),
+    case("torch", "decades", lambda x: torch.exp(20 * x[:, 0]) + x[:, 1] ** 2),
+    case("torch", "scales", lambda x: (1e9 * x[:, 0] - 0.3) ** 2 + (1e-9 * x[:, 1] + 0.2) ** 2, scales),
+    case("torch", "tiny", lambda x: 1e-17 * ((x - 0.3) ** 2).sum(1)),
+    case("jax", "huge", lambda p: 1e20 * jnp.sum((p - 0.3) ** 2), TEN),
+    case("torch", "abs", lambda x: (x - 0.2).abs().sum(1)),
+    case("numpy", "hinge", hinge),
+    case("torch", "jump", lambda x: torch.where(x[:, 0] > 0.3, x[:, 0] + 1, x[:, 0]) + x[:, 1] ** 2),
+    case("torch", "constant", lambda x: 3.0 + 0 * x.sum(1)),
+    case("jax", "linear", lambda p: 2 * p[0] - 3 * p[1] + 0.5),
+    case("torch", "one", lambda x: torch.sin(3 * x[:, 0]), gs.ParameterSpace({"a": (-2, 2)})),
+    case("torch", "rosenbrock", rosen, TEN),
+    case("torch", "far", lambda x: (1 + (x**2).sum(1)).sqrt() + 0.1 * x[:, 0], far),
+    case("torch", "outside", lambda x: ((x - 1.5) ** 2).sum(1).sqrt()),
+    case("torch", "maximized", lambda x: (x * (1 - x)).sum(1), UNIT, maximize=True),
+]  # fmt: skip
 
 
 # ---- Wells, plateaus, staircases, ripples, saturation.
@@ -107,26 +90,11 @@ def relu_network(x: Any) -> Any:
     return (hidden @ torch.from_numpy(W2) - 0.5) ** 2
 
 
-def stairs(x: Any) -> Any:
-    """A staircase in two whole numbers."""
-    return ((x.round() - 3) ** 2).sum(1) + 0 * x.sum(1)
-
-
 def count_and_dose(x: Any) -> Any:
     """A whole number of doses, and their size."""
     count = np.floor(x[:, 0])
     miss = count * x[:, 1] - 2
     return miss**2, np.stack([0 * miss, 2 * miss * count], 1)
-
-
-def softmax(p: Any) -> Any:
-    """A saturated choice of one of ten."""
-    return jnp.sum(jax.nn.softmax(60 * p) * jnp.arange(10.0))
-
-
-def saturated(x: Any) -> Any:
-    """A cart whose forces go through a steep sigmoid."""
-    return cart(torch, 2 * torch.tanh(8 * x))
 
 
 def barrier(x: Any) -> Any:
@@ -142,11 +110,6 @@ def fails(p: Any) -> Any:
     return ((p - 0.4) ** 2).sum(), 2 * (p - 0.4)
 
 
-def sparse(x: Any) -> Any:
-    """A loss that reads 2 of 100 parameters."""
-    return (x[:, 13] - 0.3) ** 2 + x[:, 13] * x[:, 71] + torch.sin(2 * x[:, 71])
-
-
 HEIGHTS = SHAPES.normal(size=12)
 
 
@@ -159,87 +122,66 @@ def terrain(x: Any) -> Any:
     return height + x[:, 1] ** 2, np.stack([5.5 * rise, 2 * x[:, 1]], 1)
 
 
-def sawtooth(x: Any) -> Any:
-    """An angle that is wrapped seven times across the box."""
-    return torch.remainder(x[:, 0], 0.3) + 0.2 * x[:, 1] ** 2
-
-
 def wiggle(p: Any) -> Any:
     """A cubic with ripples that get shorter towards zero."""
     safe = jnp.where(p[0] == 0, 1.0, p[0])
     return jnp.where(p[0] == 0, 0.0, safe**3 * jnp.sin(1 / safe)) + p[1] ** 2
 
 
-def contacts(x: Any) -> Any:
-    """Penalty forces of 100 contacts, each a kink."""
-    return torch.relu(x - 0.3).sum(1) + 0.5 * torch.relu(-x - 0.2).sum(1)
+late = gs.ParameterSpace({"time": (1e6, 1e6 + 1e-3, "s"), "x": (-1, 1)})
+hundred = gs.ParameterSpace.box(numbered("gap", 100), -1, 1, "mm")
+STEEP = [
+    case("torch", "steep", lambda x: torch.tanh(1e3 * (x[:, 0] - 0.1)) + x[:, 1] ** 2),
+    case("torch", "peak", lambda x: 1e-3 / (((x - 0.3) ** 2).sum(1) + 1e-6)),
+    case("jax", "pole", lambda p: jnp.tan(2 * p[0]) + p[1] ** 2),
+    case("jax", "sorted", lambda p: jnp.dot(jnp.sort(p), jnp.arange(10.0)) + jnp.median(p), TEN),
+    case("torch", "sawtooth", lambda x: torch.remainder(x[:, 0], 0.3) + 0.2 * x[:, 1] ** 2),
+    case("torch", "limited", lambda x: (x.clamp(-0.9, 0.6) - 0.2).pow(2).sum(1)),
+    case("numpy", "terrain", terrain),
+    case("torch", "contacts", lambda x: torch.relu(x - 0.3).sum(1) + 0.5 * torch.relu(-x - 0.2).sum(1), hundred),
+    case("jax", "wiggle", wiggle),
+    case("torch", "late", lambda x: torch.sin(3e3 * (x[:, 0] - 1e6)) + x[:, 1] ** 2, late),
+    case("torch", "gas-float32", partial(gas, torch), GAS.space(2), precision="float32",
+         reference=partial(gas, np)),
+    case("jax", "nozzle-float32", partial(nozzle, jnp), NOZZLE.space(3), precision="float32",
+         reference=partial(nozzle, np)),
+    case("torch", "cart-float32", partial(cart, torch), CART.space(100), precision="float32",
+         reference=partial(cart, np)),
+    case("torch", "throw-float32", partial(throw, torch), THROW.space(2), precision="float32",
+         reference=partial(throw, np)),
+    case("torch", "log-loss", lambda x: torch.log10(1e-6 + ((x - 0.3) ** 2).sum(1))),
+]  # fmt: skip
 
 
-def _steep() -> list[Case]:
-    """Functions that are steep, nearly singular, sorted, wrapped or limited, or given in float32 at large values."""
-    late = gs.ParameterSpace({"time": (1e6, 1e6 + 1e-3, "s"), "x": (-1, 1)})
-    hundred = gs.ParameterSpace.box([f"gap {k}" for k in range(100)], -1, 1, "mm")
-    return [
-        case("torch", "steep", lambda x: torch.tanh(1e3 * (x[:, 0] - 0.1)) + x[:, 1] ** 2),
-        case("torch", "peak", lambda x: 1e-3 / (((x - 0.3) ** 2).sum(1) + 1e-6)),
-        case("jax", "pole", lambda p: jnp.tan(2 * p[0]) + p[1] ** 2),
-        case("jax", "sorted", lambda p: jnp.dot(jnp.sort(p), jnp.arange(10.0)) + jnp.median(p), TEN),
-        case("torch", "sawtooth", sawtooth),
-        case("torch", "limited", lambda x: (x.clamp(-0.9, 0.6) - 0.2).pow(2).sum(1)),
-        case("numpy", "terrain", terrain),
-        case("torch", "contacts", contacts, hundred),
-        case("jax", "wiggle", wiggle),
-        case("torch", "late", lambda x: torch.sin(3e3 * (x[:, 0] - 1e6)) + x[:, 1] ** 2, late),
-        case("torch", "gas-float32", partial(gas, torch), GAS.space(2), precision="float32",
-             reference=lambda x: gas(np, x)),
-        case("jax", "nozzle-float32", partial(nozzle, jnp), NOZZLE.space(3), precision="float32",
-             reference=lambda x: nozzle(np, x)),
-        case("torch", "cart-float32", partial(cart, torch), CART.space(100), precision="float32",
-             reference=lambda x: cart(np, x)),
-        case("torch", "throw-float32", partial(throw, torch), THROW.space(2), precision="float32",
-             reference=lambda x: throw(np, x)),
-        case("torch", "log-loss", lambda x: torch.log10(1e-6 + ((x - 0.3) ** 2).sum(1))),
-    ]  # fmt: skip
-
-
-def _shapes() -> list[Case]:
-    hundred = gs.ParameterSpace.box([f"x{k}" for k in range(100)], -1, 1)
-    three = gs.ParameterSpace.box([f"x{k}" for k in range(300)], -1, 1)
-    whole = gs.ParameterSpace({"n": (0, 9), "m": (0, 9)})
-    doses = gs.ParameterSpace({"count": (1, 9), "dose": (0.1, 1, "mg")})
-    decades = gs.ParameterSpace({"k": gs.log(1e-2, 1e6, "N/m"), "c": (0, 5, "N s/m")})
-    return [
-        case("torch", "well", lambda x: 1 - torch.exp(-200 * ((x - 0.6) ** 2).sum(1)), place=0.78),
-        case("jax", "narrow-well", lambda p: -jnp.exp(-50 * jnp.sum((p - 0.2) ** 2)), TEN, place=0.62),
-        case("torch", "plateau", lambda x: (torch.relu(x - 0.5) ** 2).sum(1), place=0.9),
-        case("torch", "stairs", stairs, whole, place=0.42),
-        case("numpy", "count-and-dose", count_and_dose, doses, place=0.4),
-        case("jax", "dead", lambda p: (p[0] - 0.3) ** 2 + 0 * p[1]),
-        case("torch", "relu-network", relu_network, TEN),
-        case("torch", "ripples-1e-3", lambda x: (x**2).sum(1) + 1e-3 * torch.sin(3e4 * x[:, 0])),
-        case("jax", "ripples-1e-6", lambda p: jnp.sum(p**2) + 1e-6 * jnp.sin(1e6 * p[0])),
-        case("jax", "softmax", softmax, TEN),
-        case("torch", "saturated", saturated, TEN),
-        case("torch", "barrier", barrier, place=0.6),
-        case("numpy", "fails", fails, UNIT, vectorized=False, place=0.3),
-        case("torch", "sparse", sparse, hundred),
-        case("jax", "sparse", lambda p: jnp.sin(3 * p[5]) + p[5] * p[90], hundred),
-        case("torch", "300", lambda x: torch.log1p((x**2).sum(1)) + 0.1 * torch.sin(3 * x).sum(1), three),
-        case("jax", "periodic", lambda p: jnp.sum(jnp.cos(5 * jnp.pi * p)), TEN),
-        case("numpy", "rastrigin", lambda x: ((x**2 - np.cos(9 * x)).sum(1), 2 * x + 9 * np.sin(9 * x)), TEN),
-        case("torch", "log-scale", lambda x: (x[:, 1] / (2 * x[:, 0].sqrt()) - 1) ** 2, decades),
-    ]
+hundred = gs.ParameterSpace.box([f"x{k}" for k in range(100)], -1, 1)
+three = gs.ParameterSpace.box([f"x{k}" for k in range(300)], -1, 1)
+whole = gs.ParameterSpace({"n": (0, 9), "m": (0, 9)})
+doses = gs.ParameterSpace({"count": (1, 9), "dose": (0.1, 1, "mg")})
+decades = gs.ParameterSpace({"k": gs.log(1e-2, 1e6, "N/m"), "c": (0, 5, "N s/m")})
+SHAPES = [
+    case("torch", "well", lambda x: 1 - torch.exp(-200 * ((x - 0.6) ** 2).sum(1)), place=0.78),
+    case("jax", "narrow-well", lambda p: -jnp.exp(-50 * jnp.sum((p - 0.2) ** 2)), TEN, place=0.62),
+    case("torch", "plateau", lambda x: (torch.relu(x - 0.5) ** 2).sum(1), place=0.9),
+    case("torch", "stairs", lambda x: ((x.round() - 3) ** 2).sum(1) + 0 * x.sum(1), whole, place=0.42),
+    case("numpy", "count-and-dose", count_and_dose, doses, place=0.4),
+    case("jax", "dead", lambda p: (p[0] - 0.3) ** 2 + 0 * p[1]),
+    case("torch", "relu-network", relu_network, TEN),
+    case("torch", "ripples-1e-3", lambda x: (x**2).sum(1) + 1e-3 * torch.sin(3e4 * x[:, 0])),
+    case("jax", "ripples-1e-6", lambda p: jnp.sum(p**2) + 1e-6 * jnp.sin(1e6 * p[0])),
+    case("jax", "softmax", lambda p: jnp.sum(jax.nn.softmax(60 * p) * jnp.arange(10.0)), TEN),
+    case("torch", "saturated", lambda x: cart(torch, 2 * torch.tanh(8 * x)), TEN),
+    case("torch", "barrier", barrier, place=0.6),
+    case("numpy", "fails", fails, UNIT, vectorized=False, place=0.3),
+    case("torch", "sparse", lambda x: (x[:, 13] - 0.3) ** 2 + x[:, 13] * x[:, 71] + torch.sin(2 * x[:, 71]), hundred),
+    case("jax", "sparse", lambda p: jnp.sin(3 * p[5]) + p[5] * p[90], hundred),
+    case("torch", "300", lambda x: torch.log1p((x**2).sum(1)) + 0.1 * torch.sin(3 * x).sum(1), three),
+    case("jax", "periodic", lambda p: jnp.sum(jnp.cos(5 * jnp.pi * p)), TEN),
+    case("numpy", "rastrigin", lambda x: ((x**2 - np.cos(9 * x)).sum(1), 2 * x + 9 * np.sin(9 * x)), TEN),
+    case("torch", "log-scale", lambda x: (x[:, 1] / (2 * x[:, 0].sqrt()) - 1) ** 2, decades),
+]
 
 
 # ---- Simulations.
-
-
-def population(p: Any, steps: int = 30) -> Any:
-    """A population after some generations."""
-    z = p[1]
-    for _ in range(steps):
-        z = p[0] * z * (1 - z)
-    return (z - 0.5) ** 2
 
 
 def double_pendulum(p: Any, steps: int = 300) -> Any:
@@ -293,7 +235,7 @@ def implicit(x: Any) -> Any:
         if np.abs(residual).max() < 1e-8:
             break
         rest = rest - residual / (1 + 3 * rest**2)
-    return ((rest - 0.4) ** 2).sum(1), 2 * (rest - 0.4) / (1 + 3 * rest**2)
+    return at_rest(rest)
 
 
 def unrolled(p: Any) -> Any:
@@ -315,18 +257,6 @@ def seeded_array(x: Any, seed: int = 0) -> Any:
     return ((x + off) ** 2).sum(1) + np.cos(2 * x).sum(1), 2 * (x + off) - 2 * np.sin(2 * x)
 
 
-def swing(p: Any, steps: int = 60) -> Any:
-    """A pendulum of a length and a damping, of episodes that may get longer."""
-
-    def step(state: Any, _: Any) -> Any:
-        angle, rate = state
-        rate = rate + 0.02 * (-9.81 / p[0] * jnp.sin(angle) - p[1] * rate)
-        return (angle + 0.02 * rate, rate), None
-
-    (angle, _), _ = jax.lax.scan(step, (1.0 + 0 * p[0], 0 * p[0]), None, length=steps)
-    return (angle - 0.3) ** 2
-
-
 def one_point(p: Any) -> Any:
     """A function of some microseconds, of one point."""
     a, b = float(p[0]), float(p[1])
@@ -340,37 +270,35 @@ def rotated(x: Any) -> Any:
     return (2 * (a * b - w * c) - 0.5) ** 2 + (2 * (a * c + w * b) + 0.3) ** 2
 
 
-def _simulations() -> list[Case]:
-    growth = gs.ParameterSpace({"growth": (3.6, 3.9), "start": (0.2, 0.8)})
-    angles = gs.ParameterSpace({"a": (-2.5, 2.5, "rad"), "b": (-2.5, 2.5, "rad")})
-    fall = gs.ParameterSpace({"height": (0.6, 1.0, "m"), "speed": (-0.5, 0.5, "m/s")})
-    lengths = gs.ParameterSpace({"length": (0.5, 1.5, "m"), "damping": (0, 1, "1/s")})
-    forces = gs.ParameterSpace.box([f"force {k}" for k in range(10)], 0.5, 3, "N")
-    springs = gs.ParameterSpace({"stiff": (-1, 1, "mm"), "soft": (-1, 1, "m")})
-    return [
-        case("jax", "logistic-30", population, growth),
-        case("jax", "logistic-60", partial(population, steps=60), growth, mode="forward", place=(0.785, 0.4)),
-        case("jax", "double-pendulum", double_pendulum, angles),
-        case("torch", "soft-contact", soft_contact, fall),
-        case("torch", "exact-bounce", exact_bounce, fall),
-        case("torch", "stiff", stiff, springs),
-        case("numpy", "implicit", implicit, forces),
-        case("jax", "unrolled", unrolled, forces),
-        case("jax", "seeded", seeded),
-        case("jax", "mean-of-seeds", seeded, TEN, seeds=4),
-        case("numpy", "mean-of-seeds", seeded_array, TEN, seeds=4),
-        case("jax", "horizon", swing, lengths, horizon="steps"),
-        case("numpy", "microseconds", one_point, vectorized=False),
-        case("torch", "rotated", rotated, gs.ParameterSpace.box(["a", "b", "c"], -1, 1)),
-        case("numpy", "differences", partial(nozzle, np), NOZZLE.space(3), differences=1e-5),
-        case("numpy", "differences", partial(cart, np), CART.space(10), differences=1e-5),
-        case("torch", "gas", partial(gas, torch), GAS.space(2)),
-        case("jax", "throw", partial(throw, jnp), THROW.space(2)),
-        case("torch", "rod", partial(rod, torch), ROD.space(100)),
-        case("jax", "chain", partial(chain, jnp), CHAIN.space(100), precision="float32",
-             reference=lambda x: chain(np, x)),
-        case("numpy", "chain", partial(right, CHAIN), CHAIN.space(100)),
-    ]  # fmt: skip
+growth = gs.ParameterSpace({"growth": (3.6, 3.9), "start": (0.2, 0.8)})
+angles = gs.ParameterSpace({"a": (-2.5, 2.5, "rad"), "b": (-2.5, 2.5, "rad")})
+fall = gs.ParameterSpace({"height": (0.6, 1.0, "m"), "speed": (-0.5, 0.5, "m/s")})
+forces = gs.ParameterSpace.box(numbered("force", 10), 0.5, 3, "N")
+springs = gs.ParameterSpace({"stiff": (-1, 1, "mm"), "soft": (-1, 1, "m")})
+SIMULATIONS = [
+    case("jax", "logistic-30", partial(logistic, steps=30), growth),
+    case("jax", "logistic-60", partial(logistic, steps=60), growth, mode="forward", place=(0.785, 0.4)),
+    case("jax", "double-pendulum", double_pendulum, angles),
+    case("torch", "soft-contact", soft_contact, fall),
+    case("torch", "exact-bounce", exact_bounce, fall),
+    case("torch", "stiff", stiff, springs),
+    case("numpy", "implicit", implicit, forces),
+    case("jax", "unrolled", unrolled, forces),
+    case("jax", "seeded", seeded),
+    case("jax", "mean-of-seeds", seeded, TEN, seeds=4),
+    case("numpy", "mean-of-seeds", seeded_array, TEN, seeds=4),
+    case("jax", "horizon", pendulum(), SWING, horizon="steps"),
+    case("numpy", "microseconds", one_point, vectorized=False),
+    case("torch", "rotated", rotated, gs.ParameterSpace.box(["a", "b", "c"], -1, 1)),
+    case("numpy", "differences", partial(nozzle, np), NOZZLE.space(3), differences=1e-5),
+    case("numpy", "differences", partial(cart, np), CART.space(10), differences=1e-5),
+    case("torch", "gas", partial(gas, torch), GAS.space(2)),
+    case("jax", "throw", partial(throw, jnp), THROW.space(2)),
+    case("torch", "rod", partial(rod, torch), ROD.space(100)),
+    case("jax", "chain", partial(chain, jnp), CHAIN.space(100), precision="float32",
+         reference=partial(chain, np)),
+    case("numpy", "chain", partial(right, CHAIN), CHAIN.space(100)),
+]  # fmt: skip
 
 
 # ---- Warp.
@@ -427,17 +355,10 @@ def drive_exactly(x: Any) -> Any:
     return (speed - 1) ** 2
 
 
-def _warp() -> list[Case]:
-    quick: dict[str, Any] = {"device": "cpu", "check_overwrites": False}
-    return [
-        case("warp", "throw", throw_double, THROW.space(2), precision="float64", **quick),
-        case("warp", "drive", drive, FORCES, reference=drive_exactly, **quick),
-        case(
-            "warp", "offset", of_kernel(_wave_kernel), reference=lambda x: np.sin(3 * x[:, 0]) + x[:, 1] ** 2, **quick
-        ),
-    ]
-
-
-def cases() -> list[Case]:
-    """Return the cases of this file."""
-    return [*_plain(), *_steep(), *_shapes(), *_simulations(), *_warp()]
+wave = lambda x: np.sin(3 * x[:, 0]) + x[:, 1] ** 2  # noqa: E731
+WARP = [
+    case("warp", "throw", throw_double, THROW.space(2), precision="float64"),
+    case("warp", "drive", drive, FORCES, reference=drive_exactly),
+    case("warp", "offset", of_kernel(_wave_kernel), reference=wave),
+]
+CASES = [*PLAIN, *STEEP, *SHAPES, *SIMULATIONS, *WARP]

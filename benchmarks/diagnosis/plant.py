@@ -10,8 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 import torch
 
-import gradscape as gs
-
 from .systems import System
 
 Spoil = Callable[[Any, Any, Any], Any]
@@ -66,18 +64,7 @@ def in_numpy(system: System, spoil: Spoil) -> Callable[[Any], Any]:
     return both
 
 
-PLANT = {
-    "torch": (in_torch, gs.from_torch),
-    "jax": (in_jax, gs.from_jax),
-    "numpy": (in_numpy, gs.from_numpy),
-}
-
-
-def objective(framework: str, system: System, dim: int, spoil: Spoil, precision: str, name: str) -> gs.Environment:
-    """Return a system as an objective with a spoiled gradient."""
-    plant, adapt = PLANT[framework]
-    made: gs.Environment = adapt(plant(system, spoil), system.space(dim), precision=precision, name=name)
-    return made
+PLANT = {"torch": in_torch, "jax": in_jax, "numpy": in_numpy}
 
 
 # ---- What is done to a right gradient.

@@ -91,6 +91,18 @@ def chain(xp: Any, a: Any) -> Any:
     return 10 * ((across - 0.4) ** 2 + (down - 0.7) ** 2) + (weights * bend**2).sum(-1) / count
 
 
+def settle(rest: Any, force: Any, gain: float, sweeps: int) -> Any:
+    """Let springs, of force z + z³ at a stretch of z, come to rest under a force, by so many sweeps."""
+    for _ in range(sweeps):
+        rest = rest - gain * (rest + rest**3 - force)
+    return rest
+
+
+def at_rest(rest: Any) -> tuple[Any, Any]:
+    """Return the squared error of springs at rest, arrays of NumPy, and its derivative by the forces on them."""
+    return ((rest - 0.4) ** 2).sum(1), 2 * (rest - 0.4) / (1 + 3 * rest**2)
+
+
 def plate(xp: Any, k: Any) -> Any:
     """Squared error of what a square matrix of stiffnesses makes of a load."""
     size = math.isqrt(k.shape[-1])
@@ -100,8 +112,13 @@ def plate(xp: Any, k: Any) -> Any:
     return ((force - wanted) ** 2).sum(-1)
 
 
+def numbered(word: str, count: int) -> list[str]:
+    """Return names of so many parameters."""
+    return [f"{word} {k}" for k in range(count)]
+
+
 def _box(word: str, lower: float, upper: float, unit: str) -> Callable[[int], gs.ParameterSpace]:
-    return lambda dim: gs.ParameterSpace.box([f"{word} {k}" for k in range(dim)], lower, upper, unit)
+    return lambda dim: gs.ParameterSpace.box(numbered(word, dim), lower, upper, unit)
 
 
 THROW = System(throw, lambda _: gs.ParameterSpace({"angle": (0.2, 1.3, "rad"), "speed": (4, 12, "m/s")}))

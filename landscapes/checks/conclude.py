@@ -9,16 +9,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from . import evidence as numbers_of
-from .causes import Cause, Signature, recognise
+from .causes import recognise
 from .diagnosis import CERTAINTIES, Diagnosis, Region
 from .evidence import Evidence, Samples
 from .examination import Examination, percent
 from .finding import FAIL
-from .history import ROWS, SAME, History
 from .horizons import FirstWrong
 from .memory import MemoryGrowth
 from .parameters import AGREES, WRONG
-from .slopes import UNJUDGED, Judgement, Kind
+from .slopes import UNJUDGED, Kind
 from .usefulness import Usefulness
 
 OVERWRITES = "writes to what it has read"  # how a simulator says so
@@ -30,36 +29,7 @@ UNCLEAR = 0.05  # relative error of a slope that counts for the average
 FEWEST_CONTROLS = 3  # parameters, wrong and right ones, from which it is told that the first are wrong
 
 
-@dataclass(frozen=True)
-class Calls:
-    """What checks of calls have found: the names of those that failed, and what they measured."""
-
-    history: History | None = None
-    broken: tuple[str, ...] = ()
-    second_backward: float = 0.0
-
-    def evidence(self) -> Evidence:
-        """Return it as numbers."""
-        depends = "loss without gradient" in self.broken
-        found: Evidence = {"leaks": 0.0, "depends": depends, "random": 0.0, "hidden": 0.0}
-        if (one := self.history) is not None:
-            hidden = one.loss > SAME and not one.random
-            found |= {
-                "random": one.random,
-                "leaks": one.leak > max(SAME, 10 * one.loss),
-                "hidden": hidden,
-                "stale": one.stale,
-                "grows": one.grows,
-                "batch": one.batch,
-                "alike": one.alike,
-                "gradient_leak": one.gradient_leak if one.gradient_leak > 10 * one.gradient else 0.0,
-                "rows": ROWS,
-                "loss_moves": one.loss,
-                "gradient_moves": one.gradient,
-            }
-        return {name: float(value) for name, value in found.items()}
-
-
+OF_CALLS = ("leaks", "depends", "random", "hidden")  # which count as 0 where nothing was asked
 Texts = dict[str, str]
 
 
@@ -77,9 +47,9 @@ class Further:
     has_length: bool = False
 
 
-def conclude(seen: Examination, calls: Calls, further: Further | None = None) -> tuple[Diagnosis, ...]:
+def conclude(seen: Examination, calls: Evidence, further: Further | None = None) -> tuple[Diagnosis, ...]:
     """Return a diagnosis for each kind of finding, what fails and is certain first."""
-    further = further or Further()
+    further, calls = further or Further(), dict.fromkeys(OF_CALLS, 0.0) | calls
     found = [one for judge in (_of_calls, _of_grain) for one in judge(seen, calls)]
     explained = any(one.outcome == FAIL for one in found)
     found += list(_of_nan(seen, further))
@@ -91,13 +61,17 @@ def conclude(seen: Examination, calls: Calls, further: Further | None = None) ->
     return tuple(sorted(found, key=lambda one: (one.outcome != FAIL, CERTAINTIES.index(one.certainty))))
 
 
-def _make(
-    cause: Cause, signature: Signature, evidence: Evidence, texts: Texts, names: tuple[str, ...] = (),
-    region: Region | None = None,
-) -> Diagnosis:  # fmt: skip
+def _recognised(
+    of: str, evidence: Evidence, texts: Texts, names: tuple[str, ...] = (), region: Region | None = None
+) -> tuple[Diagnosis, ...]:
+    """Return the diagnosis of a kind of finding, none where no known cause fits."""
+    if (known := recognise(of, evidence)) is None:
+        return ()
+    cause, signature = known
     what, remedy = (text.format_map({**evidence, **texts}) for text in (cause.says, cause.remedy))
-    return Diagnosis(
-        cause.name, signature.outcome, signature.certainty, what, remedy, names, region, numbers=dict(evidence)
+    numbers = dict(evidence)
+    return (
+        Diagnosis(cause.name, signature.outcome, signature.certainty, what, remedy, names, region, numbers=numbers),
     )
 
 
@@ -118,17 +92,15 @@ def _where(region: Region | None) -> str:
     return f", {'all' if region.error == 0 else 'nearly all'} with {region.rule}"
 
 
-def _of_calls(seen: Examination, calls: Calls) -> Iterator[Diagnosis]:
-    evidence = calls.evidence()
-    how = "they add up from call to call" if evidence.get("grows") else "a call returns the gradient of the one before"
-    short = f"{evidence.get('batch', 1.0):.3g} times shorter"
-    what = "the loss" if evidence.get("leaks") else "the gradient"
-    how_batch = "all rows have the same" if evidence.get("alike") else short
-    if (known := recognise("calls", evidence)) is not None:
-        yield _make(*known, evidence, {"how": how, "how_batch": how_batch, "what": what})
+def _of_calls(seen: Examination, calls: Evidence) -> Iterator[Diagnosis]:
+    how = "they add up from call to call" if calls.get("grows") else "a call returns the gradient of the one before"
+    short = f"{calls.get('batch', 1.0):.3g} times shorter"
+    what = "the loss" if calls.get("leaks") else "the gradient"
+    how_batch = "all rows have the same" if calls.get("alike") else short
+    yield from _recognised("calls", calls, {"how": how, "how_batch": how_batch, "what": what})
 
 
-def _of_grain(seen: Examination, calls: Calls) -> Iterator[Diagnosis]:
+def _of_grain(seen: Examination, calls: Evidence) -> Iterator[Diagnosis]:
     probe, loss = seen.probe, seen.found.loss[seen.found.loss.isfinite()]
     if not probe.single or not probe.grain or not len(loss):
         return
@@ -144,9 +116,8 @@ def _of_grain(seen: Examination, calls: Calls) -> Iterator[Diagnosis]:
     consequence = f": gradients cannot be judged below {percent(evidence['limit'])} of the slope"
     if evidence["zero_gradients"] >= 0.5 or evidence.get("rough", 0) > 0.01:
         consequence = ": differences over small steps are 0, or multiples of that"
-    if (known := recognise("grain", evidence)) is not None:
-        exponent = round(math.log2(probe.grain))
-        yield _make(*known, evidence, {"grain_text": f"2^{exponent}", "consequence": consequence})
+    exponent = round(math.log2(probe.grain))
+    yield from _recognised("grain", evidence, {"grain_text": f"2^{exponent}", "consequence": consequence})
 
 
 def _limit(seen: Examination) -> float:
@@ -158,7 +129,7 @@ def _limit(seen: Examination) -> float:
 def _of_nan(seen: Examination, further: Further) -> Iterator[Diagnosis]:
     rows = seen.rows(Kind.NAN)
     names, ladder = seen.places
-    places = [row for row, one in enumerate(ladder.judged) if one.kind == Kind.NAN]
+    places = ladder.rows(Kind.NAN)
     if not rows and not places:
         return
     region = seen.region if rows else None
@@ -175,27 +146,28 @@ def _of_nan(seen: Examination, further: Further) -> Iterator[Diagnosis]:
         "where_place": " and ".join(dict.fromkeys(names[row] for row in places)),
         "origin": f"; the first NaN comes from {begins}" if begins else "",
     }
-    if (known := recognise("nan", evidence)) is not None:
-        yield _make(*known, evidence, texts, region.parameters if region else (), region)
+    yield from _recognised("nan", evidence, texts, region.parameters if region else (), region)
 
 
-def _of_wrong(seen: Examination, calls: Calls, further: Further) -> Iterator[Diagnosis]:
-    rows, place = seen.rows(Kind.WRONG), _wrong_place(seen)
-    axes = [one for one in seen.axes.ladder.judged if one.kind == Kind.WRONG]
-    if not rows and not axes:
-        if place:
-            yield Diagnosis("", FAIL, "certain", place, "Look at what divides by zero or chooses a branch there.")
+def _of_wrong(seen: Examination, calls: Evidence, further: Further) -> Iterator[Diagnosis]:
+    rows = seen.rows(Kind.WRONG)
+    if not rows and not seen.axes.rows(Kind.WRONG):
+        for place in seen.places[1].rows(Kind.WRONG)[:1]:
+            remedy = "Look at what divides by zero or chooses a branch there."
+            yield Diagnosis("", FAIL, "certain", seen.describe_place(place), remedy)
         return
     names = _named(seen, seen.blamed)
     region = seen.region if rows and not seen.rows(Kind.NAN) else None
-    evidence = _wrong_numbers(seen) | calls.evidence() | {"second_backward": calls.second_backward}
+    evidence = {"second_backward": 0.0} | _wrong_numbers(seen) | calls
     begins, late = further.wrong_origin(rows[0]) if rows else "", further.first_wrong(rows)
     early = _early(seen) if seen.blamed is None else set()
     names = names or _named(seen, early)
     evidence |= {"overwrites": float(OVERWRITES in begins), "early": float(bool(early))}
     evidence |= {"horizon": float(further.has_length)}
+    when = f"; it begins in {begins}" if begins else ""
     if late is not None and late.right is not None:
         evidence |= {"right_until": late.right, "first_wrong": late.length}
+        when = f"; it is right in episodes up to a length of {late.right:g}, and wrong from {late.length:g} on{when}"
     texts = {
         "by": _by(names),
         "where": _where(region),
@@ -206,19 +178,10 @@ def _of_wrong(seen: Examination, calls: Calls, further: Further) -> Iterator[Dia
     }
     if not names and evidence.get("zero", 0.0) == 1:
         names = tuple(row.parameter for row in seen.parameters() if row.zero == 1)
-    if (known := recognise("wrong", evidence)) is not None:
-        found = _make(*known, evidence, texts, names, region)
-    else:
-        what = f"the gradient{texts['by']} is not the slope of the loss{texts['where']}; no known cause fits"
-        found = Diagnosis("", FAIL, "certain", what, REMEDY, names, region, evidence)
-    yield replace(found, what=found.what + _when(late) + (f"; it begins in {begins}" if begins else ""))
-
-
-def _when(late: FirstWrong | None) -> str:
-    """Say from which length of an episode on a gradient is wrong."""
-    if late is None or late.right is None:
-        return ""
-    return f"; it is right in episodes up to a length of {late.right:g}, and wrong from {late.length:g} on"
+    what = f"the gradient{texts['by']} is not the slope of the loss{texts['where']}; no known cause fits"
+    found = _recognised("wrong", evidence, texts, names, region)
+    found = found or (Diagnosis("", FAIL, "certain", what, REMEDY, names, region, evidence),)
+    yield replace(found[0], what=found[0].what + when)
 
 
 def _early(seen: Examination) -> set[int]:
@@ -237,17 +200,6 @@ def _early(seen: Examination) -> set[int]:
 REMEDY = "Compare the gradient with differences along one parameter, at one of these points, step by step."
 
 
-def _wrong_place(seen: Examination) -> str:
-    from .places import describe
-
-    names, ladder = seen.places
-    for row, one in enumerate(ladder.judged):
-        if one.kind == Kind.WRONG:
-            axis = int(ladder.lines.direction[row].abs().argmax())
-            return describe(names[row], one, seen.names[axis], float(ladder.lines.loss[row]))
-    return ""
-
-
 def _wrong_numbers(seen: Examination) -> Evidence:
     """Return what wrong gradients have in common: along axes where these are known, else along all at once."""
     axes = seen.at_wrong or seen.axes
@@ -263,16 +215,13 @@ def _wrong_numbers(seen: Examination) -> Evidence:
     found |= numbers_of.cut_off(seen.probe, wrong, Samples.of(seen.axes, wrong=False))
     if seen.found.grad is not None:
         found |= numbers_of.same_length(seen.found.grad[seen.found.has_gradient])
-    lines = [row for row, one in enumerate(axes.ladder.judged) if one.kind == Kind.WRONG]
+    lines = axes.rows(Kind.WRONG)
     if found.get("zero", 0) < 1:
         found |= numbers_of.as_difference(seen.probe, axes, lines)
         found |= numbers_of.roughness(seen.probe, seen.u[:16])
-    noise = [one.noise / (seen.probe.eps * abs(float(seen.found.loss[row])) or 1) for row, one in _lines(seen)]
+    noisy = [(row, one) for row, one in enumerate(seen.random.judged) if math.isfinite(one.noise)]
+    noise = [one.noise / (seen.probe.eps * abs(float(seen.found.loss[row])) or 1) for row, one in noisy]
     return found | ({"noise_ratio": float(np.median(noise))} if noise else {})
-
-
-def _lines(seen: Examination) -> list[tuple[int, Judgement]]:
-    return [(row, one) for row, one in enumerate(seen.random.judged) if math.isfinite(one.noise)]
 
 
 def _of_zero(seen: Examination) -> Iterator[Diagnosis]:
@@ -281,8 +230,7 @@ def _of_zero(seen: Examination) -> Iterator[Diagnosis]:
     names = _named(seen, seen.stepped)
     others = {axis for axis, row in enumerate(seen.parameters()) if row.zero < 1}
     evidence = {"others_move": float(bool(others)), "stepped": float(len(names))}
-    if (known := recognise("zero", evidence)) is not None:
-        yield _make(*known, evidence, {"parameters": _by(names).removeprefix(" by ")}, names)
+    yield from _recognised("zero", evidence, {"parameters": _by(names).removeprefix(" by ")}, names)
 
 
 def _of_steep(seen: Examination) -> Iterator[Diagnosis]:
@@ -293,16 +241,15 @@ def _of_steep(seen: Examination) -> Iterator[Diagnosis]:
         evidence |= {"gradient": float(np.median(slopes))}
         loss = seen.found.loss[seen.found.loss.isfinite()]
         evidence["reach"] = float(loss.max() - loss.min()) / evidence["gradient"] if evidence["gradient"] else 0.0
-    if (known := recognise("steep", evidence)) is not None:
-        yield _make(*known, evidence, {"share": percent(evidence["steep_share"])})
+    yield from _recognised("steep", evidence, {"share": percent(evidence["steep_share"])})
 
 
 def _of_noise(seen: Examination) -> Iterator[Diagnosis]:
-    lines = [one for _, one in _lines(seen)]
-    if not lines:
+    noises = [one.noise for one in seen.random.judged if math.isfinite(one.noise)]
+    if not noises:
         return
     loss = float(seen.found.loss[seen.found.loss.isfinite()].abs().median())
-    noise = float(np.median([one.noise for one in lines]))
+    noise = float(np.median(noises))
     evidence = {
         "single": float(seen.probe.single),
         "noise": noise,
@@ -310,23 +257,19 @@ def _of_noise(seen: Examination) -> Iterator[Diagnosis]:
         "noise_share": len(seen.rows(Kind.NOISE)) / len(seen.random.judged),
         "limit": _limit(seen),
     }
-    if (known := recognise("noise", evidence)) is not None:
-        yield _make(*known, evidence, {})
+    yield from _recognised("noise", evidence, {})
 
 
 def conclude_physics(evidence: Evidence) -> tuple[Diagnosis, ...]:
     """Say that gradients are right for the program and wrong for the physics."""
     texts = {"physics_text": percent(evidence.get("physics", 0.0)), "finest_text": percent(evidence.get("at_4", 0.0))}
-    known = recognise("physics", evidence)
-    return () if known is None else (_make(*known, evidence, texts),)
+    return _recognised("physics", evidence, texts)
 
 
 def conclude_memory(growth: MemoryGrowth) -> tuple[Diagnosis, ...]:
     """Say that memory grows with every evaluation."""
     evidence = {"growth": growth.per_evaluation if growth.grows else 0.0, "evaluations": float(growth.evaluations)}
-    known = recognise("memory", evidence)
-    text = {"growth_text": f"{growth.per_evaluation:,.0f} bytes"}
-    return () if known is None else (_make(*known, evidence, text),)
+    return _recognised("memory", evidence, {"growth_text": f"{growth.per_evaluation:,.0f} bytes"})
 
 
 def conclude_jumps(curve: Sequence[Usefulness]) -> tuple[Diagnosis, ...]:
@@ -336,8 +279,8 @@ def conclude_jumps(curve: Sequence[Usefulness]) -> tuple[Diagnosis, ...]:
         evidence["least_bias"] = max(one.bias.low, -one.bias.high)
         interval = f"{percent(one.bias.low, bare=True)} to {percent(one.bias.high)}"
         texts = {"lacks": percent(one.bias.value), "interval": interval, "width": percent(one.step)}
-        if (known := recognise("jumps", evidence)) is not None:
-            return (_make(*known, evidence, texts),)
+        if found := _recognised("jumps", evidence, texts):
+            return found
     return ()
 
 
@@ -356,5 +299,4 @@ def _of_length(seen: Examination) -> Iterator[Diagnosis]:
         "length_high": middle + 2 * spread,
         "length_off": abs(middle - 1) - AVERAGE_TOLERANCE - CLEAR_ERRORS * spread,
     }
-    if (known := recognise("length", evidence)) is not None:
-        yield _make(*known, evidence, {})
+    yield from _recognised("length", evidence, {})

@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..space import ParameterSpace
-from .parameters import AxisLines
 from .probe import Probe
-from .slopes import Judgement, Kind
+from .slopes import Judgement, Kind, Ladder
 
 STEADY = 0.02  # of a ratio is what others may be off by, to be the same
 MATCHES = 0.02  # of the largest component is what permuted gradients may be off by
@@ -41,19 +40,19 @@ class Samples:
     point: NDArray[np.int64]
 
     @classmethod
-    def of(cls, axes: AxisLines, *, wrong: bool) -> Samples:
+    def of(cls, axes: Ladder, *, wrong: bool) -> Samples:
         """Return the lines whose slope by differences is known; where asked, those at which gradients are wrong."""
         rows = [
             row
-            for row, one in enumerate(axes.ladder.judged)
+            for row, one in enumerate(axes.judged)
             if (one.slope is not None or one.kind in NO_SLOPE) and (not wrong or one.kind == Kind.WRONG)
         ]
-        judged = [axes.ladder.judged[row] for row in rows]
+        judged = [axes.judged[row] for row in rows]
         found = [(one.exact, *((one.slope.value, one.slope.error) if one.slope else (0.0, 0.0))) for one in judged]
         numbers = np.array(found).reshape(-1, 3)
         index = torch.tensor(rows, dtype=torch.long)
-        axis, point = axes.axis[index], axes.ladder.lines.point[index]
-        along = axes.ladder.lines.direction[index, axis].numpy()  # ahead or back, whichever leads into the box
+        axis, point = axes.axis[index], axes.lines.point[index]
+        along = axes.lines.direction[index, axis].numpy()  # ahead or back, whichever leads into the box
         exact, slope, error = numbers.T
         return cls(exact * along, slope * along, error, axis.numpy(), point.numpy())
 
@@ -235,13 +234,13 @@ class _AxisSlope:
         return float((low * high) ** 0.5)
 
 
-def as_difference(probe: Probe, axes: AxisLines, rows: Sequence[int]) -> Evidence:
+def as_difference(probe: Probe, axes: Ladder, rows: Sequence[int]) -> Evidence:
     """Look for the step of the difference that a gradient may be: `difference_step`, as a share of the box.
 
     The step is found at one component by trying many, and has to hold at others, as a share of the box or in the
     parameters' own units.
     """
-    lines, width = axes.ladder.lines, probe.width
+    lines, width = axes.lines, probe.width
     slopes = [
         _AxisSlope(probe, lines.u[row], axis := int(axes.axis[row]), float(lines.grad[row, axis])) for row in rows
     ]

@@ -20,7 +20,7 @@ from ..objective import Evaluation
 from ..statistics import Estimate, share
 from . import parameters as by_parameter
 from .diagnosis import Region
-from .parameters import AxisLines, ParameterRow
+from .parameters import ParameterRow
 from .places import measure_places, place_losses
 from .probe import Lines, Probe
 from .regions import find_region
@@ -91,8 +91,8 @@ class Examination:
     found: Evaluation
     random: Ladder
     places: tuple[tuple[str, ...], Ladder]
-    axes: AxisLines
-    at_wrong: AxisLines | None = None
+    axes: Ladder
+    at_wrong: Ladder | None = None
     blamed: set[int] | None = field(default_factory=set)
     stepped: set[int] = field(default_factory=set)
     region: Region | None = None
@@ -109,7 +109,18 @@ class Examination:
 
     def rows(self, *kinds: Kind) -> list[int]:
         """Return the random points of some kinds."""
-        return [row for row, one in enumerate(self.random.judged) if one.kind in kinds]
+        return self.random.rows(*kinds)
+
+    def describe_place(self, row: int) -> str:
+        """Say what is wrong along a line through a special place."""
+        (names, ladder), one = self.places, self.places[1].judged[row]
+        axis, loss = int(ladder.axis[row]), float(ladder.lines.loss[row])
+        if one.kind == Kind.NAN:
+            return f"the gradient is NaN at {names[row]}, where the loss is {loss:.4g}"
+        sides = [side.value for side in (one.behind, one.ahead) if side is not None]
+        rise = " and ".join(f"{value:.3g}" for value in sides) or f"{one.slope.value:.3g}" if one.slope else "otherwise"
+        gradient = f"by {self.names[axis]}, the gradient is {one.exact:.3g}"
+        return f"at {names[row]}, {gradient} and the loss rises by {rise} to either side"
 
     def parameters(self) -> tuple[ParameterRow, ...]:
         """Return the table of parameters."""
@@ -147,7 +158,8 @@ def examine(probe: Probe, power: float, seed: int, say: Callable[[str], None] = 
     wanted = points_for(power)
     drawn = 2 ** math.ceil(math.log2(wanted))
     u, found, ladder = _random(probe, engine, drawn, seed)
-    while Share.of(ladder.judged).judged < wanted and len(u) < MOST_TIMES * wanted and _worth(ladder):
+    while len(u) / 2 <= Share.of(ladder.judged).judged < wanted and len(u) < MOST_TIMES * wanted:
+        # where most could not be judged, more would not tell more
         u, found, ladder = _more(probe, engine, drawn, seed, (u, found, ladder))
     wrong = sum(one.kind in BAD for one in ladder.judged)
     if 0 < wrong < FEW_WRONG and len(u) < MOST_TIMES * wanted:
@@ -160,11 +172,6 @@ def examine(probe: Probe, power: float, seed: int, say: Callable[[str], None] = 
     say("where gradients are wrong")
     _look_closer(result)
     return result
-
-
-def _worth(ladder: Ladder) -> bool:
-    """Say whether more points would tell more: where most could not be judged, they would not."""
-    return Share.of(ladder.judged).judged >= len(ladder.judged) / 2
 
 
 Drawn = tuple[Tensor, Evaluation, Ladder]
@@ -186,16 +193,9 @@ def _more(probe: Probe, engine: SobolEngine, count: int, seed: int, before: Draw
     steps = tuple(sorted({*first.steps, *ladder.steps}))
     joined = Lines(*(torch.cat([getattr(first.lines, one), getattr(lines, one)]) for one in lines.__dataclass_fields__))
     joined = replace(joined, point=torch.arange(len(joined)))
-    walked = torch.cat([_on(one, steps) for one in (first, ladder)], dim=2)
+    walked = torch.cat([one.on(steps) for one in (first, ladder)], dim=2)
     both = Evaluation.join([before[1], found], dim=u.shape[1], grad=found.grad is not None)
     return torch.cat([before[0], u]), both, Ladder(joined, steps, walked, first.judged + ladder.judged)
-
-
-def _on(ladder: Ladder, steps: tuple[float, ...]) -> Tensor:
-    """Return what was walked, on a ladder of more steps."""
-    walked = torch.full((2, len(steps), len(ladder.lines)), torch.nan, dtype=torch.float64)
-    walked[:, [steps.index(one) for one in ladder.steps]] = ladder.walked
-    return walked
 
 
 def _look_closer(result: Examination) -> None:
@@ -203,12 +203,12 @@ def _look_closer(result: Examination) -> None:
     probe, dim = result.probe, result.u.shape[1]
     wrong = result.rows(Kind.WRONG)
     detached, result.stepped = by_parameter.find_detached(probe, result.u, result.found)
-    result.stepped |= {
-        axis
-        for axis in range(dim)
-        if (lines := result.axes.of(axis)) and _is_stepped([one for _, one in lines], result.found, axis)
-    }
-    rows = {row for row, one in enumerate(result.axes.ladder.judged) if one.kind == Kind.WRONG}
+    dead = by_parameter.never_moves(result.found, dim)
+    for axis in dead.nonzero().flatten().tolist():
+        lines = result.axes.along(axis)
+        if any(one.moves for one in lines) and all(one.kind not in BAD for one in lines):
+            result.stepped.add(axis)
+    rows = result.axes.rows(Kind.WRONG)
     seen = {int(result.axes.axis[row]) for row in rows}
     if wrong and dim > ALL_AXES:
         result.blamed = by_parameter.blame(probe, result.u, result.found, wrong)
@@ -217,16 +217,9 @@ def _look_closer(result: Examination) -> None:
     if result.blamed is not None:
         result.blamed |= detached
     if wrong or rows:
-        points = wrong[:AXIS_POINTS] or [int(result.axes.ladder.lines.point[row]) for row in rows][:AXIS_POINTS]
+        points = wrong[:AXIS_POINTS] or [int(result.axes.lines.point[row]) for row in rows][:AXIS_POINTS]
         _walk_at_wrong(result, points)
     _find_region(result)
-
-
-def _is_stepped(judged: Sequence[Judgement], found: Evaluation, axis: int) -> bool:
-    if found.grad is None or not bool(found.has_gradient.any()):
-        return False
-    zero = bool((found.grad[found.has_gradient][:, axis] == 0).all())
-    return zero and any(one.moves for one in judged) and all(one.kind not in BAD for one in judged)
 
 
 def _walk_at_wrong(result: Examination, points: Sequence[int]) -> None:
@@ -243,7 +236,7 @@ def _walk_at_wrong(result: Examination, points: Sequence[int]) -> None:
     found = by_parameter.along(result.probe, result.u, result.found, rows, axes.repeat(len(points)))
     result.at_wrong = found
     if dim <= ALL_AXES:
-        seen = {int(found.axis[row]) for row, one in enumerate(found.ladder.judged) if one.kind == Kind.WRONG}
+        seen = {int(found.axis[row]) for row in found.rows(Kind.WRONG)}
         result.blamed = None if len(seen) == dim else (result.blamed or set()) | seen
     elif result.blamed is not None and len(result.blamed) == dim:
         result.blamed = None

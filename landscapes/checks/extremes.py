@@ -148,7 +148,7 @@ def _check_variant(subject: Subject, variant: ExtremeCase) -> Finding:
     except ValueError as refusal:
         return refused(refusal)
     if objective is subject.objective and variant.x is None:
-        found = subject.rows(torch.arange(ROWS))
+        found = subject.first.rows(torch.arange(ROWS))
     else:
         found = objective.evaluate(subject.x[:ROWS] if variant.x is None else variant.x)
     judged = _judge(found)

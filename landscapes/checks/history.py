@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from itertools import pairwise
 
 import torch
@@ -10,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..objective import Evaluation, Objective, evaluate
+from .evidence import Evidence
 
 REPEATS = 6  # calls at one point, whose losses drift where a call counts
 ROWS = 4  # points of the batch that is compared with single rows
@@ -17,51 +17,42 @@ ALIKE = 1e-3  # relative difference of gradients that are the same
 SAME = 1e-9  # relative difference of losses that are the same
 
 
-@dataclass(frozen=True)
-class History:
-    """Say how evaluations depend on what was evaluated before, and with what.
+def observe(objective: Objective, x: Float[Tensor, "batch dim"]) -> Evidence:
+    """Evaluate two points alone in several orders, and both in a batch; return how that changes what is found.
 
-    `loss` and `gradient` are relative differences between two calls at one point; `random` says that these cannot be
-    reproduced by the same calls, and do not drift. `stale` says that a call returns the gradient of the one before,
-    `grows` that gradients add up from call to call. `batch` is a gradient alone over that within a batch of `ROWS`,
-    and `alike` says that all gradients of a batch are the same, though alone they are not. `leak` is the relative
-    difference of the losses of a row alone and in a batch, and `gradient_leak` that of its gradients.
+    `loss_moves` and `gradient_moves` are relative differences between two calls at one point; `random` says that these
+    cannot be reproduced by the same calls, and do not drift, and `hidden` that losses move otherwise. `stale` says that
+    a call returns the gradient of the one before, `grows` that gradients add up from call to call. `batch` is a
+    gradient alone over that within a batch of so many `rows`, and `alike` says that all gradients of a batch are the
+    same, though alone they are not. `leaks` says that the loss of a row in a batch is another one than alone, and
+    `gradient_leak` is the relative difference of its gradients. Raises what the objective raises.
     """
-
-    loss: float
-    gradient: float
-    random: bool
-    stale: bool
-    grows: bool
-    batch: float
-    alike: bool
-    leak: float
-    gradient_leak: float
-
-
-def observe(objective: Objective, x: Float[Tensor, "batch dim"]) -> History:
-    """Evaluate two points alone in several orders, and both in a batch. Raises what the objective raises."""
     a, b = x[:1], x[1:2]
     order = [a, b, a, a, b, a, a]
     first, other, after, repeated, _, after_again, repeated_again = [
         evaluate(objective, one, grad=True) for one in order
     ]
-    losses = _apart(after.loss, repeated.loss), _apart(first.loss, repeated.loss)
-    again = _apart(after.loss, after_again.loss), _apart(repeated.loss, repeated_again.loss)
-    moved = max(losses)
+    moved = max(_apart(after.loss, repeated.loss), _apart(first.loss, repeated.loss))
+    again = max(_apart(after.loss, after_again.loss), _apart(repeated.loss, repeated_again.loss))
     batch = evaluate(objective, x[:ROWS], grad=True)
     drifts = moved > SAME and _drifts([float(evaluate(objective, a, grad=False).loss) for _ in range(REPEATS)])
-    return History(
-        loss=moved,
-        gradient=max(_gap(after, repeated), _gap(first, repeated)),
-        random=(moved > SAME and max(again) > moved / 10 and not drifts) or _varies(after, after_again, repeated),
-        stale=_gap(other, repeated) < ALIKE < _gap(after, repeated),
-        grows=_grows(after, repeated, after_again, repeated_again),
-        batch=_ratio(repeated, batch),
-        leak=_apart(repeated.loss, batch.loss[:1]),
-        gradient_leak=max(_gap(repeated, batch.rows(slice(0, 1))), _gap(other, batch.rows(slice(1, 2)))),
-        alike=_is_alike(batch) and _gap(repeated, other) > ALIKE,
-    )
+    random = (moved > SAME and again > moved / 10 and not drifts) or _varies(after, after_again, repeated)
+    gradient = max(_gap(after, repeated), _gap(first, repeated))
+    leak = max(_gap(repeated, batch.rows(slice(0, 1))), _gap(other, batch.rows(slice(1, 2))))
+    found = {
+        "random": random,
+        "hidden": moved > SAME and not random,
+        "leaks": _apart(repeated.loss, batch.loss[:1]) > max(SAME, 10 * moved),
+        "stale": _gap(other, repeated) < ALIKE < _gap(after, repeated),
+        "grows": _grows(after, repeated, after_again, repeated_again),
+        "batch": _ratio(repeated, batch),
+        "alike": _is_alike(batch) and _gap(repeated, other) > ALIKE,
+        "gradient_leak": leak if leak > 10 * gradient else 0.0,
+        "rows": ROWS,
+        "loss_moves": moved,
+        "gradient_moves": gradient,
+    }
+    return {name: float(value) for name, value in found.items()}
 
 
 def _drifts(losses: list[float]) -> bool:

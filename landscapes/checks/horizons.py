@@ -13,13 +13,11 @@ Made = TypeVar("Made")
 class FirstWrong:
     """Hold the shortest length of an episode with a wrong gradient, in the unit of the horizon.
 
-    `right` is the next shorter one, whose gradient is right, None where the shortest of all is wrong already. `tried`
-    is the number of episodes that were judged.
+    `right` is the next shorter one, whose gradient is right, None where the shortest of all is wrong already.
     """
 
     length: float
     right: float | None
-    tried: int
 
 
 def first_wrong_step(
@@ -30,16 +28,13 @@ def first_wrong_step(
     A gradient that is wrong is taken to stay so in longer episodes: that makes the number of trials the logarithm of
     the number of lengths. `make` or `is_wrong` may refuse a length by ValueError; then the next one is tried.
     """
-    ahead, tried = sorted(set(lengths)), 0
+    ahead = sorted(set(lengths))
 
     def judge(length: float) -> bool | None:
-        nonlocal tried
         try:
-            wrong = is_wrong(make(length))
+            return is_wrong(make(length))
         except ValueError:
             return None
-        tried += 1
-        return wrong
 
     while ahead and (wrong := judge(ahead[-1])) is not True:
         if wrong is False:
@@ -56,4 +51,4 @@ def first_wrong_step(
             wrong_from = middle
         else:
             right = middle + 1
-    return FirstWrong(ahead[right], ahead[right - 1] if right else None, tried) if ahead else None
+    return FirstWrong(ahead[right], ahead[right - 1] if right else None) if ahead else None

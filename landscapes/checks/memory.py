@@ -35,17 +35,14 @@ class MemoryGrowth:
     """Say how much more memory is held after evaluations than before.
 
     `per_evaluation` is the median slope [bytes], which a jump, such as a cache, leaves at zero. `total` is its growth
-    over all `evaluations` after the warm-up [bytes], and `rising` the share of blocks of evaluations after which there
-    was more. `missed` is what a growth by each evaluation may be [bytes] without being found.
+    over all `evaluations` after the warm-up [bytes].
     """
 
     where: Where
     grows: bool
     per_evaluation: float
     total: float
-    rising: float
     evaluations: int
-    missed: float
 
 
 def memory_growth(
@@ -71,19 +68,17 @@ def memory_growth(
     found = []
     for where, read, floor in [_of_process(), *([_OF_GPU] if on_gpu else [])]:
         least = max(floor, BATCHES * batch)
-        one = _judge(where, _measure(evaluate, read, blocks, count), count, least)
-        if one.grows:
-            one = _judge(where, _measure(evaluate, read, blocks, count, between=gc.collect), count, least)
+        ways: tuple[Callable[[], object], ...] = (lambda: None, gc.collect)  # the latter where memory grows without
+        for between in ways:
+            one = _judge(where, _measure(evaluate, read, blocks, count, between), count, least)
+            if not one.grows:
+                break
         found.append(one)
     return max(found, key=lambda one: (one.grows, one.where == "GPU"))
 
 
 def _measure(
-    evaluate: Callable[[], None],
-    read: Callable[[], int],
-    blocks: int,
-    count: int,
-    between: Callable[[], object] = lambda: None,
+    evaluate: Callable[[], None], read: Callable[[], int], blocks: int, count: int, between: Callable[[], object]
 ) -> list[int]:
     """Return how much memory is held after each block of evaluations, the warm-up left out."""
     held = []
@@ -96,13 +91,10 @@ def _measure(
 
 
 def _judge(where: Where, held: list[int], count: int, least: float) -> MemoryGrowth:
-    evaluations, numbered = count * (len(held) - 1), list(enumerate(held))
-    slope = median((later - before) / (j - i) for (i, before), (j, later) in combinations(numbered, 2))
+    slope = median((later - before) / (j - i) for (i, before), (j, later) in combinations(enumerate(held), 2))
     rising = sum(later > before for before, later in pairwise(held)) / (len(held) - 1)
     total = slope * (len(held) - 1)
-    return MemoryGrowth(
-        where, total > least and rising >= RISING, slope / count, total, rising, evaluations, least / evaluations
-    )
+    return MemoryGrowth(where, total > least and rising >= RISING, slope / count, total, count * (len(held) - 1))
 
 
 class _Heap(ctypes.Structure):

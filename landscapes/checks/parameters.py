@@ -40,25 +40,13 @@ class ParameterRow:
     verdict: str
 
 
-@dataclass(frozen=True, eq=False)
-class AxisLines:
-    """Lines along axes that were judged: `axis` is the parameter of each."""
-
-    axis: Tensor
-    ladder: Ladder
-
-    def of(self, axis: int) -> list[tuple[int, Judgement]]:
-        """Return the lines along one parameter, with their numbers."""
-        return [(row, self.ladder.judged[row]) for row in (self.axis == axis).nonzero().flatten().tolist()]
-
-
-def walk_axes(probe: Probe, u: Float[Tensor, "batch dim"], found: Evaluation, seed: int) -> AxisLines:
+def walk_axes(probe: Probe, u: Float[Tensor, "batch dim"], found: Evaluation, seed: int) -> Ladder:
     """Walk along axes through some of the points: every parameter's, or some of them where they are many."""
     dim, generator = u.shape[1], torch.Generator().manual_seed(seed)
     usable = found.loss.isfinite().nonzero().flatten()
     if not len(usable):
         usable = torch.arange(len(u))
-    dead = _never_moves(found, dim)
+    dead = never_moves(found, dim)
     count = axis_lines(dim)
     shuffled = torch.randperm(dim, generator=generator)
     if dim > AXES_AT_MOST:  # those whose gradient is always 0 first
@@ -73,15 +61,15 @@ def axis_lines(dim: int) -> int:
     return min(AXIS_LINES, max(FEWEST_LINES, min(dim, AXES_AT_MOST) * 2, LINES_EACH * min(dim, FEW_AXES)))
 
 
-def along(probe: Probe, u: Tensor, found: Evaluation, point: Tensor, axis: Tensor) -> AxisLines:
+def along(probe: Probe, u: Tensor, found: Evaluation, point: Tensor, axis: Tensor) -> Ladder:
     """Judge lines along the axes given, each through the point given."""
     direction = torch.eye(u.shape[1], dtype=torch.float64)[axis]
     direction = torch.where(u[point] > 0.5, -1.0, 1.0) * direction
     lines = Lines.through(probe, u, direction, point, found)
-    return AxisLines(axis, measure(probe, lines, STEPS))
+    return measure(probe, lines, STEPS)
 
 
-def _never_moves(found: Evaluation, dim: int) -> Bool[Tensor, " dim"]:
+def never_moves(found: Evaluation, dim: int) -> Bool[Tensor, " dim"]:
     """Say whose component of the gradient is exactly 0 wherever there is one."""
     if found.grad is None:
         return torch.zeros(dim, dtype=torch.bool)
@@ -91,7 +79,7 @@ def _never_moves(found: Evaluation, dim: int) -> Bool[Tensor, " dim"]:
 
 def find_detached(probe: Probe, u: Float[Tensor, "batch dim"], found: Evaluation) -> tuple[set[int], set[int]]:
     """Return parameters whose gradient is always 0 though losses change by them: smoothly, and in steps."""
-    dead = _never_moves(found, u.shape[1])
+    dead = never_moves(found, u.shape[1])
     rows = found.has_gradient.nonzero().flatten()[:BLAMED_POINTS]
     if not bool(dead.any()) or not len(rows) or u.shape[1] <= AXES_AT_MOST:
         return set(), set()
@@ -134,13 +122,9 @@ def halve(
             return None
         first = False
         blamed |= {group[0] for group in wrong if len(group) == 1}
-        groups = [half for group in wrong if len(group) > 1 for half in _halves(group)]
+        cuts = [(group, len(group) // 2) for group in wrong if len(group) > 1]
+        groups = [half for group, middle in cuts for half in (group[:middle], group[middle:])]
     return blamed
-
-
-def _halves(group: list[int]) -> tuple[list[int], list[int]]:
-    middle = len(group) // 2
-    return group[:middle], group[middle:]
 
 
 def _judge_groups(
@@ -156,19 +140,17 @@ def _judge_groups(
 
 
 def table(
-    names: Sequence[str], found: Evaluation, axes: AxisLines, blamed: set[int], stepped: set[int]
+    names: Sequence[str], found: Evaluation, axes: Ladder, blamed: set[int], stepped: set[int]
 ) -> tuple[ParameterRow, ...]:
     """Return a row for each parameter."""
     grad = found.grad[found.has_gradient] if found.grad is not None else torch.zeros(0, len(names))
-    differences = axes.ladder.differences[axes.ladder.steps.index(RATIO_STEP)]
-    exact = axes.ladder.lines.slope
+    differences = axes.differences[axes.steps.index(RATIO_STEP)]
+    ratios = torch.where(differences != 0, axes.lines.slope / differences, torch.nan)
     rows = []
     for axis, name in enumerate(names):
-        lines = axes.of(axis)
-        numbers = torch.tensor([row for row, _ in lines], dtype=torch.long)
-        ratio = (exact[numbers] / differences[numbers])[differences[numbers] != 0]
-        ratio = ratio[ratio.isfinite()]
-        judged = [one for _, one in lines]
+        lines = axes.axis == axis
+        ratio = ratios[lines & ratios.isfinite()]
+        judged = axes.along(axis)
         wrong = sum(one.kind in BAD for one in judged)
         zero = float((grad[:, axis] == 0).double().mean()) if len(grad) else float("nan")
         verdict = _verdict(judged, wrong or (axis in blamed), zero, axis in stepped)

@@ -28,7 +28,7 @@ def compare_time_steps(seen: Examination, finer: Mapping[float, Callable[[], Obj
     steps, as `at_2` and `at_4`; and `ratio`, the median of gradients over slopes. Empty where slopes are not the same
     over a hundredth of the box and three, where time steps are refused, or where too few lines are left.
     """
-    rows = [row for row, one in enumerate(seen.random.judged) if one.kind in (Kind.AGREES, Kind.KINK)][:LINES]
+    rows = seen.rows(Kind.AGREES, Kind.KINK)[:LINES]
     if len(rows) < FEWEST_LINES or not finer:
         return {}
     lines = seen.random.lines.rows(torch.tensor(rows))

@@ -63,9 +63,8 @@ def measure_places(probe: Probe, seed: int) -> tuple[tuple[str, ...], Ladder]:
     direction = torch.eye(dim, dtype=torch.float64)[axes].repeat(len(u), 1)
     lines = Lines.through(probe, u, direction, point, probe.gradient(u))
     ladder = measure(probe, lines, STEPS)
-    wrong = [row for row, one in enumerate(ladder.judged) if one.kind == Kind.WRONG]
     judged = list(ladder.judged)
-    for row in wrong:
+    for row in ladder.rows(Kind.WRONG):
         if _is_within_neighbours(probe, lines, row):
             judged[row] = Judgement(Kind.KINK, judged[row].exact)
     names = tuple(list(found)[one] for one in point.tolist())
@@ -89,12 +88,3 @@ def _is_within_neighbours(probe: Probe, lines: Lines, row: int) -> bool:
     room, exact = KINKED * float(grads.abs().max()), float(lines.slope[row])
     varies = float((grads.amax(dim=0) - grads.amin(dim=0)).max()) > room
     return varies and min(0.0, float(grads.min())) - room <= exact <= max(0.0, float(grads.max())) + room
-
-
-def describe(name: str, one: Judgement, parameter: str, loss: float) -> str:
-    """Say what is wrong at a place."""
-    if one.kind == Kind.NAN:
-        return f"the gradient is NaN at {name}, where the loss is {loss:.4g}"
-    sides = [side.value for side in (one.behind, one.ahead) if side is not None]
-    rises = " and ".join(f"{value:.3g}" for value in sides) or f"{one.slope.value:.3g}" if one.slope else "otherwise"
-    return f"at {name}, by {parameter}, the gradient is {one.exact:.3g} and the loss rises by {rises} to either side"

@@ -46,7 +46,9 @@ def find_region(
     few = min(int(wrong.sum()), int((~wrong).sum()))
     if few < FEWEST:
         return None
-    features, labels, spans = _features(values, names, events or {})
+    counts = events or {}
+    features, labels = np.column_stack([values, *counts.values()]), [*names, *counts]
+    spans = np.ptp(features, axis=0)
     single = [_best_interval(features, feature, wrong) for feature in range(len(labels))]
     single = sorted(single, key=lambda one: -one.score)
     best: tuple[float, list[_Interval]] = (_error(features, single[:1], wrong), single[:1])
@@ -68,15 +70,6 @@ def find_region(
         rules.append(_describe(one, features, labels, kept, spans))
     rule = " and ".join(rules)
     return Region(rule, tuple(labels[one.feature] for one in intervals), error, len(wrong))
-
-
-def _features(
-    values: Points, names: Sequence[str], events: Mapping[str, Points]
-) -> tuple[Points, list[str], NDArray[np.float64]]:
-    """Return parameters and events as columns, their labels, and how far each reaches."""
-    columns, labels = [values, *(count[:, None] for count in events.values())], [*names, *events]
-    features = np.concatenate(columns, axis=1)
-    return features, labels, np.ptp(features, axis=0)
 
 
 def _fits_by_chance(points: int, few: int, features: int, conditions: int) -> bool:

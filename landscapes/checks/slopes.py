@@ -11,12 +11,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from functools import cached_property
 from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -102,6 +103,19 @@ class Ladder:
     judged: tuple[Judgement, ...]
 
     @property
+    def axis(self) -> Int[Tensor, " line"]:
+        """The parameter that moves most along each line: the only one along an axis."""
+        return self.lines.direction.abs().argmax(dim=1)
+
+    def rows(self, *kinds: Kind) -> list[int]:
+        """Return the lines of some kinds."""
+        return [row for row, one in enumerate(self.judged) if one.kind in kinds]
+
+    def along(self, axis: int) -> list[Judgement]:
+        """Return what was judged of the lines along one parameter."""
+        return [self.judged[row] for row in (self.axis == axis).nonzero().flatten().tolist()]
+
+    @property
     def differences(self) -> Float[Tensor, "step line"]:
         """Central differences, one-sided where the box ends, NaN where neither is there."""
         steps = torch.tensor(self.steps, dtype=torch.float64)[:, None]
@@ -109,26 +123,18 @@ class Ladder:
         central = (ahead + behind) / 2
         return torch.where(central.isfinite(), central, torch.where(ahead.isfinite(), ahead, behind))
 
+    def on(self, steps: tuple[float, ...]) -> Float[Tensor, "2 step line"]:
+        """Return what was walked over a ladder of more steps, NaN where that was not."""
+        walked = torch.full((2, len(steps), len(self.lines)), torch.nan, dtype=torch.float64)
+        walked[:, [steps.index(step) for step in self.steps]] = self.walked
+        return walked
+
     def with_kind(self, rows: Sequence[int], kind: Kind) -> Ladder:
         """Return this ladder with some of its lines judged to be of a kind."""
         judged = list(self.judged)
         for row in rows:
             judged[row] = replace(judged[row], kind=kind)
         return replace(self, judged=tuple(judged))
-
-
-@dataclass(frozen=True)
-class Limits:
-    """What tells a wrong slope from a right one: the precision of losses, what repeats differ by, and tolerances."""
-
-    eps: float
-    repeats: float
-    relative: float
-
-    @classmethod
-    def of(cls, probe: Probe) -> Limits:
-        """Return those of an objective, by what was seen of it so far."""
-        return cls(probe.eps, probe.repeats, TOLERANCE)
 
 
 def measure(probe: Probe, lines: Lines, steps: Sequence[float] = STEPS) -> Ladder:
@@ -148,11 +154,8 @@ def measure(probe: Probe, lines: Lines, steps: Sequence[float] = STEPS) -> Ladde
 
 def _forgive_few(ladder: Ladder) -> Ladder:
     """Let few small disagreements in float32 be noise: losses that jump between steps of time hide below rounding."""
-    small = [
-        row
-        for row, one in enumerate(ladder.judged)
-        if one.kind == Kind.WRONG and one.slope is not None and _alike(one.slope.value, one.exact, SMALL)
-    ]
+    wrong = [(row, ladder.judged[row]) for row in ladder.rows(Kind.WRONG)]
+    small = [row for row, one in wrong if one.slope is not None and _alike(one.slope.value, one.exact, SMALL)]
     return ladder.with_kind(small, Kind.NOISE) if len(small) < MANY * len(ladder.judged) else ladder
 
 
@@ -163,13 +166,10 @@ def _distrust(ladder: Ladder) -> Ladder:
     float32 may see none, and others above.
     """
     differences, distrusted = ladder.differences.numpy(), list[int]()
-    right = [
-        (row, one.slope.step, one.exact)
-        for row, one in enumerate(ladder.judged)
-        if one.kind == Kind.AGREES and one.slope
-    ]
-    for row, one in enumerate(ladder.judged):
-        if one.kind != Kind.WRONG or one.slope is None:
+    agreeing = [(row, ladder.judged[row]) for row in ladder.rows(Kind.AGREES)]
+    right = [(row, one.slope.step, one.exact) for row, one in agreeing if one.slope]
+    for row in ladder.rows(Kind.WRONG):
+        if (one := ladder.judged[row]).slope is None:
             continue
         level = ladder.steps.index(one.slope.step)
         others = [(differences[level, other], exact) for other, step, exact in right if step != one.slope.step]
@@ -207,12 +207,8 @@ def _rounding(eps: float, lines: Lines, row: int) -> float:
 def _extend(probe: Probe, ladder: Ladder, rows: Sequence[int], more: Sequence[float]) -> Ladder:
     """Walk along some of the lines over further steps, and judge these once more."""
     chosen = torch.tensor(rows)
-    part = ladder.lines.rows(chosen)
-    steps = tuple(sorted({*ladder.steps, *more}))
-    order = torch.tensor([steps.index(step) for step in ladder.steps])
+    part, walked = ladder.lines.rows(chosen), ladder.on(steps := tuple(sorted({*ladder.steps, *more})))
     added = torch.tensor([steps.index(step) for step in more])
-    walked = torch.full((2, len(steps), len(ladder.lines)), torch.nan, dtype=torch.float64)
-    walked[:, order] = ladder.walked
     walked[:, added[:, None], chosen[None]] = part.walk(probe, list(more))
     again = _judge(probe, part, steps, walked[:, :, chosen])
     judged = list(ladder.judged)
@@ -223,35 +219,29 @@ def _extend(probe: Probe, ladder: Ladder, rows: Sequence[int], more: Sequence[fl
 
 def _judge(probe: Probe, lines: Lines, steps: tuple[float, ...], walked: Float[Tensor, "2 step line"]) -> Ladder:
     """Judge lines by what was walked."""
-    limits = Limits.of(probe)
     loss, slope = lines.loss.numpy(), lines.slope.numpy()
-    rounding = _rounding_of(probe, lines, limits.eps)
-    noise = _typical_noise(steps, loss, walked.numpy())
-    typical = _typical_slope(slope, lines)
+    rounding = _rounding_of(probe, lines)
+    usual = _typical_noise(steps, loss, walked.numpy()) + NOISE_MARGIN * probe.repeats
     moved = lines.direction.abs().sum(dim=1).numpy() * float(lines.grad.abs().nan_to_num().max())
-    allowed = (
-        ROUNDED * limits.eps * lines.parts.numpy() + FLAT * typical + NOISE_MARGIN * probe.gradient_repeats * moved
-    )
-    judged = []
+    allowed = ROUNDED * probe.eps * lines.parts.numpy() + FLAT * _typical_slope(slope, lines)
+    allowed += NOISE_MARGIN * probe.gradient_repeats * moved
+    judged, eps = [], probe.eps
     for row in range(len(lines)):
         found = walked[:, :, row].numpy()
         known = np.isfinite(found).any(axis=0)
-        line = _Line(
-            np.array(steps)[known], found[:, known], float(loss[row]), float(slope[row]), limits.eps,
-            float(rounding[row]), float(noise[row]) + NOISE_MARGIN * limits.repeats, limits.relative,
-            float(allowed[row]),
-        )  # fmt: skip
+        numbers = (float(one[row]) for one in (loss, slope, rounding, usual, allowed))
+        line = _Line(np.array(steps)[known], found[:, known], eps, *numbers)
         judged.append(Judgement(Kind.NAN, np.nan) if bool(lines.missing[row]) else line.judge())
     return Ladder(lines, steps, walked, tuple(judged))
 
 
-def _rounding_of(probe: Probe, lines: Lines, eps: float) -> NDArray[np.float64]:
+def _rounding_of(probe: Probe, lines: Lines) -> NDArray[np.float64]:
     """Return what rounding of the loss, and of the point, changes of each loss [loss unit]."""
     space = probe.objective.space
     places = (lines.u + space.lower / probe.width).abs() + 1
     parts = torch.where(lines.direction == 0, 0.0, (lines.grad * places).abs()).nan_to_num().sum(dim=1)
     point = EPS["float32"] if probe.precision == "float32" else EPS["float64"]
-    found: NDArray[np.float64] = (eps * lines.loss.abs() + point * parts).numpy()
+    found: NDArray[np.float64] = (probe.eps * lines.loss.abs() + point * parts).numpy()
     return found
 
 
@@ -311,13 +301,32 @@ class _Line:
 
     steps: NDArray[np.float64]
     walked: NDArray[np.float64]
+    eps: float
     loss: float
     exact: float
-    eps: float
     rounding: float
     usual: float
-    relative: float
     allowed: float
+
+    @cached_property
+    def rises(self) -> NDArray[np.float64]:
+        """How much higher losses are ahead and behind, shape (2, step)."""
+        found: NDArray[np.float64] = self.walked - self.loss
+        return found
+
+    @cached_property
+    def change(self) -> NDArray[np.float64]:
+        """The larger of both changes over each step."""
+        found: NDArray[np.float64] = np.fmax(*np.abs(self.rises))
+        return found
+
+    @cached_property
+    def central(self) -> NDArray[np.float64]:
+        """Central differences over each step."""
+        ahead, behind = self.rises
+        with np.errstate(invalid="ignore"):
+            found: NDArray[np.float64] = (ahead - behind) / (2 * self.steps)
+        return found
 
     def judge(self) -> Judgement:
         """Compare the gradient's slope with the plateaus of differences: central ones, and to both sides."""
@@ -325,34 +334,29 @@ class _Line:
             return Judgement(Kind.FAILED, self.exact)
         if not np.isfinite(self.exact):
             return Judgement(Kind.NAN, self.exact)
-        noise = self._noise()
-        ahead, behind = self.walked - self.loss
-        with np.errstate(invalid="ignore"):
-            halves, error = (ahead - behind) / (2 * self.steps), noise / self.steps
-            central = self._plateau(zip(self.steps, halves, error, strict=True))
-            front = self._plateau(zip(self.steps, ahead / self.steps, 2 * error, strict=True))
-            back = self._plateau(zip(self.steps, -behind / self.steps, 2 * error, strict=True))
-        change = np.fmax(np.abs(ahead), np.abs(behind))
-        moves = bool(np.nanmax(change) > max(NOISE_MARGIN * noise, self.rounding))
-        kind, slope = self._compare(central, front, back, change, noise)
+        (ahead, behind), error = self.rises, self.noise / self.steps
+        central = self._plateau(zip(self.steps, self.central, error, strict=True))
+        front = self._plateau(zip(self.steps, ahead / self.steps, 2 * error, strict=True))
+        back = self._plateau(zip(self.steps, -behind / self.steps, 2 * error, strict=True))
+        moves = bool(np.nanmax(self.change) > max(NOISE_MARGIN * self.noise, self.rounding))
+        kind, slope = self._compare(central, front, back)
         if kind == Kind.WRONG and slope is not None:
-            kind = self._doubt(slope, change, noise)
+            kind = self._doubt(slope)
         limit = np.nan
-        if slope is not None and max(abs(slope.value), abs(self.exact)) > 0:
-            limit = self._margin(slope) / max(abs(slope.value), abs(self.exact))
-        return Judgement(kind, self.exact, slope, back, front, moves, limit, noise)
+        if slope is not None and (size := max(abs(slope.value), abs(self.exact))) > 0:
+            limit = self._margin(slope) / size
+        return Judgement(kind, self.exact, slope, back, front, moves, limit, self.noise)
 
-    def _noise(self) -> float:
-        """Return the noise of losses at this line.
+    @cached_property
+    def noise(self) -> float:
+        """The noise of losses at this line.
 
         It is what is usual, or half of the second difference over the smallest step; or the first change, where losses
         do not change at all over smaller steps, as those of rounded numbers do.
         """
-        ahead, behind = self.walked - self.loss
-        change = np.fmax(np.abs(ahead), np.abs(behind))
-        moved = np.flatnonzero(change > 0)
+        moved = np.flatnonzero(self.change > 0)
         first = int(moved[0]) if len(moved) else 0
-        grain = float(change[first]) if first and self._is_grain(change) else 0.0
+        grain = float(self.change[first]) if first and self._is_grain() else 0.0
         return max(self.usual, self._unevenness(), grain, self.rounding)
 
     def _unevenness(self) -> float:
@@ -360,44 +364,42 @@ class _Line:
         found = float(_unexplained(self.steps, self.walked, self.loss))
         return found if np.isfinite(found) else 0.0
 
-    def _is_grain(self, change: NDArray[np.float64]) -> bool:
+    def _is_grain(self) -> bool:
         """Say whether the first change along a line is that of rounded losses or points, not a step of its own."""
-        moved = np.flatnonzero(change > 0)
+        moved = np.flatnonzero(self.change > 0)
         if not len(moved):
             return False
         first = int(moved[0])
-        return bool(self.steps[first] <= SMALL_GRAIN or change[first] <= ROUNDED_BY * self.eps * abs(self.loss))
+        return bool(self.steps[first] <= SMALL_GRAIN or self.change[first] <= ROUNDED_BY * self.eps * abs(self.loss))
 
-    def _doubt(self, slope: Slope, change: NDArray[np.float64], noise: float) -> Kind:
+    def _doubt(self, slope: Slope) -> Kind:
         """Return what a gradient is that a plateau contradicts: wrong, unless something speaks against the plateau."""
-        if not self._holds(slope, noise):
+        if not self._holds(slope):
             return Kind.STEEP if abs(self.exact) > BEYOND * abs(slope.value) else Kind.NOISE
         if slope.step > LONGEST_STEP:
             return Kind.NOISE
-        return Kind.AGREES if self._agrees_beyond(slope, change) else Kind.WRONG
+        return Kind.AGREES if self._agrees_beyond(slope) else Kind.WRONG
 
-    def _agrees_beyond(self, slope: Slope, change: NDArray[np.float64]) -> bool:
+    def _agrees_beyond(self, slope: Slope) -> bool:
         """Say whether the gradient is the slope over longer steps, and lacks less below than any solver tolerates.
 
         Time steps that a solver adapts make losses uneven there.
         """
-        ahead, behind = self.walked - self.loss
+        ahead, behind = self.rises
         with np.errstate(invalid="ignore"):
-            near = np.abs((ahead - behind) / (2 * self.steps) - self.exact) <= self.relative * abs(self.exact)
+            near = np.abs(self.central - self.exact) <= TOLERANCE * abs(self.exact)
             off = np.fmax(np.abs(ahead - self.exact * self.steps), np.abs(behind + self.exact * self.steps))
         longer = np.flatnonzero(near & (self.steps > slope.step))
         if len(longer) < LONGER_STEPS:
             return False
-        return bool(off[: longer[0]].max() <= TOLERATED * max(abs(self.loss), float(np.nanmax(change))))
+        return bool(off[: longer[0]].max() <= TOLERATED * max(abs(self.loss), float(np.nanmax(self.change))))
 
-    def _holds(self, slope: Slope, noise: float) -> bool:
+    def _holds(self, slope: Slope) -> bool:
         """Say whether differences over steps that are smaller than a plateau's are those of it, within their noise."""
         smaller = self.steps < slope.step
-        ahead, behind = self.walked[:, smaller] - self.loss
-        steps = self.steps[smaller]
-        central = (ahead - behind) / (2 * steps)
+        (ahead, behind), steps, central = self.rises[:, smaller], self.steps[smaller], self.central[smaller]
         found = np.where(np.isfinite(central), central, np.where(np.isfinite(ahead), ahead, -behind) / steps)
-        allowed = 2 * (2 * noise / steps + slope.error) + PLATEAU * abs(slope.value)
+        allowed = 2 * (2 * self.noise / steps + slope.error) + PLATEAU * abs(slope.value)
         return bool((np.abs(found - slope.value) <= allowed).all())
 
     def _plateau(self, found: Iterator[tuple[float, float, float]]) -> Slope | None:
@@ -422,27 +424,20 @@ class _Line:
 
     def _margin(self, slope: Slope) -> float:
         size = max(abs(slope.value), abs(self.exact))
-        return 2 * slope.error + self.relative * size + self.allowed
+        return 2 * slope.error + TOLERANCE * size + self.allowed
 
     def _agrees(self, slope: Slope | None) -> bool:
         return slope is not None and abs(slope.value - self.exact) <= self._margin(slope)
 
-    def _compare(
-        self,
-        central: Slope | None,
-        front: Slope | None,
-        back: Slope | None,
-        change: NDArray[np.float64],
-        noise: float,
-    ) -> tuple[Kind, Slope | None]:
-        first = float(change[0])
-        if self.exact == 0 and first == 0 and not self._is_grain(change):
+    def _compare(self, central: Slope | None, front: Slope | None, back: Slope | None) -> tuple[Kind, Slope | None]:
+        first, noise = float(self.change[0]), self.noise
+        if self.exact == 0 and first == 0 and not self._is_grain():
             return Kind.ZERO, central
         if self._agrees(central):
             return Kind.AGREES, central
-        if kind := self._one_sided(front, back, first, noise):
+        if kind := self._one_sided(front, back):
             return kind, central
-        if np.nanmax(change) <= NOISE_MARGIN * noise and abs(self.exact) * self.steps[-1] <= NOISE_MARGIN * noise:
+        if np.nanmax(self.change) <= NOISE_MARGIN * noise and abs(self.exact) * self.steps[-1] <= NOISE_MARGIN * noise:
             return Kind.FLAT, central
         sides = [one for one in (front, back) if one is not None]
         found = central or (min(sides, key=lambda one: one.error) if sides else None)
@@ -453,9 +448,10 @@ class _Line:
             return (Kind.FLAT if flat else Kind.NOISE), None
         return Kind.WRONG, found
 
-    def _one_sided(self, front: Slope | None, back: Slope | None, first: float, noise: float) -> Kind | None:
+    def _one_sided(self, front: Slope | None, back: Slope | None) -> Kind | None:
         """Return what a line is whose gradient is the slope to one side, or between both."""
-        jumps = first > BEYOND * (noise if np.isfinite(noise) else 0.0) + BEYOND * abs(self.exact) * self.steps[0]
+        noise = self.noise if np.isfinite(self.noise) else 0.0
+        jumps = self.change[0] > BEYOND * noise + BEYOND * abs(self.exact) * self.steps[0]
         if front is not None and back is not None:
             low, high = sorted((front, back), key=lambda one: one.value)
             apart = high.value - low.value > low.error + high.error
@@ -468,7 +464,7 @@ class _Line:
 
     def _is_rough(self) -> bool:
         """Say whether losses change unevenly over the smallest step, in which the gradient foresees more."""
-        change, next_ = np.fmax(*np.abs(self.walked - self.loss)), min(1, len(self.steps) - 1)
+        change, next_ = self.change, min(1, len(self.steps) - 1)
         saturated = (
             change[0] > SATURATED * np.nanmax(change) and abs(self.exact) * self.steps[0] > SATURATED * change[0]
         )

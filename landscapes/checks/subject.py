@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from ..objective import Evaluation, Objective, evaluate
@@ -92,10 +92,6 @@ class Subject:
     def evaluate(self, x: Float[Tensor, "batch dim"]) -> Evaluation:
         """Return losses and gradients at other points, held against the protocol."""
         return evaluate(self.objective, x, grad=True)
-
-    def rows(self, rows: Int[Tensor, " some"]) -> Evaluation:
-        """Return the evaluation of some of the points."""
-        return self.first.rows(rows)
 
     def differences(self, found: Evaluation, wanted: Evaluation) -> tuple[float, float]:
         """Return the largest differences between losses and between gradients, as shares."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import gc
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from typing import Any
@@ -18,8 +19,9 @@ from ..sampling.memory import ADVICE, is_out_of_memory
 from . import examination, extremes, growth
 from . import parameters as by_parameter
 from .causes import causes
-from .conclude import Calls, Further, conclude, conclude_jumps, conclude_memory, conclude_physics
+from .conclude import Further, conclude, conclude_jumps, conclude_memory, conclude_physics
 from .diagnosis import Diagnosis
+from .evidence import Evidence
 from .examination import Examination, examine, percent
 from .extremes import ExtremeCase
 from .finding import FAIL, PASS, SKIP, UNEXPECTED, WARN, Finding, one_line, skip, verdict, within
@@ -27,7 +29,6 @@ from .history import observe
 from .horizons import FirstWrong, first_wrong_step
 from .memory import memory_growth
 from .physics import compare_time_steps
-from .places import describe
 from .probe import Lines, Probe
 from .slopes import BAD, UNJUDGED, Kind, counts, measure
 from .subject import Subject, difference
@@ -49,10 +50,10 @@ LEAST_SHARE = 0.25  # share of slopes to compare for a step to be judged by
 
 @dataclass(eq=False)
 class Results:
-    """What `check` gathers besides findings, once it is done: what was measured, and what is concluded."""
+    """What `check` gathers besides findings, once it is done: what was measured, also of calls, and is concluded."""
 
     examination: Examination | None = None
-    calls: Calls = dataclasses.field(default_factory=Calls)
+    calls: Evidence = dataclasses.field(default_factory=dict)
     diagnoses: tuple[Diagnosis, ...] = ()
     usefulness: tuple[Usefulness, ...] = ()
 
@@ -107,7 +108,9 @@ def check(objective: Objective, settings: Settings | None = None, results: Resul
     shapes = _try("shapes", lambda: _check_shapes(objective, x))
     yield shapes.excuse(how.expected)
     if shapes.outcome == FAIL:
-        results.diagnoses = _of_error(shapes)
+        if "writes to what it has read" in shapes.why or "modified by an inplace operation" in shapes.why:
+            (cause,) = [one for one in causes() if one.name == "tape overwritten"]
+            results.diagnoses = (Diagnosis(cause.name, FAIL, "certain", shapes.why, cause.remedy),)
         yield Finding("all else", SKIP, "not checked", "evaluations of the wrong form can be judged no further")
         return
     how.follow("repeats")
@@ -126,14 +129,6 @@ def check(objective: Objective, settings: Settings | None = None, results: Resul
         yield _try(name, run).excuse(how.expected)
     for name in left:
         yield Finding(name, UNEXPECTED, "not checked", "a failure is expected of it, but there is no such check")
-
-
-def _of_error(finding: Finding) -> tuple[Diagnosis, ...]:
-    """Return what an error says of its cause: an array that was overwritten."""
-    if "writes to what it has read" not in finding.why and "modified by an inplace operation" not in finding.why:
-        return ()
-    (cause,) = [one for one in causes() if one.name == "tape overwritten"]
-    return (Diagnosis(cause.name, FAIL, "certain", finding.why, cause.remedy),)
 
 
 def episodes(dim: int, power: float, horizons: Sequence[float] = ()) -> tuple[int, int]:
@@ -161,16 +156,6 @@ def _other(
     return cache(observe_twin)
 
 
-def _usable(other: Callable[[], Subject] | None) -> Callable[[], Subject] | None:
-    """Return what evaluates the twin, None where it refuses to be evaluated: kernels written for one precision."""
-    if other is not None:
-        try:
-            other()
-        except ValueError:
-            return None
-    return other
-
-
 def _give_back(made: Sequence[Objective]) -> None:
     """Give back the memory of a device that environments hold between evaluations: another one takes all there is."""
     if any(one.device != "cpu" for one in made):
@@ -184,15 +169,18 @@ def _checks(
 ) -> Iterator[tuple[str, Callable[[], Finding]]]:
     other = _other(subject, how.twin, made)
     for name, run in PROMISES.items():
-        yield name, partial(_keep_promise, name, run, subject, results)
+        yield name, partial(_keep_promise, run, subject, results)
     yield "order of calls", partial(_check_calls, subject, results)
-    other = _usable(other)
+    if other is not None:
+        try:
+            other()
+        except ValueError:  # kernels written for one precision
+            other = None
     exact = other if subject.precision == "float32" else None
     best = exact or (lambda: subject)
     yield "gradient", lambda: _check_gradient(best(), how, results)
-    yield "special places", partial(_check_places, results)
-    yield "parameters", partial(_check_parameters, results)
-    yield "usefulness", partial(_check_usefulness, results)
+    for name, judge in JUDGED.items():
+        yield name, partial(_of_gradient, judge, results)
     yield "shorter time steps", partial(_check_time_steps, how, results)
     yield "memory", partial(_check_memory, subject, how.memory_seconds, results)
     yield "second backward", lambda: _check_second_backward(subject, results)
@@ -201,22 +189,21 @@ def _checks(
     yield from extremes.checks(subject, other, how.variants)
 
 
-def _keep_promise(name: str, run: Callable[[Subject], Finding], subject: Subject, results: Results) -> Finding:
-    """Make a check of calls, and remember its name where it fails: it tells causes."""
+def _keep_promise(run: Callable[[Subject], Finding], subject: Subject, results: Results) -> Finding:
     found = run(subject)
-    if found.outcome == FAIL:
-        results.calls = replace(results.calls, broken=(*results.calls.broken, name))
+    if run is _check_loss_without_gradient:  # which tells a cause
+        results.calls["depends"] = float(found.outcome == FAIL)
     return found
 
 
 def _check_calls(subject: Subject, results: Results) -> Finding:
     """Call the same points in several orders: what an evaluation gives depends on no other."""
     seen = observe(subject.objective, subject.x)
-    results.calls = replace(results.calls, history=seen)
-    limits = subject.repeatable
-    figure = f"losses {seen.loss:.1e} and gradients {seen.gradient:.1e} of themselves apart"
-    ok = seen.loss <= limits[0] and seen.gradient <= limits[1] and not (seen.stale or seen.grows)
-    return verdict(ok, "same bits" if max(seen.loss, seen.gradient) == 0 else figure, "an evaluation remembers others")
+    results.calls |= seen
+    loss, gradient, limits = seen["loss_moves"], seen["gradient_moves"], subject.repeatable
+    figure = f"losses {loss:.1e} and gradients {gradient:.1e} of themselves apart"
+    ok = loss <= limits[0] and gradient <= limits[1] and not (seen["stale"] or seen["grows"])
+    return verdict(ok, "same bits" if max(loss, gradient) == 0 else figure, "an evaluation remembers others")
 
 
 def _check_gradient(subject: Subject, how: Settings, results: Results) -> Finding:
@@ -246,7 +233,7 @@ def _judge_gradient(seen: Examination, results: Results) -> Finding:
     }
     failing = [one.what for one in results.diagnoses if one.outcome == FAIL]
     on_average = any(one.outcome == FAIL and {*ON_AVERAGE} & {*one.numbers} for one in results.diagnoses)
-    if share.wrong or on_average or any(one.kind == Kind.WRONG for one in seen.axes.ladder.judged):
+    if share.wrong or on_average or seen.axes.rows(Kind.WRONG):
         figure = f"wrong at {share.describe()}: {told}" if share.wrong else f"{share.points} points: {told}"
         return Finding("", FAIL, figure, "; ".join(failing), numbers, seen.table())
     if counted[Kind.FAILED] == share.points:
@@ -294,7 +281,7 @@ def _is_wrong(seen: Examination, rows: Sequence[int], objective: Objective) -> b
     lines = seen.random.lines.rows(chosen)
     found = probe.gradient(lines.u)
     ladder = measure(probe, Lines.through(probe, lines.u, lines.direction, torch.arange(len(rows)), found))
-    return any(one.kind in BAD for one in ladder.judged)
+    return bool(ladder.rows(*BAD))
 
 
 def _check_time_steps(how: Settings, results: Results) -> Finding:
@@ -322,29 +309,25 @@ def _check_memory(subject: Subject, seconds: float, results: Results) -> Finding
     return Finding("", WARN if found else PASS, figure, found[0].what if found else "")
 
 
-def _check_places(results: Results) -> Finding:
+def _of_gradient(judge: Callable[[Examination, Results], Finding], results: Results) -> Finding:
     seen = results.examination
-    if seen is None or seen.found.grad is None:
-        return skip("no gradient")
+    return skip("no gradient") if seen is None or seen.found.grad is None else judge(seen, results)
+
+
+def _check_places(seen: Examination, results: Results) -> Finding:
     names, ladder = seen.places
     places = ", ".join(dict.fromkeys(names))
-    bad = [row for row, one in enumerate(ladder.judged) if one.kind in BAD]
+    bad = ladder.rows(*BAD)
     if not bad:
         told = sum(one.kind not in UNJUDGED for one in ladder.judged)
         return verdict(True, f"{told} slopes at {places}: between those to either side") if told else skip(places)
-    said = []
-    for row in bad:
-        axis = int(ladder.lines.direction[row].abs().argmax())
-        said.append(describe(names[row], ladder.judged[row], seen.names[axis], float(ladder.lines.loss[row])))
+    said = (seen.describe_place(row) for row in bad)
     figure = f"{len(bad)} of {len(ladder.judged)} slopes at {places} are wrong"
     numbers: dict[str, float | None] = {"wrong": float(len(bad)), "compared": float(len(ladder.judged))}
     return Finding("", FAIL, figure, "; ".join(list(dict.fromkeys(said))[:SAID_PLACES]), numbers)
 
 
-def _check_parameters(results: Results) -> Finding:
-    seen = results.examination
-    if seen is None or seen.found.grad is None:
-        return skip("no gradient")
+def _check_parameters(seen: Examination, results: Results) -> Finding:
     rows = seen.parameters()
     verdicts = [row.verdict for row in rows]
     figure = ", ".join(f"{verdicts.count(one)} {one}" for one in dict.fromkeys(verdicts))
@@ -358,11 +341,8 @@ def _check_parameters(results: Results) -> Finding:
     return verdict(True, figure)
 
 
-def _check_usefulness(results: Results) -> Finding:
+def _check_usefulness(seen: Examination, results: Results) -> Finding:
     """Say how far a gradient holds: useless over an optimiser's step is the landscape's fault, and a warning."""
-    seen = results.examination
-    if seen is None or seen.found.grad is None:
-        return skip("no gradient")
     results.usefulness = usefulness(seen.probe, seen.random)
     if not any(one.outcome == FAIL for one in results.diagnoses):
         results.diagnoses += conclude_jumps(results.usefulness)
@@ -385,11 +365,14 @@ def _check_usefulness(results: Results) -> Finding:
     return Finding("", PASS if useful else WARN, figure, "" if useful else why, numbers)
 
 
+JUDGED = {"special places": _check_places, "parameters": _check_parameters, "usefulness": _check_usefulness}
+
+
 def _check_second_backward(subject: Subject, results: Results) -> Finding:
     found = growth.second_backward(subject)
     if found.outcome == FAIL and results.examination is not None and not results.diagnoses:
-        calls = replace(results.calls, second_backward=1.0)
-        results.diagnoses = conclude(results.examination, calls)
+        results.calls["second_backward"] = 1.0
+        results.diagnoses = conclude(results.examination, results.calls)
     return found
 
 
@@ -458,17 +441,14 @@ def _check_status(subject: Subject) -> Finding:
 def _check_refusal_of_shapes(subject: Subject) -> Finding:
     x, dim = subject.x, subject.objective.space.dim
     shapes = {"(2, dim + 1)": x.new_zeros(2, dim + 1), "(dim,)": x[0], "(1, 1, dim)": x[None, :1]}
-    taken = [shape for shape, wrong in shapes.items() if not _refuses(subject.objective, wrong)]
+    taken = list(shapes)
+    for shape, wrong in shapes.items():
+        with suppress(ValueError):
+            subject.objective.evaluate(wrong)
+            continue
+        taken.remove(shape)
     why = f"ValueError is wanted; x of shape {' and '.join(taken)} was taken"
     return verdict(not taken, f"{len(shapes) - len(taken)} of {len(shapes)} shapes refused", why)
-
-
-def _refuses(objective: Objective, x: Tensor) -> bool:
-    try:
-        objective.evaluate(x)
-    except ValueError:
-        return True
-    return False
 
 
 def _check_refusal_of_nan(subject: Subject) -> Finding:
@@ -479,7 +459,7 @@ def _check_refusal_of_nan(subject: Subject) -> Finding:
         found = evaluate(subject.objective, x, grad=True)
     except ValueError:
         return verdict(True, "refused")
-    others = subject.rows(torch.arange(1, len(x)))
+    others = subject.first.rows(torch.arange(1, len(x)))
     clean = subject.agree(found.rows(slice(1, None)), others)
     status = Status(int(found.status[0]))
     why = "the other rows changed with it" if not clean else f"a row of nan was given a loss and status {status.name}"
@@ -510,7 +490,7 @@ def _check_order_of_rows(subject: Subject) -> Finding:
 
 
 def _compare(subject: Subject, found: Evaluation, rows: Tensor) -> Finding:
-    apart = subject.differences(found, subject.rows(rows))
+    apart = subject.differences(found, subject.first.rows(rows))
     limits = subject.tolerances
     figure = "same bits" if max(apart) == 0 else f"loss {apart[0]:.1e} of its range, gradient {apart[1]:.1e} apart"
     why = f"at most {limits[0]:.0e} and {limits[1]:.0e} is wanted: a row depends on the rows it is evaluated with"

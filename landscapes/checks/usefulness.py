@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -81,18 +82,24 @@ def _at(
 
 
 def _cosine(a: NDArray[np.float64], d: NDArray[np.float64]) -> Estimate:
-    """Return the cosine of gradients' slopes with differences over all lines, with its interval by resampling lines."""
+    """Return the cosine of gradients' slopes with differences over all lines, with its interval."""
     if len(a) < 2 or not (a.any() and d.any()):
         return UNKNOWN
-    drawn = np.random.default_rng(0).integers(len(a), size=(RESAMPLED, len(a)))
-    values = [_cosine_of(a[rows], d[rows]) for rows in (np.arange(len(a)), *drawn)]
-    low, high = np.nanquantile(values, CONFIDENT)
-    return Estimate(values[0], float(low), float(high))
+    return _resampled(
+        lambda a, d: float(a @ d) / size if (size := np.linalg.norm(a) * np.linalg.norm(d)) else np.nan, a, d
+    )
 
 
-def _cosine_of(a: NDArray[np.float64], d: NDArray[np.float64]) -> float:
-    size = float(np.linalg.norm(a) * np.linalg.norm(d))
-    return float(a @ d) / size if size > 0 else np.nan
+def _resampled(
+    of: Callable[[NDArray[np.float64], NDArray[np.float64]], float], *values: NDArray[np.float64]
+) -> Estimate:
+    """Return a number of values over lines, with its interval by resampling lines."""
+    lines = len(values[0])
+    drawn = np.random.default_rng(0).integers(lines, size=(RESAMPLED, lines))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        found = [of(*(one[rows] for one in values)) for rows in (np.arange(lines), *drawn)]
+    low, high = np.nanquantile(found, CONFIDENT)
+    return Estimate(float(found[0]), float(low), float(high))
 
 
 def _bias(probe: Probe, lines: Lines, step: float, slope: NDArray[np.float64], seen: NDArray[np.bool_]) -> Estimate:
@@ -121,10 +128,4 @@ def _lacking(mean: NDArray[np.float64], wanted: NDArray[np.float64]) -> Estimate
     mean, wanted = mean[known], wanted[known]
     if len(mean) < MEANS or not wanted.any():
         return UNKNOWN
-    drawn = np.random.default_rng(0).integers(len(mean), size=(RESAMPLED, len(mean)))
-    with np.errstate(invalid="ignore", divide="ignore"):
-        values = [
-            1 - (mean[rows] @ wanted[rows]) / (wanted[rows] @ wanted[rows]) for rows in (np.arange(len(mean)), *drawn)
-        ]
-    low, high = np.nanquantile(values, CONFIDENT)
-    return Estimate(float(values[0]), float(low), float(high))
+    return _resampled(lambda mean, wanted: 1 - (mean @ wanted) / (wanted @ wanted), mean, wanted)

@@ -12,7 +12,6 @@ import time
 from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, Future, wait
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import chain, islice
 from typing import Any, TypeVar
 
@@ -69,17 +68,14 @@ class PortableObjective:
 
     def __reduce__(self) -> tuple[Any, ...]:
         try:
-            recipe = self.recipe or cloudpickle.dumps(self.made or partial(_itself, self.objective.objective))
+            itself = self.objective.objective
+            recipe = self.recipe or cloudpickle.dumps(self.made or (lambda: itself))
         except Exception as error:  # whatever part of it cannot travel
             raise ValueError(
                 f"{self.objective.name} cannot be sent to another process ({error}); give sample made=, a function "
                 "that makes it there"
             ) from error
         return PortableObjective, (None, None, recipe)
-
-
-def _itself(objective: Objective) -> Objective:
-    return objective
 
 
 _objectives: dict[bytes, MemoryBound] = {}
@@ -214,29 +210,18 @@ def _evaluate(
 
 
 def _fill(
-    sent: PortableObjective,
-    tiling: Tiling,
-    tiles: Sequence[Tile],
-    batch: int,
-    pending: Collection[Tile],
+    sent: PortableObjective, tiling: Tiling, tiles: Sequence[Tile], batch: int, pending: Collection[Tile]
 ) -> Iterator[FilledTile]:
-    objective = sent.objective
-    for tile, found in evaluate_tiles(objective, tiling, tiles, batch, set(pending)):
+    """Evaluate the points of those tiles that are pending, in order; a point without gradient has one of NaN."""
+    objective, pending = sent.objective, set(pending)
+    kinds = [Batches(objective, tiling, tiles, batch, pending, grad).evaluations() for grad in (True, False)]
+    for tile, having, lacking in zip([tile for tile in tiles if tile in pending], *kinds, strict=True):
+        found = _merge(having, lacking, torch.from_numpy(tiling.sloped(tile)), tiling)
         yield FilledTile(tile, found, objective.take_notes())
 
 
 def _fill_there(*task: Any) -> list[FilledTile]:
     return list(_fill(*task))
-
-
-def evaluate_tiles(
-    objective: Objective, tiling: Tiling, tiles: Sequence[Tile], batch: int, pending: Collection[Tile]
-) -> Iterator[tuple[Tile, Evaluation]]:
-    """Evaluate the points of those tiles that are pending, in order; a point without gradient has one of NaN."""
-    kinds = [Batches(objective, tiling, tiles, batch, pending, grad).evaluations() for grad in (True, False)]
-    left = [tile for tile in tiles if tile in pending]
-    for tile, having, lacking in zip(left, *kinds, strict=True):
-        yield tile, _merge(having, lacking, torch.from_numpy(tiling.sloped(tile)), tiling)
 
 
 def _merge(having: Evaluation, lacking: Evaluation, sloped: Tensor, tiling: Tiling) -> Evaluation:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Executor
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
@@ -17,7 +17,6 @@ from ..identity import check_identity, record_parameters, with_stride
 from ..objective import Objective, Status
 from ..plane import Plane
 from ..space import as_stride, as_whole
-from ..storage.arrays import Tile
 from ..storage.files import full, is_full
 from ..storage.store import SliceStore
 from .distribution import PortableObjective, WorkersLostError, fill_tiles
@@ -79,7 +78,7 @@ def sample(
         about = describe(objective)
         about["identity"] = with_stride(about["identity"], gradients)
         store = SliceStore.in_memory(plane, objective.space, **about, grad=gradients > 0)
-    _check_store(store, objective, plane, grad=gradients > 0)
+    check_store(store, objective, plane, grad=gradients > 0)
     store.verify(objective)
     batch = as_whole(objective.preferred_batch if batch is None else batch, "sample's batch", least=1)
     status, pending = store.status(), store.pending()
@@ -88,7 +87,8 @@ def sample(
     left = Counter(tile.level for tile in pending)  # tiles, by level
     all_levels = 1 + store.tiles()[-1].level
     levels = min(left, default=all_levels)
-    _warn_of_damage(store, pending)
+    for tile in store.damaged_tiles(pending):
+        warnings.warn(f"{store.place}: tile {tile.index} is damaged and computed again", RuntimeWarning, stacklevel=2)
 
     def report() -> None:
         nonlocal levels
@@ -121,9 +121,11 @@ def describe(objective: Objective) -> dict[str, dict[str, Any]]:
     return {"identity": objective.identity(), "provenance": {"loss_unit": objective.loss_unit}}
 
 
-def _warn_of_damage(store: SliceStore, pending: Sequence[Tile]) -> None:
-    for tile in store.damaged_tiles(pending):
-        warnings.warn(f"{store.place}: tile {tile.index} is damaged and computed again", RuntimeWarning, stacklevel=3)
+def check_store(store: SliceStore, objective: Objective, plane: Plane, *, grad: bool | None = None) -> None:
+    """Raise StoreMismatchError where a store is of another plane or parameters, or lacks gradients or has some."""
+    wanted: dict[str, Any] = {"plane": plane.record(), **record_parameters(objective.space)}
+    wanted |= {} if grad is None else {"gradients": grad}
+    check_identity(store.path, wanted=wanted, found={name: store.identity[name] for name in wanted})
 
 
 @contextmanager
@@ -141,8 +143,3 @@ def resumable(store: SliceStore, counts: Counter[Status]) -> Iterator[None]:
         if is_full(error):
             raise full(error, kept) from error
         raise
-
-
-def _check_store(store: SliceStore, objective: Objective, plane: Plane, *, grad: bool) -> None:
-    wanted = {"plane": plane.record(), **record_parameters(objective.space), "gradients": grad}
-    check_identity(store.path, wanted=wanted, found={name: store.identity[name] for name in wanted})

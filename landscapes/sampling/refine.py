@@ -23,14 +23,14 @@ import torch
 import xarray as xr
 from numpy.typing import NDArray
 
-from ..identity import DamagedError, check_identity, record_parameters
+from ..identity import DamagedError
 from ..objective import Objective, Status, evaluate
 from ..plane import Plane
 from ..storage.arrays import POINTS
 from ..storage.checkpoint import Checkpoint
 from ..storage.store import SliceStore
 from .distribution import evaluator, workers_of
-from .fill import Progress, resumable
+from .fill import Progress, check_store, resumable
 from .quadtree import Places, Quadtree, Values, coarsest_lattice
 
 REFINED = "refinement"  # the attribute of a slice that says how it was refined
@@ -138,8 +138,7 @@ def refine(
     Raises StoreMismatchError where the store was made by other settings, ValueError for a budget that does not cover
     the coarsest lattice, DamagedError where a finished one is damaged, and what `sample` does.
     """
-    wanted = {"plane": plane.record(), **record_parameters(objective.space)}
-    check_identity(store.path, wanted=wanted, found={name: store.identity[name] for name in wanted})
+    check_store(store, objective, plane)
     refinement.check(plane)
     if store.ascending:
         if store.path is not None and store.pending():
@@ -199,27 +198,24 @@ class _Samples:
         return empty.assign({name: empty[name].copy(data=values[str(name)]) for name in empty.data_vars})
 
 
+@dataclass(eq=False)
 class Refining:
     """A refinement under way: `tree` holds what is sampled, and interpolates the rest."""
 
-    def __init__(
-        self,
-        objective: Objective,
-        batch: int,
-        plane: Plane,
-        store: SliceStore,
-        refinement: Refinement,
-        progress: Callable[[Progress], None] | None,
-        seed: int,
-    ) -> None:
-        self.batch, self.counts = batch, Counter[Status]()
-        self.objective, self.plane, self.store, self.refinement = objective, plane, store, refinement
-        self.progress, self.seed = progress, seed
-        self.tree, self.samples = Quadtree(store.shape), _Samples(store.shape, plane.dim)
-        self.axes = plane.axes()
+    objective: Objective
+    batch: int
+    plane: Plane
+    store: SliceStore
+    refinement: Refinement
+    progress: Callable[[Progress], None] | None
+    seed: int
+
+    def __post_init__(self) -> None:
+        self.counts, self.axes = Counter[Status](), self.plane.axes()
+        self.tree, self.samples = Quadtree(self.store.shape), _Samples(self.store.shape, self.plane.dim)
         self.errors, self.tests, self.resumed = np.zeros(0), 0, 0
-        if store.parts is not None:
-            self.samples.load(store.parts)
+        if self.store.parts is not None:
+            self.samples.load(self.store.parts)
             self.resumed = int(self.samples.sampled.sum())
 
     def go(self) -> None:

@@ -64,7 +64,7 @@ def need_of(shape: tuple[int, ...], dim: int, *, grad: bool) -> Need:
     there are the files of the tiles, and for a moment the finished slice next to them.
     """
     points, depth = math.prod(shape), dim if grad else 0
-    tiles = math.prod(-(-side // tile_side(side)) for side in shape)
+    tiles = math.prod(chunk_counts(shape, list(map(tile_side, shape))))
     array = points * (9 + 8 * depth)
     return Need(4.0 * (8 * points + array) + DRAWN * points, 2.0 * array + tiles * (2 + grad) * BLOCK)
 
@@ -118,15 +118,12 @@ def write_finished(path: Path, dataset: xr.Dataset) -> None:
     group.attrs.update({**dataset.attrs, **COORDINATES})
     samples = dataset["loss"].shape
     for name, values in dataset.variables.items():
-        dims = tuple(map(str, values.dims))
-        if values.dtype.kind in "fi" and dims != (name,):
-            chunks = analysis_chunks(samples, *values.shape[len(samples) :])
-            array = create_array(
-                group, str(name), values.shape, chunks, dims, values.dtype.name, codecs=COMPACT_CODECS, **values.attrs
-            )
-            array[...] = values.to_numpy()
-        else:
-            _keep(group, str(name), values.to_numpy(), dims, values.attrs)
+        dims, number = tuple(map(str, values.dims)), values.dtype.kind in "fi"
+        large = number and dims != (name,)
+        chunks = analysis_chunks(samples, *values.shape[len(samples) :]) if large else values.shape
+        kind, codecs = (values.dtype.name, COMPACT_CODECS) if number else ("string", CODECS)
+        array = create_array(group, str(name), values.shape, chunks, dims, kind, codecs=codecs, **values.attrs)
+        array[...] = values.to_numpy() if number else values.to_numpy().astype(object)
     write_sums(group, dataset.drop_vars(INTERPOLATED, errors="ignore"))
     consolidate(group.store)
     with ZipFile(path, "w") as archive:
@@ -150,16 +147,6 @@ def _axis(plane: Plane, number: int) -> dict[str, str]:
     about = {"label": plane.labels[number], "long_name": plane.names[number]}
     about |= {"scale": LOG10} if plane.scales[number] == LOG10 else {}
     return about | ({"units": plane.units[number]} if plane.units[number] else {})
-
-
-def _keep(
-    group: zarr.Group, name: str, values: NDArray[Any], dims: tuple[str, ...], attributes: Mapping[str, Any]
-) -> None:
-    """Write a small array whole."""
-    number = values.dtype.kind in "fi"
-    kind, codecs = (values.dtype.name, COMPACT_CODECS) if number else ("string", CODECS)
-    array = create_array(group, name, values.shape, values.shape, dims, kind, codecs=codecs, **attributes)
-    array[...] = values if number else values.astype(object)
 
 
 def _about(identity: Mapping[str, Any], provenance: Mapping[str, Any]) -> dict[str, Any]:
@@ -286,8 +273,10 @@ class Tiling:
 
     def tiles(self) -> list[Tile]:
         """Return every tile, coarse to fine."""
-        counts = (math.ceil(points / side) for points, side in zip(self.shape, self.sides, strict=True))
-        return sorted(map(Tile, np.ndindex(*counts)), key=lambda tile: (tile.level, sum(tile.index), tile.index))
+        return sorted(
+            map(Tile, np.ndindex(*chunk_counts(self.shape, self.sides))),
+            key=lambda tile: (tile.level, sum(tile.index), tile.index),
+        )
 
     def rows(self, tile: Tile) -> list[NDArray[np.intp]]:
         """Return the places of a tile's samples along each axis."""
@@ -311,6 +300,15 @@ class Tiling:
         pairs = zip(self.plane.axes()[::-1], self.rows(tile), strict=True)
         grid = np.meshgrid(*(axis.numpy()[rows] for axis, rows in pairs), indexing="ij")[::-1]
         return self.plane.lift(torch.from_numpy(np.stack([axis.ravel() for axis in grid], axis=1)))
+
+
+def chunk_counts(shape: Sequence[int], sides: Sequence[int]) -> tuple[int, ...]:
+    """Return how many chunks of these sides are along each axis."""
+    return tuple(-(-points // side) for points, side in zip(shape, sides, strict=True))
+
+
+def _box(index: tuple[int, ...], sides: Sequence[int]) -> tuple[slice, ...]:
+    return tuple(slice(at * side, (at + 1) * side) for at, side in zip(index, sides, strict=True))
 
 
 def tile_side(points: int) -> int:
@@ -372,7 +370,7 @@ class Chunks:
 
     @cached_property
     def _sums(self) -> zarr.Array[Any] | None:
-        counts = tuple(math.ceil(points / side) for points, side in zip(self._shape, self.sides, strict=True))
+        counts = chunk_counts(self._shape, self.sides)
         return self._all[SUMS] if SUMS in self._all and self._all[SUMS].shape == counts else None
 
     @classmethod
@@ -404,15 +402,11 @@ class Chunks:
     def read(self, tile: Tile) -> Arrays | None:
         """Return the samples of a chunk, None where they are not what was written."""
         try:
-            values = {name: np.asarray(array[self._box(tile)]) for name, array in self._arrays.items()}
+            values = {name: np.asarray(array[_box(tile.index, self.sides)]) for name, array in self._arrays.items()}
             known = None if self._sums is None else int(np.asarray(self._sums[tile.index]))
         except Exception:  # a damaged chunk raises whatever its codec does
             return None
         return values if known is None or known == tile_sum(tile.index, values) else None
-
-    def _box(self, tile: Tile) -> tuple[slice, ...]:
-        parts = zip(tile.index, self.sides, self._shape, strict=True)
-        return tuple(slice(at * side, min((at + 1) * side, points)) for at, side, points in parts)
 
 
 def _read_blank(path: Path, group: zarr.Group) -> xr.Dataset:
@@ -453,11 +447,11 @@ def write_sums(group: zarr.Group, dataset: xr.Dataset) -> None:
     """Write the checksum of every chunk of a finished slice."""
     samples, names = dataset["loss"].shape, [str(name) for name in dataset["loss"].dims]
     sides = analysis_chunks(samples)
-    tiles = tuple(math.ceil(points / side) for points, side in zip(samples, sides, strict=True))
+    tiles = chunk_counts(samples, sides)
     sums = np.zeros(tiles, dtype=np.int64)
     for index in np.ndindex(*tiles):
-        place = tuple(slice(at * side, (at + 1) * side) for at, side in zip(index, sides, strict=True))
-        sums[index] = tile_sum(index, {str(name): one.to_numpy()[place] for name, one in dataset.items()})
+        values = {str(name): one.to_numpy()[_box(index, sides)] for name, one in dataset.items()}
+        sums[index] = tile_sum(index, values)
     said = "checksum (CRC-32, plus one) of a tile's place, gradient, loss and status"
     dims = tuple(f"{name}_tile" for name in names)
     create_array(group, SUMS, tiles, tiles, dims, "int64", long_name=said)[...] = sums
@@ -468,25 +462,24 @@ ANEW = "restore it, or sample the slice again in another folder"
 
 def check_layouts(path: Path) -> None:
     """Raise DamagedError, naming the file, where how an array is stored is not readable or not what the index says."""
+    at = path
     try:
         with _files(path) as read:
-            _check_layouts(path, read)
+            at = path / ROOT
+            root = _object(read(ROOT))
+            index = root.get("consolidated_metadata", {"metadata": {}})  # copies that xarray wrote may have none
+            known = index.get("metadata") if isinstance(index, dict) else None
+            if not isinstance(known, dict) or not (known or "consolidated_metadata" not in root):
+                raise damage(path, "the index of its arrays is not what it was made")
+            for name in known or [name for name in (*SAMPLES, *AXES, "dim", "unit") if (path / name).is_dir()]:
+                at = path / name / ROOT
+                layout = _object(read(f"{name}/{ROOT}"))
+                if layout.get("node_type") != "array" or known.get(name, layout) != layout:
+                    raise damage(path / name, "its layout is not what the store's index says")
     except DamagedError:
         raise
     except Exception as error:  # a damaged zip raises anything
-        raise damage(path, str(error)) from None
-
-
-def _check_layouts(path: Path, read: Callable[[str], bytes]) -> None:
-    root = _layout(path, "", read)
-    index = root.get("consolidated_metadata", {"metadata": {}})  # copies that xarray wrote may have none
-    known = index.get("metadata") if isinstance(index, dict) else None
-    if not isinstance(known, dict) or not (known or "consolidated_metadata" not in root):
-        raise damage(path, "the index of its arrays is not what it was made")
-    for name in known or [name for name in (*SAMPLES, *AXES, "dim", "unit") if (path / name).is_dir()]:
-        layout = _layout(path, name, read)
-        if layout.get("node_type") != "array" or known.get(name, layout) != layout:
-            raise damage(path / name, "its layout is not what the store's index says")
+        raise damage(at, str(error)) from None
 
 
 def check_axes(path: Path, group: zarr.Group, axes: Mapping[str, NDArray[Any]], values: Sequence[str]) -> None:
@@ -540,14 +533,6 @@ def is_torn(archive: Path) -> bool:
         return not isinstance(read_layout(archive)["attributes"], dict)
     except Exception:  # a damaged zip raises anything
         return not begins or FIRST_BYTES.match(begins) is not None
-
-
-def _layout(store: Path, name: str, read: Callable[[str], bytes]) -> dict[str, Any]:
-    """Return the layout of an array in a store, or without a name that of the store."""
-    try:
-        return _object(read(f"{name}/{ROOT}" if name else ROOT))
-    except Exception as error:  # a damaged zip raises anything
-        raise damage(store / name / ROOT, str(error)) from None
 
 
 def damage(path: Path, why: str) -> DamagedError:

@@ -64,6 +64,5 @@ def test_what_a_slice_takes_grows_with_its_points_and_its_gradients() -> None:
     assert plain.disk < sloped.disk < larger.disk
 
 
-@pytest.mark.parametrize(("count", "said"), [(10, "0 kB"), (2.5e6, "2 MB"), (3e9, "3.0 GB"), (4e12, "4.0 TB")])
-def test_bytes_are_said_in_words(count: float, said: str) -> None:
-    assert capacity.size(count) == said
+def test_bytes_are_said_in_words() -> None:
+    assert [capacity.size(count) for count in (10, 2.5e6, 3e9, 4e12)] == ["0 kB", "2 MB", "3.0 GB", "4.0 TB"]

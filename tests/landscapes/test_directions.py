@@ -62,12 +62,9 @@ def test_barrier_of_a_double_well():
     assert np.isnan(barrier(u.numpy(), np.where(u.numpy() > 0.5, np.nan, loss.numpy())))
 
 
-@pytest.mark.parametrize(
-    ("text", "names"),
-    [("a.npy:b.npy", ["a.npy", "b.npy"]), ("center:example:aim:random:2", ["center", "example:aim", "random:2"])],
-)
-def test_points_take_their_own_colons(text, names):
-    assert points_in(text) == names
+def test_points_take_their_own_colons():
+    assert points_in("a.npy:b.npy") == ["a.npy", "b.npy"]
+    assert points_in("center:example:aim:random:2") == ["center", "example:aim", "random:2"]
 
 
 def test_refusals():

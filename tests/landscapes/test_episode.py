@@ -19,12 +19,9 @@ def test_an_episode_shows_its_key_frames_in_a_notebook_without_pyplot() -> None:
     assert plt.get_fignums() == []
 
 
-def test_an_episode_without_parts_says_so() -> None:
+def test_an_episode_without_a_view_is_seen_whole_and_without_parts_says_so() -> None:
     with pytest.raises(ValueError, match="give Episode its `parts`"):
         Episode(EPISODE.time, EPISODE.points).show()
-
-
-def test_an_episode_without_a_view_is_seen_whole() -> None:
     view, every = EPISODE.viewpoint(), AT.reshape(-1, 3).numpy()
     assert (np.array(view.lower) < every.min(axis=0)).all()
     assert (np.array(view.upper) > every.max(axis=0)).all()

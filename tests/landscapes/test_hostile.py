@@ -46,15 +46,12 @@ class Own(Objective):
         return self.answer(x)
 
 
-def answered(status: Any, factor: Any = 1) -> Callable[[], Any]:
-    def answer(x: Any) -> Evaluation:
-        return Evaluation(x[:, 0] * factor, torch.zeros_like(x), torch.full((len(x),), status))
-
-    return lambda: sample(Own(answer), PLANE)
-
-
 def sampled(answer: Callable[[Any], Any]) -> Callable[[], Any]:
     return lambda: sample(Own(answer), PLANE)
+
+
+def answered(status: Any, factor: Any = 1) -> Callable[[], Any]:
+    return sampled(lambda x: Evaluation(x[:, 0] * factor, torch.zeros_like(x), torch.full((len(x),), status)))
 
 
 def differing(**how: Any) -> Callable[[], Any]:
@@ -93,10 +90,7 @@ REFUSED: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "masked points": (lambda: BOWL.evaluate(MASKED), "bowl takes numbers; got an array that masks some"),
     "masked bounds": (lambda: ParameterSpace(["a", "b"], MASKED[0], [9, 9]), "lower takes numbers; .* masks some"),
-    "status 257": (answered(257), "a status is one of 0 MISSING, 1 OK, .*; got 257"),
-    "status -1": (answered(-1), "a status is one of .*; got -1"),
-    "status 1.5": (answered(1.5), "a status is one of .*; got 1.5"),
-    "status 7": (answered(7), "a status is one of .*; got 7"),
+    **{f"status {n}": (answered(n), f"a status is one of 0 MISSING, 1 OK, .*; got {n}") for n in (257, -1, 1.5, 7)},
     "no status yet": (answered(0), "own must say how every point ended"),
     "failures coded 257": (lambda: Evaluation.from_results(X[:, 0], None, torch.full((4,), 257)), "got 257"),
     "a tuple": (sampled(lambda x: (x[:, 0], x, 1)), r"own._evaluate must return an Evaluation; got tuple"),
@@ -214,15 +208,12 @@ def test_arrays_of_every_kind_are_numbers(kind: str) -> None:
         assert float(difference.abs().max()) < 1e-12, number
 
 
-def test_bounds_stay_what_they_were() -> None:
+def test_bounds_stay_what_they_were_and_a_status_is_kept_as_it_is_said() -> None:
     """What becomes of an array afterwards is no concern of a space made of it: bounds were infinite that way."""
     lower = torch.tensor([0.0, 0.0], dtype=torch.float64)
     space = ParameterSpace(["a", "b"], lower, [1, 1])
     lower[0] = -INF
     assert space.lower.tolist() == [0, 0]
-
-
-def test_a_status_is_kept_as_it_is_said() -> None:
     codes = [Status.OK, Status.NONFINITE, Status.ESCAPED, Status.ERROR]
     for dtype in (torch.int8, torch.int64, torch.float64):
         found = Evaluation.from_results(X[:, 0], X, torch.tensor(codes, dtype=dtype))

@@ -97,16 +97,15 @@ def test_another_release_goes_on_and_its_version_is_kept_as_provenance(branin, t
     assert gs.slice(branin, **how).data["loss"].identical(first.data["loss"])
 
 
-def test_another_model_is_refused_by_both_versions(branin, tmp_path, monkeypatch):
+def test_another_model_is_refused_by_both_versions_and_another_setting_beside_it_is_named(
+    branin, tmp_path, monkeypatch
+):
     how = {"dims": (0, 1), "resolution": 5, "out": tmp_path / "cut"}
     gs.slice(branin, **how)
     monkeypatch.setattr(Branin, "model_version", 2)
     said = r"was made by branin model 1; this is model 2\. Use --out, or --force to replace it\."
     with pytest.raises(StoreMismatchError, match=said):
         gs.slice(gs.make("branin"), **how)
-
-
-def test_another_setting_beside_another_model_is_named():
     with pytest.raises(StoreMismatchError, match=r"model_version: wanted 2, found 1; seed: wanted 5, found 0"):
         check_identity(None, wanted={**NOW, "model_version": 2, "seed": 5}, found=NOW)
 

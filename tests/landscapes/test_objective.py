@@ -122,18 +122,9 @@ def test_evaluations_of_several_batches_are_joined_in_order():
         assert torch.equal(getattr(joined, name).nan_to_num(-1.0), getattr(whole, name).nan_to_num(-1.0))
     assert joined.rows(slice(1, 3)).status.tolist() == whole.status.tolist()[1:]
     assert Evaluation.join(parts, dim=3, grad=False).grad is None
-    nothing = Evaluation.join([], dim=3, grad=True)
-    assert nothing.grad.shape == (0, 3)
-    blind = evaluate(Strict(), x, grad=False)
+    assert Evaluation.join([], dim=3, grad=True).grad.shape == (0, 3)
     with pytest.raises(ValueError, match="1 of 3 evaluations to join have no gradients"):
-        Evaluation.join([*parts, blind], dim=3, grad=True)
-
-
-def test_the_first_name_of_raw_results_still_works() -> None:
-    loss = torch.tensor([1.0, torch.nan])
-    torch.testing.assert_close(
-        Evaluation.judged(loss, None).loss, Evaluation.from_results(loss, None).loss, equal_nan=True
-    )
+        Evaluation.join([*parts, evaluate(Strict(), x, grad=False)], dim=3, grad=True)
 
 
 def test_a_loss_without_a_gradient_is_kept():
@@ -149,7 +140,7 @@ def test_a_loss_without_a_gradient_is_kept():
     assert found.has_loss.tolist() == [True, True, False, False, True, False]
     assert found.has_gradient.tolist() == [True, *[False] * 5]
     assert found.failed.tolist() == (~found.has_loss).tolist()
-    alone = Evaluation.from_results(loss, None, found.status)
+    alone = Evaluation.judged(loss, None, found.status)  # by its first name
     assert alone.status.tolist()[:2] == [Status.OK] * 2
     assert not alone.has_gradient.any()
 
@@ -175,8 +166,7 @@ def test_the_message_of_the_first_point_that_raised_stays_with_its_points():
 
     class Raises(Strict):
         def evaluate(self, x: torch.Tensor, *, grad: bool = True) -> Evaluation:
-            loss = torch.zeros(len(x), dtype=torch.float64)
-            return Evaluation.from_results(loss, None, torch.full((len(x),), Status.ERROR), "RuntimeError: no")
+            return part(Status.ERROR, "RuntimeError: no").rows(slice(1, 1 + len(x)))
 
     inside = torch.stack([SPACE.center, SPACE.upper + 1.0])
     assert evaluate(Raises(), inside, grad=False).error == "RuntimeError: no"

@@ -85,20 +85,13 @@ def test_descents_are_found_by_their_gradients_even_when_they_alternate():
     np.testing.assert_array_equal(laid["previous"], [-1, -1, *range(10)])
 
 
-def test_a_descent_that_overshoots_is_one_zigzag():
+def test_a_descent_that_overshoots_or_follows_the_border_is_one_and_none_is_without_gradients():
     (laid,) = overlay(SLICE, [run(descent([0.9, -0.8, 0.3], step=0.9), [2] * 6)])
     np.testing.assert_array_equal(laid["previous"], [-1, 0, 1, 2, 3, 4])  # not the nearest point on the same line
-
-
-def test_a_descent_along_the_border_is_one_descent():
-    z = np.array([[0.9, 0.2, 0.1], [1.0, 0.1, 0.05], [1.0, 0.05, 0.025]])
-    table = run(z, [2, 2, 2])
+    table = run(np.array([[0.9, 0.2, 0.1], [1.0, 0.1, 0.05], [1.0, 0.05, 0.025]]), [2, 2, 2])
     table["grad"].values[:] = np.array([-0.4, 2 * 0.1, 0.1]) * [1, 1, 1] / HALF  # pushes against the border
     table["grad"].values[1] *= 0.5
     np.testing.assert_array_equal(overlay(SLICE, [table])[0]["previous"], [-1, 0, 1])
-
-
-def test_points_without_gradients_are_no_descents():
     (laid,) = overlay(SLICE, [run(descent([0.9, -0.8, 0.3]), [1] * 6, grad=False)])
     assert (laid["previous"] == -1).all()
 

@@ -25,7 +25,7 @@ from gradscape.landscapes.storage.store import open_slice
 from ...clock import Clock
 from ...processes import FORK
 from . import waves
-from .waves import PLANE, SPACE, same, store_at, wave
+from .waves import PLANE, SPACE, Counted, same, store_at, wave
 
 for module in (sys.modules[__name__], waves):
     cloudpickle.register_pickle_by_value(module)  # workers need not find the tests
@@ -131,15 +131,13 @@ def test_an_error_in_a_worker_comes_back_and_what_was_done_is_kept(tmp_path, alo
     assert same(store, alone)
 
 
-class Broken(Objective):
+class Broken(Counted):
     """A wave whose evaluation ends in a corner, and not as a status of a point."""
 
-    space = SPACE
-
-    def evaluate(self, x: torch.Tensor, *, grad: bool = True) -> Evaluation:
+    def answer(self, x: torch.Tensor, *, grad: bool) -> Evaluation:
         if bool((x > 1.9).any()):
             raise RuntimeError("broken cable")
-        return from_torch(wave, SPACE).evaluate(x, grad=grad)
+        return super().answer(x, grad=grad)
 
 
 class Slow(Executor):

@@ -2,6 +2,7 @@
 
 import errno
 import os
+import re
 import warnings
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from gradscape.envs.engines.sheets import springs
 from gradscape.envs.registry import make
 from gradscape.landscapes.cost import seconds_per_episode
 from gradscape.landscapes.identity import StoreError
-from gradscape.landscapes.objective import Evaluation, Objective, Status
+from gradscape.landscapes.objective import Status
 from gradscape.landscapes.plane import Plane
 from gradscape.landscapes.sampling.fill import sample
 from gradscape.landscapes.sampling.memory import MemoryBound, is_out_of_memory
@@ -24,7 +25,7 @@ from gradscape.studies.stability import ask, is_stable
 
 from ...processes import FORK
 from ..storage.stores import break_chunk
-from .waves import PLANE, SPACE, same, store_at, wave
+from .waves import PLANE, SPACE, Counted, same, store_at, wave
 
 MESSAGES = [
     "CUDA out of memory. Tried to allocate 2.00 GiB",
@@ -34,20 +35,11 @@ MESSAGES = [
 ]
 
 
-class Small(Objective):
-    """A device with memory for so many points, the wave's."""
-
-    space, name, device = SPACE, "wave", "cpu"
-
-    def __init__(self, room: int, error: Exception) -> None:
-        self.room, self.error = room, error
-        self.asked: list[int] = []
-
-    def evaluate(self, x: torch.Tensor, *, grad: bool = True) -> Evaluation:
-        self.asked.append(len(x))
-        if len(x) > self.room:
-            raise self.error
-        return from_torch(wave, SPACE).evaluate(x, grad=grad)
+def small(room: int, error: Exception) -> Counted:
+    """Return a wave on a device with memory for so many points."""
+    found = Counted(room=room, error=error)
+    found.name, found.device = "wave", "cpu"
+    return found
 
 
 @pytest.fixture
@@ -63,16 +55,16 @@ def whole():
 
 @pytest.mark.parametrize("error", [*map(RuntimeError, MESSAGES), torch.OutOfMemoryError("x"), MemoryError()])
 def test_a_batch_that_does_not_fit_is_halved_with_a_warning_and_the_same_bits(whole, error):
-    small = Small(20, error)
+    device = small(20, error)
     with pytest.warns(RuntimeWarning, match="wave ran out of memory at") as said:
-        dataset = sample(small, PLANE, batch=60)
+        dataset = sample(device, PLANE, batch=60)
     assert same(dataset, whole)
     assert [str(one.message).split(" at ")[1] for one in said] == [
         "64 points; going on with 32",
         "32 points; going on with 16",
     ]
-    assert small.asked[:3] == [64, 32, 16]
-    assert max(small.asked[2:]) == 16  # learnt
+    assert device.sizes[:3] == [64, 32, 16]
+    assert max(device.sizes[2:]) == 16  # learnt
 
 
 def test_a_solver_that_does_not_fit_is_made_smaller(monkeypatch):
@@ -101,63 +93,54 @@ def test_a_solver_that_does_not_fit_is_made_smaller(monkeypatch):
 
 def test_memory_for_no_point_at_all_ends_it_and_other_errors_pass():
     with pytest.raises(MemoryError, match=r"wave ran out of memory at a single point: .*--fidelity"):
-        MemoryBound(Small(0, RuntimeError(MESSAGES[0]))).evaluate(SPACE.uniform(3, seed=0))
+        MemoryBound(small(0, RuntimeError(MESSAGES[0]))).evaluate(SPACE.uniform(3, seed=0))
     with pytest.raises(RuntimeError, match="broken cable"):
-        MemoryBound(Small(0, RuntimeError("broken cable"))).evaluate(SPACE.uniform(3, seed=0))
+        MemoryBound(small(0, RuntimeError("broken cable"))).evaluate(SPACE.uniform(3, seed=0))
     assert not is_out_of_memory(RuntimeError("the ball is out of the memory foam"))
 
 
 def test_memory_that_runs_out_says_nothing_of_a_setting():
     points = SPACE.uniform(16, seed=0)
-    small = Small(4, RuntimeError(MESSAGES[1]))
-    assert is_stable(ask(small, points))
-    assert small.asked[:3] == [16, 8, 4]
-    found = ask(Small(0, RuntimeError(MESSAGES[1])), points)
+    device = small(4, RuntimeError(MESSAGES[1]))
+    assert is_stable(ask(device, points))
+    assert device.sizes[:3] == [16, 8, 4]
+    found = ask(small(0, RuntimeError(MESSAGES[1])), points)
     assert "wave ran out of memory at a single point" in found.refused
     assert len(found.status) == 0
-    broken = ask(Small(0, RuntimeError("broken cable")), points)
+    broken = ask(small(0, RuntimeError("broken cable")), points)
     assert (broken.refused, broken.error) == ("", "RuntimeError: broken cable")
     assert (broken.status == Status.ERROR).all()
 
 
 def test_what_an_episode_costs_is_measured_with_the_memory_that_is_there():
-    small = Small(4, RuntimeError(MESSAGES[1]))
-    small.device = "cuda"
-    assert seconds_per_episode(small, SPACE.uniform(16, seed=0), grad=True) > 0
-    assert small.asked[:3] == [16, 8, 4]
+    device = small(4, RuntimeError(MESSAGES[1]))
+    device.device = "cuda"
+    assert seconds_per_episode(device, SPACE.uniform(16, seed=0), grad=True) > 0
+    assert device.sizes[:3] == [16, 8, 4]
     with pytest.raises(MemoryError, match="wave ran out of memory at a single point"):
-        seconds_per_episode(Small(0, RuntimeError(MESSAGES[1])), SPACE.uniform(16, seed=0), grad=True)
+        seconds_per_episode(small(0, RuntimeError(MESSAGES[1])), SPACE.uniform(16, seed=0), grad=True)
 
 
-@pytest.mark.parametrize("damage", ["truncated", "altered", "empty"])
-def test_a_damaged_tile_is_named_and_computed_again(tmp_path, kept, whole, damage):
-    path = tmp_path / "s.zarr"
+@pytest.mark.parametrize("damage", ["truncated", "altered", "empty", "removed", "finished"])
+def test_a_damaged_tile_is_named_and_computed_again_and_one_that_never_was_is_none(tmp_path, whole, damage, request):
+    path, device = tmp_path / "s.zarr", small(1000, MemoryError())
+    if damage != "finished":
+        request.getfixturevalue("kept")
     sample(from_torch(wave, SPACE), PLANE, store_at(path))
-    file = filling_path(path) / "pieces/2-3.npz"
-    sound, small = file.read_bytes(), Small(1000, MemoryError())
-    torn = {"truncated": sound[: len(sound) // 2], "altered": sound.replace(b"NUMPY", b"numpy", 1), "empty": b""}
-    file.write_bytes(torn[damage])
-    with pytest.warns(RuntimeWarning, match=r"s\.filling: tile \(2, 3\) is damaged and computed again") as said:
-        assert same(sample(small, PLANE, store_at(path)), whole)
-    assert len(said) == 1
-    assert small.asked == [POINTS, 16]  # those that are verified first
-
-
-def test_a_tile_that_was_never_finished_is_no_damage(tmp_path, kept, whole):
-    path = tmp_path / "s.zarr"
-    sample(from_torch(wave, SPACE), PLANE, store_at(path))
-    (filling_path(path) / "pieces/2-3.npz").unlink()
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert same(sample(from_torch(wave, SPACE), PLANE, store_at(path)), whole)
-
-
-def test_a_damaged_finished_slice_is_named_and_computed_again(tmp_path, whole):
-    path = tmp_path / "s.zarr"
-    sample(from_torch(wave, SPACE), PLANE, store_at(path))
-    break_chunk(path, "loss/c/0/0")
-    with pytest.warns(RuntimeWarning, match=r"tile \(0, 0\) is damaged and computed again"):
-        assert same(sample(from_torch(wave, SPACE), PLANE, store_at(path)), whole)
+    if damage == "finished":
+        break_chunk(path, "loss/c/0/0")
+    else:
+        file = filling_path(path) / "pieces/2-3.npz"
+        sound = file.read_bytes()
+        torn = {"truncated": sound[: len(sound) // 2], "altered": sound.replace(b"NUMPY", b"numpy", 1), "empty": b""}
+        file.unlink() if damage == "removed" else file.write_bytes(torn[damage])
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always", RuntimeWarning)
+        assert same(sample(device, PLANE, store_at(path)), whole)
+    place = r"s\.zarr\.zip: tile \(0, 0\)" if damage == "finished" else r"s\.filling: tile \(2, 3\)"
+    assert len(said) == (damage != "removed")
+    assert all(re.search(f"{place} is damaged and computed again", str(one.message)) for one in said)
+    assert device.sizes == ([288] if damage == "finished" else [POINTS, 16])  # those that are verified first
 
 
 def test_a_damaged_axis_is_said_with_what_to_do(tmp_path):
@@ -185,9 +168,9 @@ def test_a_full_disk_ends_it_with_what_is_kept_and_the_slice_goes_on(tmp_path, w
     assert ended.value.errno == code
     monkeypatch.undo()
     assert not list(tmp_path.rglob("*.partial"))
-    small = Small(1000, MemoryError())
-    assert same(sample(small, PLANE, store_at(tmp_path / "s.zarr")), whole)
-    assert sum(small.asked) == 288 - 80 + POINTS
+    device = small(1000, MemoryError())
+    assert same(sample(device, PLANE, store_at(tmp_path / "s.zarr")), whole)
+    assert sum(device.sizes) == 288 - 80 + POINTS
 
 
 def _fill(path: Path, barrier) -> None:

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gradscape.landscapes.identity import StoreError
-from gradscape.landscapes.objective import Evaluation, Objective, Status
+from gradscape.landscapes.objective import Evaluation, Status
 from gradscape.landscapes.plane import Plane
 from gradscape.landscapes.sampling.fill import sample
 from gradscape.landscapes.storage.paths import archive_path
@@ -19,29 +19,15 @@ from gradscape.landscapes.storage.store import SliceStore
 from gradscape.landscapes.verification import POINTS
 
 from ...processes import Instant, alone
-from .waves import PLANE, SPACE, same, store_at
+from .waves import PLANE, SPACE, Counted, same, store_at
 
 SAID = "RuntimeError: too much work"
 
 
-class Wave(Objective):
-    """A smooth wave that escapes in one corner and raises in another, and has no gradients in the middle.
+class Wave(Counted):
+    """A smooth wave that escapes in one corner and raises in another, and has no gradients in the middle."""
 
-    It counts what it is asked.
-    """
-
-    space = SPACE
-
-    def __init__(self, *, stop_after: int | None = None):
-        self.asked: list[tuple[float, ...]] = []
-        self.batches: list[int] = []
-        self.stop_after = stop_after
-
-    def evaluate(self, x: torch.Tensor, *, grad: bool = True) -> Evaluation:
-        if self.stop_after is not None and len(self.asked) >= self.stop_after:
-            raise KeyboardInterrupt
-        self.asked += map(tuple, x.tolist())
-        self.batches.append(len(x))
+    def answer(self, x: torch.Tensor, *, grad: bool) -> Evaluation:
         loss = (3 * x).sin().prod(dim=1) + x.exp().sum(dim=1)
         loss[(x > 1).all(dim=1)] = torch.nan
         failed = torch.where((x[:, 0] < -1) & (x[:, 2] < -1), Status.ESCAPED, Status.OK)
@@ -116,7 +102,7 @@ def test_sigkill_at_any_instant_changes_no_bit(tmp_path):
         objective = Wave()
         resumed = sample(objective, PLANE, store_at(path))
         verified = len(pending) < len(left.tiles())
-        assert len(objective.batches) == verified + len(pending)
+        assert len(objective.sizes) == verified + len(pending)
         xr.testing.assert_equal(resumed, whole)
         assert same(resumed, whole)
         assert resumed.attrs["error"] == SliceStore.open(path).dataset().attrs["error"] == SAID
@@ -146,55 +132,61 @@ def test_progress_counts_up_by_status_and_announces_each_finer_picture(tmp_path)
 
 
 def test_batches_are_as_large_as_the_objective_prefers():
-    objective = Wave()
-    objective.preferred_batch = 60
+    objective = Wave(batch=60)
     sample(objective, PLANE)
-    assert all(size >= 60 for size in objective.batches[:-1])
-    assert sum(objective.batches) == 288
+    assert all(size >= 60 for size in objective.sizes[:-1])
+    assert sum(objective.sizes) == 288
 
 
 def test_without_gradients_none_is_asked_for_and_none_stored(tmp_path):
-    class Blind(Wave):
-        def evaluate(self, x, *, grad=True):
-            assert not grad
-            return super().evaluate(x, grad=grad)
-
-    assert "grad" not in sample(Blind(), PLANE, store_at(tmp_path / "s.zarr", grad=False), gradients=0)
+    objective = Wave()
+    assert "grad" not in sample(objective, PLANE, store_at(tmp_path / "s.zarr", grad=False), gradients=0)
+    assert objective.count(True) == 0
+    other = Plane.through(SPACE, SPACE.center, ["x", "y"], resolution=16)
+    with pytest.raises(StoreError, match=r"plane\.basis"):
+        sample(Wave(), other, store_at(tmp_path / "t.zarr"))
     with pytest.raises(StoreError, match="gradients: wanted True, found False"):
         sample(Wave(), PLANE, store_at(tmp_path / "s.zarr", grad=False))
 
 
-def test_another_plane_than_the_stores_is_refused(tmp_path):
-    other = Plane.through(SPACE, SPACE.center, ["x", "y"], resolution=16)
-    with pytest.raises(StoreError, match=r"plane\.basis"):
-        sample(Wave(), other, store_at(tmp_path / "s.zarr"))
+class Bent(Wave):
+    """A wave whose answer is changed."""
+
+    def __init__(self, change):
+        super().__init__()
+        self.change = change
+
+    def answer(self, x, *, grad):
+        return self.change(super().answer(x, grad=grad))
 
 
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (lambda e: Evaluation(e.loss[:-1], e.grad, e.status), r"bent must return loss of shape \(16,\).*got \(15,\)"),
+        (
+            lambda e: Evaluation(e.loss[:-1], e.grad, e.status),
+            r"counted must return loss of shape \(16,\).*got \(15,\)",
+        ),
         (lambda e: Evaluation(e.loss, e.grad[:, :2], e.status), r"grad of shape \(16, 3\).*got \(16, 2\)"),
         (lambda e: Evaluation(e.loss, None, e.status), "asked for gradients and returned none"),
         (lambda e: Evaluation(e.loss, e.grad, 0 * e.status), "got status MISSING"),
+        (lambda e: Evaluation(e.loss, e.grad, 0 * e.status + Status.INTERPOLATED), "got status INTERPOLATED"),
     ],
 )
 def test_an_objective_that_breaks_the_protocol_is_named(change, said):
-    class Bent(Wave):
-        def evaluate(self, x, *, grad=True):
-            return change(super().evaluate(x, grad=grad))
-
     with pytest.raises(ValueError, match=said):
-        sample(Bent(), PLANE)
+        sample(Bent(change), PLANE)
 
 
 def test_a_silent_nan_becomes_a_status():
-    class Silent(Wave):
-        def evaluate(self, x, *, grad=True):
-            gradient = torch.zeros_like(x)
-            gradient[0, 1] = torch.inf
-            return Evaluation(x[:, 0], gradient, torch.full((len(x),), Status.OK))
+    def silent(found):
+        first = torch.arange(len(found.loss))[:, None] == 0
+        return Evaluation(
+            0 * found.status.double(),
+            torch.where(first, torch.inf, 0.0 * found.grad.nan_to_num()),
+            0 * found.status + 1,
+        )
 
-    dataset = sample(Silent(), PLANE)
+    dataset = sample(Bent(silent), PLANE)
     assert (dataset["status"] == Status.NO_GRADIENT).sum() == len(SliceStore.in_memory(PLANE, SPACE).tiles())
     assert not dataset["loss"].isnull().any()

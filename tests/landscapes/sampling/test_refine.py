@@ -27,6 +27,7 @@ from gradscape.landscapes.storage.paths import filling_path
 from gradscape.landscapes.storage.store import SliceStore, open_slice
 
 from ..storage.stores import break_chunk
+from .waves import Counted
 
 Function = Callable[[Tensor], Tensor]
 SPACE = ParameterSpace.box(("a", "b"), -1.0, 1.0)
@@ -150,12 +151,11 @@ def test_a_budget_is_not_exceeded_and_is_used(budget: int) -> None:
     assert sampled(finest).mean() < 0.8
 
 
-def test_a_share_and_a_budget_are_numbers_that_make_sense() -> None:
-    for share, budget in ((None, None), (0.0, None), (1.5, None), (math.nan, None)):
-        with pytest.raises(ValueError, match="a slice is refined to a share"):
-            Refinement(share, budget)
-    with pytest.raises(ValueError, match="begins with 81 points; got a budget of 80"):
-        refined(bowl, 65, None, 80)
+@pytest.mark.parametrize(("share", "budget"), [(None, None), (0.0, None), (1.5, None), (math.nan, None), (None, 80)])
+def test_a_share_and_a_budget_are_numbers_that_make_sense(share: float | None, budget: int | None) -> None:
+    said = "begins with 81 points; got a budget of 80" if budget else "a slice is refined to a share"
+    with pytest.raises(ValueError, match=said):
+        refined(bowl, 65, share, budget)
 
 
 @pytest.mark.parametrize("points", [2, 3, (2, 9), (7, 50)])
@@ -179,20 +179,22 @@ def test_failures_are_surrounded_and_not_interpolated_over() -> None:
     assert set(np.unique(everywhere["status"])) == {Status.NONFINITE, Status.INTERPOLATED}
 
 
-class Stopping(Objective):
-    """A function that is stopped at every so many points, as Ctrl-C does; it says how often it was asked what."""
+class Stopping(Counted):
+    """A function that is stopped at every so many calls, as Ctrl-C does."""
 
-    preferred_batch = 40
+    space, name = SPACE, "stopping"
 
     def __init__(self, function: Function, every: int) -> None:
-        self.inner, self.every, self.asked = from_torch(function, SPACE, name="stopping"), every, 0
-        self.space, self.name, self.seen = SPACE, "stopping", list[tuple[float, ...]]()
+        super().__init__(batch=40)
+        self.inner, self.every = from_torch(function, SPACE, name="stopping"), every
 
     def evaluate(self, x: Tensor, *, grad: bool = True) -> Evaluation:
-        self.asked += 1
-        if self.every and self.asked % self.every == 0:
+        if self.every and (len(self.sizes) + 1) % self.every == 0:
+            self.sizes.append(0)
             raise KeyboardInterrupt
-        self.seen += map(tuple, x.tolist())
+        return super().evaluate(x, grad=grad)
+
+    def answer(self, x: Tensor, *, grad: bool) -> Evaluation:
         return self.inner.evaluate(x, grad=grad)
 
 
@@ -206,32 +208,26 @@ def runs(objective: Objective, path: Path, over: Plane, **how: Any) -> Iterator[
             yield None
 
 
-def test_one_that_is_stopped_goes_on_and_has_the_same_bits(tmp_path: Path) -> None:
+def test_one_that_is_stopped_goes_on_and_has_the_same_bits_and_so_have_workers(tmp_path: Path) -> None:
     over = plane(65)
     whole = next(runs(Stopping(jumping, 0), tmp_path / "one" / "slice.zarr", over))
+    with ThreadPoolExecutor(3) as executor:
+        many = next(runs(Stopping(jumping, 0), tmp_path / "many" / "slice.zarr", over, executor=executor))
     stopping = Stopping(jumping, 3)
     ended = [one for one, _ in zip(runs(stopping, tmp_path / "two" / "slice.zarr", over), range(60), strict=False)]
     first = next(number for number, one in enumerate(ended) if one is not None)
     assert first > 3
     assert whole is not None
+    xr.testing.assert_identical(many, whole)
     xr.testing.assert_identical(ended[first], whole)
     xr.testing.assert_identical(ended[-1], whole)  # which was finished
-    assert len(stopping.seen) == len(set(stopping.seen)) == sampled(whole).sum()
+    assert len(stopping.asked) == len(set(stopping.asked)) == sampled(whole).sum()
     assert sorted(path.name for path in (tmp_path / "two").iterdir()) == ["slice.zarr.zip"]
     stored = open_slice(tmp_path / "two" / "slice.zarr")
     xr.testing.assert_equal(stored, whole)
     plain = xr.open_zarr(ZipStore(tmp_path / "two" / "slice.zarr.zip")).load()
     assert "interpolated" in plain["status"].attrs["flag_meanings"]
     assert np.isfinite(plain["loss"].fillna(plain["interpolated"])).all()
-
-
-def test_workers_sample_the_same(tmp_path: Path) -> None:
-    over = plane(65)
-    alone = next(runs(Stopping(jumping, 0), tmp_path / "one" / "slice.zarr", over))
-    with ThreadPoolExecutor(3) as executor:
-        many = next(runs(Stopping(jumping, 0), tmp_path / "two" / "slice.zarr", over, executor=executor))
-    assert alone is not None
-    xr.testing.assert_identical(many, alone)
 
 
 def test_a_damaged_piece_is_evaluated_again(tmp_path: Path) -> None:
@@ -262,7 +258,9 @@ def test_nothing_interpolated_enters_a_measure() -> None:
     stride = 64 // (lattice.sizes["u"] - 1)
     assert not (lattice["status"] == Status.INTERPOLATED).any()
     assert np.array_equal(lattice["loss"], dataset["loss"][::stride, ::stride])
-    assert np.allclose(plane_of(lattice).axes()[0], lattice["u"])
+    for one in (lattice, sampled_lattice(refined(bowl, (40, 65)))):  # of an odd grid, too
+        for name, axis in zip("uv", plane_of(one).axes(), strict=True):
+            assert np.allclose(axis, one[name])
     whole = sample(from_torch(waves, SPACE), plane(64 // stride + 1))
     measured, wanted = (Slice(one).minima() for one in (dataset, whole))
     assert np.allclose(measured.to_numpy(), wanted.to_numpy())
@@ -279,13 +277,6 @@ def test_nothing_interpolated_enters_a_measure() -> None:
     assert table["loss"][table["status"] == "interpolated"].isna().all()
 
 
-def test_every_second_sample_of_an_odd_grid_is_a_lattice() -> None:
-    dataset = refined(bowl, (40, 65))
-    lattice = sampled_lattice(dataset)
-    for name, axis in zip("uv", plane_of(lattice).axes(), strict=True):
-        assert np.allclose(axis, lattice[name])
-
-
 def test_it_says_what_it_came_to() -> None:
     dataset = refined(waves, 65)
     about = Refined.of(dataset)
@@ -295,17 +286,6 @@ def test_it_says_what_it_came_to() -> None:
     assert about.error <= 0.02
     assert about.say().startswith(f"{about.sampled} of 4225 points sampled, 95 % of the others to ")
     assert Refined.of(sample(from_torch(waves, SPACE), plane(5))) is None
-
-
-def test_an_objective_may_not_interpolate() -> None:
-    class Guessing(Objective):
-        space, name = SPACE, "guessing"
-
-        def evaluate(self, x: Tensor, *, grad: bool = True) -> Evaluation:
-            return Evaluation(x[:, 0], x if grad else None, torch.full((len(x),), int(Status.INTERPOLATED)))
-
-    with pytest.raises(ValueError, match="how every point ended; got status INTERPOLATED"):
-        sample(Guessing(), plane(3))
 
 
 def test_a_function_that_raises_says_so() -> None:

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,12 +12,12 @@ from matplotlib.quiver import Quiver
 from torch import Tensor
 
 import gradscape as gs
-from gradscape import ParameterSpace, Plane, from_torch
+from gradscape import Plane, from_torch
 from gradscape.jobs.slice import SliceJob
 from gradscape.landscapes.draw.figures.contour import arrows_along, landscape_figure
 from gradscape.landscapes.measures.gradient_quality import compare_samples
 from gradscape.landscapes.measures.undersampled import find_undersampled
-from gradscape.landscapes.objective import Evaluation, Objective, Status
+from gradscape.landscapes.objective import Evaluation, Status
 from gradscape.landscapes.sampling.distribution import equal_groups
 from gradscape.landscapes.sampling.fill import Progress, sample
 from gradscape.landscapes.storage.arrays import Tiling
@@ -26,33 +25,16 @@ from gradscape.landscapes.storage.store import SliceStore, open_slice
 from gradscape.landscapes.verification import POINTS
 
 from ...command import Said
+from .waves import SPACE, Counted, same
 
-SPACE = ParameterSpace.box(("x", "y", "z"), -2.0, 2.0, "m")
 PLANE = Plane.through(SPACE, SPACE.center, ["x", "z"], resolution=(18, 21))
 LINE = Plane.through(SPACE, SPACE.center, ["y"], resolution=30)
 
 
-class Counted(Objective):
-    """A wave that is not finite in a corner; it counts losses and gradients, and stops after so many points.
+class Torn(Counted):
+    """A wave that is not finite in a corner."""
 
-    `batches` holds the points of every call, by whether gradients were asked for.
-    """
-
-    space, name = SPACE, "counted"
-
-    def __init__(self, stop_after: int | None = None, batch: int = 1, room: int | None = None) -> None:
-        self.gradients = self.losses = 0
-        self.stop_after, self.preferred_batch, self.room = stop_after, batch, room
-        self.batches: dict[bool, list[list[tuple[float, ...]]]] = {True: [], False: []}
-
-    def evaluate(self, x: Tensor, *, grad: bool = True) -> Evaluation:
-        if self.stop_after is not None and self.losses + self.gradients >= self.stop_after:
-            raise KeyboardInterrupt
-        if grad and self.room is not None and len(x) > self.room:
-            raise MemoryError
-        self.batches[grad].append(list(map(tuple, x.tolist())))
-        self.gradients += len(x) * grad
-        self.losses += len(x) * (not grad)
+    def answer(self, x: Tensor, *, grad: bool) -> Evaluation:
         loss = (3 * x).sin().sum(dim=1)
         loss[(x > 1.5).all(dim=1)] = torch.nan
         return Evaluation.from_results(loss, 3 * (3 * x).cos() if grad else None)
@@ -71,7 +53,7 @@ def kept(dataset: xr.Dataset, every: int) -> np.ndarray:
 @pytest.mark.parametrize("plane", [PLANE, LINE], ids=["plane", "line"])
 @pytest.mark.parametrize("every", [2, 5])
 def test_gradients_are_those_of_the_whole_slice_where_they_are(plane: Plane, every: int, tmp_path: Path) -> None:
-    whole, counted = sample(Counted(), plane), Counted()
+    whole, counted = sample(Torn(), plane), Torn()
     job = SliceJob.of(counted, plane, command="", out=tmp_path / "cut", gradients=every)
     job.run()
     found = open_slice(tmp_path / "cut")
@@ -82,38 +64,21 @@ def test_gradients_are_those_of_the_whole_slice_where_they_are(plane: Plane, eve
     np.testing.assert_array_equal(found["grad"].to_numpy()[inside], whole["grad"].to_numpy()[inside])
     assert found.identical(open_slice(tmp_path / "cut"))
     with ThreadPoolExecutor(2) as threads:
-        job = SliceJob.of(Counted(), plane, command="", out=tmp_path / "threads", gradients=every, executor=threads)
+        job = SliceJob.of(Torn(), plane, command="", out=tmp_path / "threads", gradients=every, executor=threads)
         job.run()
-    apart = open_slice(tmp_path / "threads")
-    for name in ("loss", "grad", "status"):
-        np.testing.assert_array_equal(apart[name], found[name])
-
-
-def test_no_more_gradients_are_asked_for_than_are_kept() -> None:
-    counted = Counted()
-    sample(counted, PLANE, gradients=4)
-    assert counted.gradients == 5 * 6  # of 18 and 21 samples
-    assert counted.losses == 18 * 21 - counted.gradients
-
-
-@pytest.mark.parametrize("gradients", [-1, 2.5])
-def test_gradients_are_at_every_whole_number_of_samples(gradients: Any) -> None:
-    with pytest.raises(ValueError, match=f"gradients is a whole number of at least 0; got {gradients}"):
-        sample(Counted(), PLANE, gradients=gradients)
+    assert same(open_slice(tmp_path / "threads"), found)
 
 
 def test_one_that_was_stopped_goes_on_to_the_same_bits(tmp_path: Path) -> None:
-    SliceJob.of(Counted(), PLANE, command="", out=tmp_path / "whole", gradients=3).run()
+    SliceJob.of(Torn(), PLANE, command="", out=tmp_path / "whole", gradients=3).run()
     for _ in range(100):
-        job = SliceJob.of(Counted(150), PLANE, command="", out=tmp_path / "cut", gradients=3)
+        job = SliceJob.of(Torn(150), PLANE, command="", out=tmp_path / "cut", gradients=3)
         try:
             job.run()
         except KeyboardInterrupt:
             continue
         break
-    one, other = (open_slice(tmp_path / name) for name in ("whole", "cut"))
-    for name in ("loss", "grad", "status"):
-        np.testing.assert_array_equal(one[name], other[name])
+    assert same(*(open_slice(tmp_path / name) for name in ("whole", "cut")))
 
 
 SQUARE = Plane.through(SPACE, SPACE.center, ["x", "z"], resolution=64)  # its first tiles have all of the gradients
@@ -122,7 +87,7 @@ SQUARE = Plane.through(SPACE, SPACE.center, ["x", "z"], resolution=64)  # its fi
 @pytest.mark.parametrize("plane", [PLANE, SQUARE, LINE], ids=["plane", "square", "line"])
 @pytest.mark.parametrize(("every", "batch"), [(2, 24), (3, 16), (4, 33)])
 def test_batches_of_gradients_and_of_losses_are_full_but_the_last(plane: Plane, every: int, batch: int) -> None:
-    counted = Counted(batch=batch)
+    counted = Torn(batch=batch)
     found = sample(counted, plane, gradients=every)
     number = int(kept(found, every).sum())
     for grad, points in ((True, number), (False, found["loss"].size - number)):
@@ -140,10 +105,8 @@ def full_batch(plane: Plane, every: int, batch: int, *, grad: bool) -> int:
 
 
 def test_no_more_than_a_batch_of_either_kind_is_evaluated_ahead() -> None:
-    counted, ahead = Counted(batch=32), list[int]()
-    sample(
-        counted, SQUARE, gradients=3, progress=lambda now: ahead.append(counted.gradients + counted.losses - now.done)
-    )
+    counted, ahead = Torn(batch=32), list[int]()
+    sample(counted, SQUARE, gradients=3, progress=lambda now: ahead.append(len(counted.asked) - now.done))
     kinds = [full_batch(SQUARE, 3, 32, grad=grad) for grad in (True, False)]
     assert 32 < max(ahead) < sum(kinds)
     assert ahead[-1] == 0
@@ -151,17 +114,15 @@ def test_no_more_than_a_batch_of_either_kind_is_evaluated_ahead() -> None:
 
 
 def test_gradients_that_do_not_fit_into_memory_are_halved_to_the_same_bits() -> None:
-    small = Counted(batch=64, room=40)
+    small = Torn(batch=64, room=40)
     with pytest.warns(RuntimeWarning, match="counted ran out of memory at 64 points; going on with 32"):
         found = sample(small, SQUARE, gradients=3)
-    wanted = sample(Counted(), SQUARE, gradients=3)
     assert {len(one) for one in small.batches[True][:-1]} == {32}
-    for name in ("loss", "grad", "status"):
-        np.testing.assert_array_equal(found[name], wanted[name])
+    assert same(found, sample(Torn(), SQUARE, gradients=3))
 
 
 def test_a_run_that_goes_on_repeats_the_batches(tmp_path: Path) -> None:
-    whole, stopped, last = Counted(batch=32), Counted(2000, batch=32), Counted(batch=32)
+    whole, stopped, last = Torn(batch=32), Torn(2000, batch=32), Torn(batch=32)
     sample(whole, SQUARE, strided_store(tmp_path / "whole.zarr", SQUARE))
     with pytest.raises(KeyboardInterrupt):
         sample(stopped, SQUARE, strided_store(tmp_path / "cut.zarr", SQUARE))
@@ -188,28 +149,26 @@ def test_workers_get_groups_of_tiles_whose_gradients_fill_a_batch(workers: int) 
 
 
 def test_workers_ask_for_few_batches_of_gradients(tmp_path: Path) -> None:
-    counted = Counted(batch=32)
+    counted = Torn(batch=32)
     with ThreadPoolExecutor(2) as threads:
         sample(counted, SQUARE, gradients=3, executor=threads)
-    assert counted.gradients == 22 * 22
+    assert counted.count(True) == 22 * 22
     assert len(counted.batches[True]) < 2 * 22 * 22 / 32  # of tiles there are 64
 
 
 def test_a_slice_that_another_process_finishes_meanwhile_is_left_as_it_is(tmp_path: Path) -> None:
     plane = Plane.through(SPACE, SPACE.center, ["x", "z"], resolution=(600, 17))  # of three chunks once it is finished
-    path, counted = tmp_path / "s.zarr", Counted(batch=32)
+    path, counted = tmp_path / "s.zarr", Torn(batch=32)
     store = strided_store(path, plane)
 
     def finish(now: Progress) -> None:
         if now.done and not (path / "zarr.json").exists():
-            sample(Counted(), plane, strided_store(path, plane))
+            sample(Torn(), plane, strided_store(path, plane))
 
     found = sample(counted, plane, store, progress=finish)
     assert store.ascending
-    assert counted.losses + counted.gradients < plane.resolution[0] * plane.resolution[1] / 2
-    wanted = sample(Counted(), plane, gradients=3)
-    for name in ("loss", "grad", "status"):
-        np.testing.assert_array_equal(found[name], wanted[name])
+    assert len(counted.asked) < plane.resolution[0] * plane.resolution[1] / 2
+    assert same(found, sample(Torn(), plane, gradients=3))
 
 
 def strided_store(path: Path, plane: Plane = PLANE) -> SliceStore:
@@ -217,12 +176,12 @@ def strided_store(path: Path, plane: Plane = PLANE) -> SliceStore:
 
 
 def test_other_gradients_are_another_slice(tmp_path: Path) -> None:
-    job = SliceJob.of(Counted(), PLANE, command="", out=tmp_path, gradients=3)
+    job = SliceJob.of(Torn(), PLANE, command="", out=tmp_path, gradients=3)
     job.run()
     with pytest.raises(ValueError, match="gradients_every: wanted 4, found 3"):
-        SliceJob.of(Counted(), PLANE, command="", out=tmp_path, gradients=4)
+        SliceJob.of(Torn(), PLANE, command="", out=tmp_path, gradients=4)
     with pytest.raises(ValueError, match="gradients_every: wanted none, found 3"):
-        SliceJob.of(Counted(), PLANE, command="", out=tmp_path)
+        SliceJob.of(Torn(), PLANE, command="", out=tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -246,8 +205,7 @@ def test_the_command_and_the_call_make_the_same_slice(run: Callable[..., Said], 
     assert "81 episodes (gradients at every 4 samples along each axis) to compute" in done.stderr
     theirs = gs.open_slice(tmp_path / "cut")
     ours = gs.slice("branin", (0, 1), resolution=9, gradients=4, out=tmp_path / "ours")
-    for name in ("loss", "grad", "status"):
-        np.testing.assert_array_equal(theirs.data[name], ours.data[name])
+    assert same(theirs.data, ours.data)
     assert "gradients=4" in ours.provenance["command"]
 
 

@@ -22,13 +22,19 @@ def study(folder: Path, seed: int = 0, *, force: bool = False) -> Checkpoint:
     return Checkpoint.open(folder, {"seed": seed}, what="pairs", force=force)
 
 
-def test_a_part_of_another_study_is_damaged_and_computed_again(tmp_path: Path) -> None:
+def test_a_part_of_another_study_or_of_an_earlier_version_is_damaged_and_computed_again(tmp_path: Path) -> None:
     for seed in (0, 1):
         study(tmp_path / str(seed), seed).save("one", limit=np.array(0.1 / (1 + 16 * seed)))
+    pieces = tmp_path / "0/pieces"
     assert float(study(tmp_path / "0", 0).load("one")["limit"]) == 0.1  # type: ignore[index] # it is there
-    shutil.copy(tmp_path / "1/pieces/one.npz", tmp_path / "0/pieces/one.npz")
-    with pytest.warns(RuntimeWarning, match=r"one\.npz is damaged \(it is not of this study.*computed again"):
-        assert study(tmp_path / "0", 0).load("one") is None
+    shutil.copy(tmp_path / "1/pieces/one.npz", pieces)
+    np.savez(pieces / "two.npz", piece=np.array("two"), loss=np.zeros(3))  # which do not say
+    for name in ("one", "two"):
+        said = rf"{name}\.npz is damaged \(it is not of this study, or of an earlier version.*computed again"
+        with pytest.warns(RuntimeWarning, match=said):
+            assert study(tmp_path / "0", 0).load(name) is None
+    study(tmp_path / "0").verify(BOWL)  # it begins again
+    study(tmp_path / "0").verify(BOWL)
 
 
 @pytest.mark.slow
@@ -44,16 +50,6 @@ def test_a_limit_is_not_moved_by_a_piece_of_another_seed(tmp_path: Path) -> None
     with pytest.warns(RuntimeWarning, match="not of this study"):
         again = gs.study("extremes", "bounce", **how, seed=0, out=tmp_path / "0")
     assert [one.stable for one in again.limits] == [one.stable for one in found[0].limits]
-
-
-def test_parts_of_an_earlier_version_that_do_not_say_are_computed_again(tmp_path: Path) -> None:
-    study(tmp_path)
-    (tmp_path / "pieces").mkdir()
-    np.savez(tmp_path / "pieces/one.npz", piece=np.array("one"), loss=np.zeros(3))
-    with pytest.warns(RuntimeWarning, match="of an earlier version"):
-        assert study(tmp_path).load("one") is None
-    study(tmp_path).verify(BOWL)  # it begins again
-    study(tmp_path).verify(BOWL)
 
 
 def test_a_study_goes_on_with_the_same_objective_alone(tmp_path: Path) -> None:

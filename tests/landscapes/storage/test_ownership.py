@@ -121,9 +121,8 @@ def test_another_zarr_store_of_our_names_is_not_replaced(tmp_path: Path) -> None
     root.write_text('{"zarr_format": 3, "node_type": "group", "attributes": {"title": "wind"}}')
     with pytest.raises(StoreError, match="no slice store, so it is not replaced"):
         make(tmp_path / "slice.zarr", overwrite=True)
-    with pytest.raises(StoreError, match="no slice store of format") as said:
+    with pytest.raises(StoreError, match=r"no slice store of format(?!.*--force)"):
         SliceStore.open(tmp_path / "slice.zarr")
-    assert "--force" not in str(said.value)
 
 
 def test_what_somebody_put_among_the_tiles_stays_when_they_go(tmp_path: Path) -> None:
@@ -160,30 +159,25 @@ def test_a_study_with_anything_else_among_its_pieces_is_not_begun_anew(tmp_path:
     assert Checkpoint.open(tmp_path, {"seed": 1}, what="pairs", force=True).count() == 0
 
 
-@pytest.mark.parametrize("content", [b"", b"PK", None])
-def test_a_damaged_piece_is_said_and_computed_again(content: bytes | None, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("damage", "said"),
+    [
+        (lambda one, other: b"", ".+"),
+        (lambda one, other: b"PK", ".+"),
+        (lambda one, other: one[: len(one) // 2] + b"?" + one[len(one) // 2 + 1 :], ".+"),
+        (lambda one, other: other, "it is another part"),
+    ],
+)
+def test_a_damaged_piece_is_said_and_computed_again(
+    damage: Callable[[bytes, bytes], bytes], said: str, tmp_path: Path
+) -> None:
     checkpoint = Checkpoint.open(tmp_path, {"seed": 0}, what="pairs")
-    checkpoint.save("one", loss=torch.arange(99).numpy())
-    (file,) = (tmp_path / "pieces").iterdir()
-    torn = file.read_bytes()
-    file.write_bytes(torn[: len(torn) // 2] + b"?" + torn[len(torn) // 2 + 1 :] if content is None else content)
-    with pytest.warns(RuntimeWarning, match=rf"{file} is damaged \(.+\); it is computed again"):
+    for name in ("one", "two"):
+        checkpoint.save(name, loss=np.arange(99.0))
+    file, other = (tmp_path / f"pieces/{name}.npz" for name in ("one", "two"))
+    file.write_bytes(damage(file.read_bytes(), other.read_bytes()))
+    with pytest.warns(RuntimeWarning, match=rf"{file} is damaged \({said}\); it is computed again"):
         assert checkpoint.load("one") is None
-
-
-def test_pieces_in_each_others_place_are_computed_again(tmp_path: Path) -> None:
-    checkpoint = Checkpoint.open(tmp_path, {"seed": 0}, what="pairs")
-    for name in ("one", "two"):
-        checkpoint.save(name, loss=np.arange(3.0))
-    files = [tmp_path / f"pieces/{name}.npz" for name in ("one", "two")]
-    contents = [file.read_bytes() for file in files]
-    for file, content in zip(files, reversed(contents), strict=True):
-        file.write_bytes(content)
-    for name in ("one", "two"):
-        with pytest.warns(
-            RuntimeWarning, match=rf"{name}\.npz is damaged \(it is another part\); it is computed again"
-        ):
-            assert checkpoint.load(name) is None
 
 
 def test_what_a_living_process_makes_is_held_and_nobody_clears_it_away(tmp_path: Path) -> None:
@@ -244,11 +238,7 @@ def test_a_folder_that_cannot_be_put_in_its_place_leaves_the_one_that_is_there(t
         placing(tmp_path / "folder", overwrite=True, check=refuse) as new,
     ):
         new.mkdir()
-    assert (tmp_path / "folder/mine").read_text() == "precious"
-    with (
-        pytest.raises(FileNotFoundError),
-        placing(tmp_path / "folder", overwrite=True) as new,
-    ):
+    with pytest.raises(FileNotFoundError), placing(tmp_path / "folder", overwrite=True):
         pass  # nothing is made
     assert (tmp_path / "folder/mine").read_text() == "precious"
 

@@ -34,8 +34,6 @@ def test_every_value_comes_back_at_its_own_coordinates(tmp_path):
     assert dataset["loss"].dims == ("v", "u")
     assert dataset["grad"].dims == ("v", "u", "dim")
     assert dataset["grad"].dtype == dataset["loss"].dtype == np.float64
-    assert (np.diff(dataset["u"]) > 0).all()
-    assert (np.diff(dataset["v"]) > 0).all()
     u, v = np.meshgrid(dataset["u"], dataset["v"])
     wanted = evaluated(PLANE.lift(torch.from_numpy(np.stack([u.ravel(), v.ravel()], axis=1))))
     np.testing.assert_array_equal(dataset["loss"], wanted.loss.reshape(8, 10))
@@ -43,7 +41,7 @@ def test_every_value_comes_back_at_its_own_coordinates(tmp_path):
     np.testing.assert_array_equal(dataset["status"], wanted.status.reshape(8, 10))
 
 
-def test_the_file_says_what_it_holds_to_anyone_who_opens_it(tmp_path):
+def test_the_file_says_what_it_holds_to_plain_xarray(tmp_path):
     finished(tmp_path / "s.zarr")
     with xr.open_zarr(ZipStore(tmp_path / "s.zarr.zip"), chunks=None) as raw:
         assert json.loads(raw.attrs["identity"])["options"] == {"steps": 3, "tilt": [0.1, 0.2]}
@@ -54,23 +52,16 @@ def test_the_file_says_what_it_holds_to_anyone_who_opens_it(tmp_path):
         assert raw["loss"].attrs["units"] == "J"
         assert list(raw["dim"].values) == ["x", "y", "z"]
         assert list(raw["unit"].values) == ["m", "m/s", ""]
-    assert plane_of(open_slice(tmp_path / "s.zarr")).record() == PLANE.record()
-
-
-def test_plain_xarray_reads_a_finished_slice_as_we_do(tmp_path):
-    """Ascending axes: values, nearest samples and pictures are right for whoever knows nothing of us."""
-    finished(tmp_path / "s.zarr")
-    ours = open_slice(tmp_path / "s.zarr")
-    with xr.open_zarr(ZipStore(tmp_path / "s.zarr.zip"), chunks=None) as raw:
-        assert (np.diff(raw["u"]) > 0).all()
-        assert (np.diff(raw["v"]) > 0).all()
+        ours = open_slice(tmp_path / "s.zarr")
         for name in ours.variables:
             np.testing.assert_array_equal(raw[name], ours[name])
         assert raw.attrs == ours.attrs
+        assert all((np.diff(raw[axis]) > 0).all() for axis in "uv")  # so that nearest samples and pictures are right
         near = raw["loss"].sel(u=-0.5, v=0.1, method="nearest")
         assert float(near) == float(ours["loss"].sel(u=near["u"], v=near["v"]))
         raw["loss"].plot()
     plt.close("all")
+    assert plane_of(open_slice(tmp_path / "s.zarr")).record() == PLANE.record()
 
 
 def attribute_values(dataset: xr.Dataset) -> list[object]:
@@ -105,29 +96,23 @@ def test_what_xarray_writes_of_a_slice_is_a_slice(tmp_path):
         open_slice(tmp_path / "cut.zarr")
 
 
-def test_a_finished_slice_is_one_file_of_large_chunks_always_the_same(tmp_path):
+def test_a_finished_slice_is_one_file_of_large_chunks_always_the_same_and_found_by_its_folder(tmp_path):
     path = tmp_path / "slice.zarr"
     fill(make(path))
     assert [file.name for file in tmp_path.iterdir()] == ["slice.filling"]
     tiles = len(chunks(filling_path(path)))
+    assert open_slice(tmp_path).identical(open_slice(filling_path(path)))
     finished(path)
     assert [file.name for file in tmp_path.iterdir()] == ["slice.zarr.zip"]
     assert make(path).pending() == []
     assert make(path).coarse().identical(open_slice(path))
+    assert open_slice(tmp_path).identical(open_slice(path))
     content, whole = (tmp_path / "slice.zarr.zip").read_bytes(), open_slice(path)
     assert len(chunks(unpacked(path))) == 4 < tiles
     assert open_slice(path).identical(whole)  # as earlier versions left it
     shutil.rmtree(tmp_path / "slice.zarr")
     finished(path)
     assert (tmp_path / "slice.zarr.zip").read_bytes() == content
-
-
-def test_a_slice_is_found_by_its_folder_too(tmp_path):
-    fill(make(tmp_path / "slice.zarr"))
-    assert open_slice(tmp_path).identical(open_slice(tmp_path / "slice.zarr"))
-    assert open_slice(tmp_path).identical(open_slice(tmp_path / "slice.filling"))
-    finished(tmp_path / "slice.zarr")
-    assert open_slice(tmp_path).identical(open_slice(tmp_path / "slice.zarr"))
 
 
 def test_a_slice_that_is_not_complete_is_not_finished(tmp_path):
@@ -148,28 +133,6 @@ def test_tiles_that_a_kill_left_beside_a_finished_slice_go(tmp_path):
     assert make(path).pending() == []
     assert [file.name for file in tmp_path.iterdir()] == ["slice.zarr.zip"]
     assert open_slice(path).identical(whole)
-
-
-def test_another_process_that_finishes_first_is_followed(tmp_path):
-    path = tmp_path / "slice.zarr"
-    slow, tile = make(path), make(path).tiles()[0]
-    whole = open_slice(finished(path).path)
-    slow.write(tile, evaluated(slow.points(tile)))  # too late, and not needed
-    assert slow.dataset().identical(whole)
-    assert slow.pending() == []
-    assert open_slice(path).identical(whole)
-
-
-def test_a_nan_result_is_finished_and_not_missing(tmp_path):
-    store = make(tmp_path / "s.zarr")
-    tile = store.tiles()[0]
-    count = store.tiling.count(tile)
-    nan = torch.full((count,), torch.nan).double()
-    store.write(tile, Evaluation.from_results(nan, nan[:, None].expand(-1, 3)))
-    assert tile not in store.pending()
-    status = store.dataset()["status"].to_numpy()
-    assert (status == Status.NONFINITE).sum() == count
-    assert (status == Status.MISSING).sum() == status.size - count
 
 
 def test_tiles_come_in_squares_and_the_coarse_picture_grows_with_them():

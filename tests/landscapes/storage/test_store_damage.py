@@ -34,7 +34,10 @@ def test_a_damaged_chunk_of_a_finished_slice_is_computed_again(tmp_path, place):
             file.write_bytes(file.read_bytes()[:-1])
         assert (SliceStore.open(path).status() == Status.MISSING).all()
         assert make(path).coarse() is None
-        finished(path)
+        one, other = fill(make(path)), fill(make(path))  # as two processes may
+        for store in (one, other):
+            store.finish(store.dataset())
+        assert one.pending() == other.pending() == []
         assert os.listdir(tmp_path) == ["slice.zarr.zip"]
         assert open_slice(path).identical(whole)
         assert archive_path(path).read_bytes() == again
@@ -57,18 +60,6 @@ def test_no_byte_of_a_finished_slice_changes_it_unseen(tmp_path):
         assert missing or found.identical(whole)
         lost += missing
     assert lost > len(sound) / 7 / 2
-
-
-def test_two_processes_may_compute_a_damaged_chunk_again(tmp_path):
-    path = tmp_path / "s.zarr"
-    finished(path)
-    whole = open_slice(path)
-    break_chunk(path, "loss/c/0/0")
-    one, other = make(path), make(path)
-    for store in (fill(one), fill(other)):
-        store.finish(store.dataset())
-    assert one.pending() == other.pending() == []
-    assert open_slice(path).identical(whole)
 
 
 @pytest.mark.parametrize("damage", ["truncated", "removed", "altered"])
@@ -146,10 +137,8 @@ def test_other_settings_are_refused_by_name_and_harm_nothing(tmp_path, changes, 
     path = tmp_path / "s.zarr"
     fill(make(path))
     before = {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()}
-    with pytest.raises(StoreMismatchError, match=said) as error:
+    with pytest.raises(StoreMismatchError, match=f"{said}.*--out.*--force"):
         make(path, **changes)
-    assert "--out" in str(error.value)
-    assert "--force" in str(error.value)
     assert {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()} == before
 
 
