@@ -15,7 +15,7 @@ import warp as wp
 
 from .. import cpp
 from ..launches import BLOCK, blocks
-from ..runtime import Ints, fill_struct, precision
+from ..runtime import Ints, precision
 from .model import Box
 from .stencil import lattice, layout, particles, stencil
 
@@ -25,11 +25,22 @@ from .stencil import lattice, layout, particles, stencil
 @cache
 @no_type_check
 def list_struct() -> Any:
-    """Return the struct of `Lists`."""
+    """Return the struct `Lists`."""
 
     @partial(wp.struct, module="gradscape.lists")
-    class Listed:
-        """The fields of Lists."""
+    class Lists:
+        """The particles by cell: `order` [environment, place], and the walks along its segments.
+
+        There are `full` [environment] of them, and `walks` [environment, walk] says of each which segment it goes
+        along, the first place of the particles it takes, how many they are, and, counted from the segment's first,
+        which planes of nodes it leaves and where it begins: the lowest plane, 256 times the one beyond the highest, and
+        65536 times the cell. The planes that a segment's particles touch are the bits of `planes` [environment,
+        segment].
+
+        Nodes that particles touch have places in grids, one column after the other: `touched` [environment, 2] is how
+        many nodes there are, and columns, `nodes` [environment, place] which node of the box has a place, and `starts`
+        [environment, column] the place of the column's node 0, if it had one.
+        """
 
         order: Ints
         full: wp.array[wp.int32]
@@ -39,7 +50,12 @@ def list_struct() -> Any:
         nodes: Ints
         touched: Ints
 
-    return Listed
+    return Lists
+
+
+def arrays_of(lists: Any) -> list[wp.array]:
+    """Return every array of `Lists`."""
+    return [getattr(lists, field) for field in list_struct().vars]
 
 
 @cache
@@ -157,38 +173,6 @@ def node_taker():
 SEGMENT = 16  # cells
 STRETCH = 4  # planes of nodes that a walk of a small batch leaves, and the last along a segment up to two more
 STEP, SIZES = 4, 32  # walks are of one size up to so many particles apart, and the largest of so many sizes
-
-
-@dataclass(frozen=True, eq=False)
-class Lists:
-    """The particles by cell: `order` [environment, place], and the walks along its segments.
-
-    There are `full` [environment] of them, and `walks` [environment, walk] says of each which segment it goes along,
-    the first place of the particles it takes, how many they are, and, counted from the segment's first, which planes of
-    nodes it leaves and where it begins: the lowest plane, 256 times the one beyond the highest, and 65536 times the
-    cell. The planes that a segment's particles touch are the bits of `planes` [environment, segment].
-
-    Nodes that particles touch have places in grids, one column after the other: `touched` [environment, 2] is how many
-    nodes there are, and columns, `nodes` [environment, place] which node of the box has a place, and `starts`
-    [environment, column] the place of the column's node 0, if it had one.
-    """
-
-    order: wp.array
-    full: wp.array
-    walks: wp.array
-    planes: wp.array
-    starts: wp.array
-    nodes: wp.array
-    touched: wp.array
-
-    def arrays(self) -> tuple[wp.array, ...]:
-        """Return every array of the lists."""
-        return (self.order, self.full, self.walks, self.planes, self.starts, self.nodes, self.touched)
-
-    @cached_property
-    def struct(self) -> Any:
-        """The lists as kernels take them."""
-        return fill_struct(list_struct()(), self)
 
 
 def whole_warps(threads: int) -> int:

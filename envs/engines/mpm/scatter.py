@@ -9,7 +9,7 @@ from typing import Any
 
 import warp as wp
 
-from ..runtime import load
+from ..runtime import fill_struct, load
 from .checkpoints import Frame, spare
 from .columns import (
     CPU_TEAM,
@@ -128,7 +128,7 @@ class ByColumns(Scatter):
     def list_particles(self, step: int, substep: int, frame: Frame, batch: int, *, counted: bool) -> None:
         """Find out where particles are, before a substep; g2p may have `counted` them already."""
         solver, tape, kernels = self.solver, self.solver.tape(step), self.listing
-        lists, count = tape.lists[substep].struct, solver.model.particles
+        lists, count = tape.lists[substep], solver.model.particles
         if not counted:
             solver.launch(kernels.count, count, batch, [tape.lattice, frame.x, self.counts])
         inputs = [tape.lattice, self.counts, lists]
@@ -160,7 +160,7 @@ class ByColumns(Scatter):
     def walk(self, kernel: Any, step: int, substep: int, batch: int, inputs: list[Any]) -> None:
         """Launch a kernel that leaves parts of sums at nodes, after the substep's lists."""
         tape = self.solver.tape(step)
-        given = [tape.lattice, batch, tape.lists[substep].struct, *inputs, self.parts]
+        given = [tape.lattice, batch, tape.lists[substep], *inputs, self.parts]
         self.solver.launch_on_box(kernel, partial(self.team.threads, stretch=self.stretch(batch)), batch, given)
 
     def stretch(self, batch: int) -> int:
@@ -174,7 +174,7 @@ class ByColumns(Scatter):
 
     def to_add_up(self, step: int, substep: int) -> list[Any]:
         """Return what nodes add up themselves, as their kernel takes it."""
-        return [self.solver.tape(step).lists[substep].struct, self.parts]
+        return [self.solver.tape(step).lists[substep], self.parts]
 
     def _allocate(self, count: int) -> None:
         """Allocate what so many segments take."""
@@ -184,11 +184,8 @@ class ByColumns(Scatter):
         kinds = {"counts": (wp.int32, count * SEGMENT), "places": (wp.vec2i, count * SEGMENT)}
         kinds |= {"found": (wp.vec4i, walks), "ranks": (wp.int32, walks)}
         kinds |= {"spans": (wp.int32, count * 2)}  # of columns, of which there are no more
-        self.counts = count_struct()()
-        for field, array in self.fixed.items():
-            setattr(self.counts, field, array)
-        for field, (kind, size) in kinds.items():
-            setattr(self.counts, field, allocator.array(kind, size))
+        sized = {field: allocator.array(kind, size) for field, (kind, size) in kinds.items()}
+        self.counts = fill_struct(count_struct(), self.fixed | sized)
 
 
 def nodes(box: Box) -> int:

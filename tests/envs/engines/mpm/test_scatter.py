@@ -7,7 +7,7 @@ import pytest
 import torch
 import warp as wp
 
-from gradscape.envs.engines.mpm.columns import SEGMENT, SIZES, STEP, STRETCH, segments
+from gradscape.envs.engines.mpm.columns import SEGMENT, SIZES, STEP, STRETCH, arrays_of, segments
 from gradscape.envs.engines.mpm.model import Body, Box, Model, place_grid
 from gradscape.envs.engines.mpm.solver import Solver
 from gradscape.envs.engines.runtime import to_torch
@@ -94,7 +94,7 @@ def test_particles_are_listed_by_cell_and_then_as_they_lie(first, stretch):
     listing = Listing(wp.launch, "float64", place_grid(model, box), box, x, stretch)
     for _ in range(2):  # the second time it begins where the first has ended
         listing.run()
-        order, full, walks, planes, *_ = (to_torch(array).clone() for array in listing.lists.arrays())
+        order, full, walks, planes, *_ = (to_torch(array).clone() for array in arrays_of(listing.lists))
         for row in range(2):
             keys = sorted((i, j, k // SEGMENT, k % SEGMENT, p) for p, (i, j, k) in enumerate(cell[row].tolist()))
             found = {}
@@ -133,7 +133,7 @@ def test_particles_that_are_nowhere_are_not_listed():
     listing = Listing(wp.launch, "float64", place_grid(model, box), box, x)
     for _ in range(2):  # the second time it begins where the first has ended
         listing.run()
-        order, full, segments_found, *_ = (to_torch(array).clone() for array in listing.lists.arrays())
+        order, full, segments_found, *_ = (to_torch(array).clone() for array in arrays_of(listing.lists))
         listed = torch.cat([order[0, begin : begin + count] for _, begin, count, _ in segments_found[0, : full[0]]])
         assert sorted(listed.tolist()) == [p for p in range(500) if p % 3 and p != 1]
         assert full[1] == 0
