@@ -5,6 +5,7 @@ from __future__ import annotations
 import abc
 import weakref
 from functools import partial
+from operator import attrgetter
 from typing import Any
 
 import warp as wp
@@ -21,11 +22,12 @@ from .columns import (
     cell_kernels,
     column_kernels,
     count_struct,
-    placing_warps,
     segments,
-    warps,
+    whole_warps,
 )
 from .model import Box
+
+nodes = attrgetter("cells")  # of a box
 
 
 class Scatter(abc.ABC):
@@ -132,8 +134,9 @@ class ByColumns(Scatter):
         if not counted:
             solver.launch(kernels.count, count, batch, [tape.lattice, frame.x, self.counts])
         inputs = [tape.lattice, self.counts, lists]
-        solver.launch_on_box(kernels.place_segments, warps, batch, [*inputs, self.stretch(batch)])
-        solver.launch_on_box(kernels.place, partial(placing_warps, count), batch, inputs)
+        by_segment, by_column = lambda box: whole_warps(segments(box)), lambda box: whole_warps(max(count, box.columns))
+        solver.launch_on_box(kernels.place_segments, by_segment, batch, [*inputs, self.stretch(batch)])
+        solver.launch_on_box(kernels.place, by_column, batch, inputs)
         solver.launch(kernels.tidy, count, batch, [*inputs, solver.needed])
 
     def where(self, step: int, substep: int) -> list[Any]:
@@ -186,8 +189,3 @@ class ByColumns(Scatter):
         kinds |= {"spans": (wp.int32, count * 2)}  # of columns, of which there are no more
         sized = {field: allocator.array(kind, size) for field, (kind, size) in kinds.items()}
         self.counts = fill_struct(count_struct(), self.fixed | sized)
-
-
-def nodes(box: Box) -> int:
-    """Return the number of nodes of a box."""
-    return box.cells

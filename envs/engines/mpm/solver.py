@@ -52,31 +52,24 @@ def compile_all(model: Model, device: str) -> None:
 
 def kernels(model: Model, device: str) -> Iterator[Any]:
     """Yield a kernel or more of each module, those first that take longest to compile."""
-    name = model.precision
-    yield from (_of_cpu if device == "cpu" else _of_gpu)(name, any(body.material.smoothing for body in model.groups))
-    yield velocity_on(name, model.boundary, columns=device != "cpu")
+    name, columns = model.precision, device != "cpu"
+    if columns:
+        yield from (transfers_of_columns(name).g2p, column_kernels(name, GPU_TEAM).p2g, cell_kernels(name).count)
+        yield settle_kernel(name)
+    else:
+        yield transfers(name).p2g
+    if any(body.material.smoothing for body in model.groups):
+        yield (smoothing_columns(name, GPU_TEAM) if columns else smoothing_kernels(name)).spread
+    yield velocity_on(name, model.boundary, columns=columns)
     if any(chain.from_iterable(walls_that_reflect(model))):
-        yield (mirror_kernels if device == "cpu" else mirrors_of_columns)(name).unfold
+        yield (mirrors_of_columns if columns else mirror_kernels)(name).unfold
     for body in model.groups:
-        yield from body.material.kernels(name, columns=device != "cpu")
+        yield from body.material.kernels(name, columns=columns)
     yield extent_kernels(name).look
     sorting = sorting_kernels(name, wp.int32)  # with which all but huge batches are sorted
     yield sorting.label
     for body in model.groups:
         yield from sorting.states[body.material.state(name)]
-
-
-def _of_cpu(name: str, smooth: bool) -> Iterator[Any]:
-    yield transfers(name).p2g
-    if smooth:
-        yield smoothing_kernels(name).spread
-
-
-def _of_gpu(name: str, smooth: bool) -> Iterator[Any]:
-    yield from (transfers_of_columns(name).g2p, column_kernels(name, GPU_TEAM).p2g, cell_kernels(name).count)
-    yield settle_kernel(name)
-    if smooth:
-        yield smoothing_columns(name, GPU_TEAM).spread
 
 
 # ---- The backward pass of MLS-MPM: the adjoints of the states of particles, control step by control step, and of

@@ -9,9 +9,8 @@ from gradscape.envs.engines.mpm.columns import (
     count_struct,
     list_struct,
     most_walks,
-    placing_warps,
     segments,
-    warps,
+    whole_warps,
 )
 from gradscape.envs.engines.runtime import fill_struct, precision, to_torch
 
@@ -41,7 +40,7 @@ class Listing:
         """Make the lists, and begin where the last run has ended: at zeros."""
         rows, count, given = *self.shape, [self.lattice, self.counts, self.lists]
         self.launch(self.kernels.count, self.shape, [self.lattice, self.x, self.counts])
-        self.launch(self.kernels.place_segments, (rows, warps(self.box)), [*given, self.stretch])
-        self.launch(self.kernels.place, (rows, placing_warps(count, self.box)), given)
+        self.launch(self.kernels.place_segments, (rows, whole_warps(segments(self.box))), [*given, self.stretch])
+        self.launch(self.kernels.place, (rows, whole_warps(max(count, self.box.columns))), given)
         self.launch(self.kernels.tidy, self.shape, [*given, self.needed])
         assert not any(to_torch(getattr(self.counts, field)).any() for field in ("counts", "used", "sizes", "spans"))
