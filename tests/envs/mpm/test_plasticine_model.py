@@ -149,8 +149,9 @@ def test_parts_below_nothing_are_refused():
         made(Torus, softness=0.0)
 
 
-def test_targets_are_those_of_the_whole_model():
-    assert torch.equal(made(Torus, gravity=0.0, yield_stress=2.0)._target.mass, made(Torus)._target.mass)
+@pytest.mark.parametrize("options", [{"gravity": 0.0, "yield_stress": 2.0}, {"contact": 1.0, "loss": "sum"}])
+def test_targets_are_those_of_the_whole_model_whatever_the_losss_weights(options):
+    assert torch.equal(made(Torus, **options)._target.mass, made(Torus)._target.mass)
 
 
 @pytest.mark.parametrize(("kind", "released"), [(Torus, (0.071, 0.078)), (Pinch, (0.059, 0.070))])
