@@ -42,7 +42,8 @@ class _Material(abc.ABC):
     def kernels(self, name: str, *, columns: bool = False) -> tuple[Any, Any]:
         """Return (update, adjoint) of one precision for a CPU, or for `columns`."""
         if not columns and (rows := self.rows(name)):
-            return kernels_in_rows(name, law_struct(name, *self.constants()), wp.array2d[self.state(name)], *rows)
+            array2d: Any = wp.array2d  # of a type that is known at run time alone
+            return kernels_in_rows(name, law_struct(name, *self.constants()), array2d[self.state(name)], *rows)
         response = self.response(name)
         adjoint = after_p2g(name, response, self.blocks) if columns else alone(name, response)
         return update_kernel(name, response), adjoint
@@ -83,7 +84,8 @@ class Fluid(_Material):
 
     def response(self, name: str) -> Response:
         """Return what the material does in one precision, as Warp functions."""
-        return fluid.response(name)
+        found: Response = fluid.response(name)
+        return found
 
     def rows(self, name: str) -> tuple[Any, ...]:
         """Return what kernels in C++ are called after, and their constants."""
@@ -146,7 +148,8 @@ class Elastic(_Solid):
 
     def response(self, name: str) -> Response:
         """Return what the material does in one precision, as Warp functions."""
-        return elastic.response(name)
+        found: Response = elastic.response(name)
+        return found
 
 
 @dataclass(frozen=True)
