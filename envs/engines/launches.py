@@ -219,7 +219,8 @@ class Launches:
                 self.clear()
             self._recording, self._place = _Sequence(extent), place
             work()
-            self.sequences[key] = self._recording  # only now: of work that was interrupted a part would be stored
+            # Only now: of work that was interrupted a part would be stored; and what is cleared must not be held here.
+            self.sequences[key], self._recording = self._recording, _Sequence(None)
             self.seen.add((key, extent))
         elif self.one_by_one or self.device == "cpu":
             known.move(extent, place)

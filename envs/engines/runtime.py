@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
-from dataclasses import dataclass, fields
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
@@ -108,8 +108,9 @@ def load(kernels: Iterable[Any], device: str) -> None:
         wp.config.use_precompiled_headers = before
 
 
-def fill_struct(data: Any, record: Any) -> Any:
-    """Return a Warp struct with the fields of a dataclass in it."""
-    for field in fields(record):
-        setattr(data, field.name, getattr(record, field.name))
+def fill_struct(Struct: Any, values: Mapping[str, Any]) -> Any:
+    """Return an instance of a Warp struct with values in its fields, by their names."""
+    data = Struct()
+    for name, value in values.items():
+        setattr(data, name, value)
     return data

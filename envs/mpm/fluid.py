@@ -38,7 +38,6 @@ SYRUP_DENSITY, GRAVITY = 1330.0, 9.81  # [kg/m^3], [m/s^2]
 SPAN = 0.01  # length of a control step [s]
 MARGIN = 2  # nodes outside the walls
 JITTER = 0.1  # of the distance between particles, by which those of another seed are moved
-VIEW = View((-0.2, 0.0, -0.2), (0.2, 0.42, 0.2), eye=(0.4, 0.55, 1.0))
 
 
 @dataclass(frozen=True)
@@ -128,6 +127,7 @@ class Fluid(MpmScene):
         ModelPart("sticky walls", {"walls": "stick"}, "floor and walls hold the syrup", missing=True),
     )
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {"paper": {"speed": 0.4, "viscosity": 0.0}}
+    view = View((-0.2, 0.0, -0.2), (0.2, 0.42, 0.2), eye=(0.4, 0.55, 1.0))
     space = _speeds(UNIT)
 
     def tools(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch step_plus_1 1 3"]:
@@ -177,11 +177,8 @@ class Fluid(MpmScene):
     def _body_names(self) -> tuple[str, str]:
         return "syrup", "cube"
 
-    def _surroundings(self, tools: Float[Tensor, "frame 1 3"]) -> dict[str, Tensor]:
-        return {"ladle": tools[:, 0]}
-
-    def _view(self) -> View:
-        return VIEW
+    def _tool_names(self) -> tuple[str]:
+        return ("ladle",)
 
     def _parts(self, bodies: Sequence[Tensor], tools: Float[Tensor, "frame 1 3"]) -> tuple[Part, ...]:
         syrup, cube = bodies

@@ -17,7 +17,7 @@ from ... import __version__
 from ...landscapes import episode
 from ...landscapes.episode import Part, View
 from ...landscapes.space import ParameterSpace
-from ..base import Environment, Fidelity, ModelPart, Pool
+from ..base import Environment, Fidelity, ModelPart
 from ..controls import extend, hold, integrate_velocity, roll
 from ..engines.mpm import materials
 from ..engines.mpm.boundaries import Kind, Tool, ToolsInRoom
@@ -226,14 +226,6 @@ def _sort_by_cell(x: np.ndarray, dx: float) -> np.ndarray:
 
 # ---- What a plasticine scene looks like: bodies, tools and targets to draw.
 
-SHAPES: dict[Kind, episode.Shape] = {
-    Kind.SPHERE: "sphere",
-    Kind.CAPSULE: "capsule",
-    Kind.TORUS: "torus",
-    Kind.CYLINDER: "cylinder",
-    Kind.ROLLER: "capsule",
-}
-
 
 def parts(
     scene: Scene,
@@ -276,7 +268,8 @@ def _tool(tool: Tool, pose: Float[Tensor, "frame slot 3"]) -> Part:
         spin, yaw, _ = pose[:, 1].unbind(1)
         turn = rotate_about(1, yaw) @ rotate_about(2, spin) @ rotate_about(0, torch.full_like(yaw, torch.pi / 2))
     material: episode.Material = "wood" if tool.kind in (Kind.ROLLER, Kind.CYLINDER) else "steel"
-    return Part(SHAPES[tool.kind], material, pose[:, :1], tool.size, turn)
+    shape: Any = "capsule" if tool.kind is Kind.ROLLER else tool.kind.name.lower()
+    return Part(shape, material, pose[:, :1], tool.size, turn)
 
 
 def _target(shape: Shape, frames: int) -> Part:
@@ -306,13 +299,6 @@ class PlasticineOptions(PhysicsOptions):
     density: float = 10.0
     sdf: float = 10.0
     contact: float = 500.0
-
-
-@dataclass(frozen=True, eq=False)
-class JudgedStage(Stage):
-    """What one thread simulates and judges with."""
-
-    raster: Raster
 
 
 class Plasticine(MpmScene):
@@ -367,7 +353,11 @@ class Plasticine(MpmScene):
     )
     control_step: ClassVar[float] = SPAN
     scene: ClassVar[Scene]
-    _solvers: Pool[JudgedStage]
+
+    @property
+    def view(self) -> View:  # type: ignore[override] # read only
+        """How the scene is seen."""
+        return view(self.scene)
 
     def memory(self) -> int:
         """Estimate the bytes one episode takes while it runs."""
@@ -430,8 +420,8 @@ class Plasticine(MpmScene):
     @staticmethod
     def _make_stage(
         make_solver: Callable[..., Solver], model: Model, stop: threading.Event, settings: Mapping[str, Any]
-    ) -> JudgedStage:
-        return JudgedStage(make_solver(model, stop=stop, **settings), Raster(model, model.mass, **settings))
+    ) -> Stage:
+        return Stage(make_solver(model, stop=stop, **settings), Raster(model, model.mass, **settings))
 
     def _prepare(self) -> None:
         _ = self._target
@@ -439,12 +429,12 @@ class Plasticine(MpmScene):
     def _loss_steps(self) -> Sequence[int]:
         return (self.model.steps,) if self.options.loss == "final" else range(1, self.model.steps + 1)
 
-    def _losses(self, stage: JudgedStage, step: int, end: Tensor, paths: Tensor) -> Float[Tensor, " batch"]:
+    def _losses(self, stage: Stage, step: int, end: Tensor, paths: Tensor) -> Float[Tensor, " batch"]:
         weights = paths.new_tensor([getattr(self.options, term) for term in TERMS])
         return (self._terms(stage, end, paths[:, step]) * weights).sum(dim=1)
 
     def _terms(
-        self, stage: JudgedStage, end: Float[Tensor, "batch particle 3"], tools: Float[Tensor, "batch slot 3"]
+        self, stage: Stage, end: Float[Tensor, "batch particle 3"], tools: Float[Tensor, "batch slot 3"]
     ) -> Float[Tensor, "batch term"]:
         """Return the loss's terms where particles and tools are."""
         shape = compare(stage.raster(end).double(), self._target)
@@ -461,14 +451,11 @@ class Plasticine(MpmScene):
     def _body_names(self) -> list[str]:
         return [f"plasticine {number}" for number in range(1, len(self.model.bodies) + 1)]
 
-    def _surroundings(self, tools: Float[Tensor, "frame slot 3"]) -> dict[str, Tensor]:
-        return {f"tool {number}": path for number, path in enumerate(tools.unbind(1), start=1)}
+    def _tool_names(self) -> list[str]:
+        return [f"tool {number}" for number in range(1, self.model.boundary.slots + 1)]
 
     def _parts(self, bodies: Sequence[Tensor], tools: Float[Tensor, "frame slot 3"]) -> tuple[Part, ...]:
         return parts(self.scene, bodies, tools, self._target_particles())
-
-    def _view(self) -> View:
-        return view(self.scene)
 
     @cached_property
     def _target(self) -> Target:

@@ -26,9 +26,10 @@ SHIFTS = ("shift_x", "shift_y", "shift_z")  # settings of a fidelity: cells that
 
 @dataclass(frozen=True, eq=False)
 class Stage:
-    """What one thread simulates with."""
+    """What one thread simulates with, and what it judges with where a loss takes masses at nodes."""
 
     solver: Solver
+    raster: Any = None
 
 
 class MpmScene(Environment):  # noqa: D101 -- `about` prints the docstrings of a scene's family, each for its readers
@@ -38,7 +39,8 @@ class MpmScene(Environment):  # noqa: D101 -- `about` prints the docstrings of a
     decisions = SEGMENTS
     designed_order: ClassVar[dict[str, float]] = {"dt": 1.0, "resolution": 2.0, "joint": 1.0}  # Euler; splines
     model: Model
-    _solvers: Pool[Any]
+    view: View
+    _solvers: Pool[Stage]
 
     def memory(self) -> int:
         """Estimate the bytes one episode takes while it runs."""
@@ -67,9 +69,9 @@ class MpmScene(Environment):  # noqa: D101 -- `about` prints the docstrings of a
         return Episode(
             self.control_step * torch.arange(self.model.steps + 1, dtype=torch.float64),
             dict(zip(self._body_names(), bodies, strict=True)),
-            self._surroundings(tools[0]),
+            dict(zip(self._tool_names(), tools[0].unbind(1), strict=True)),
             self._parts(bodies, tools[0]),
-            self._view(),
+            self.view,
         )
 
     @abc.abstractmethod
@@ -77,7 +79,7 @@ class MpmScene(Environment):  # noqa: D101 -- `about` prints the docstrings of a
         """Return the model at this fidelity, with these options."""
 
     @abc.abstractmethod
-    def _losses(self, stage: Any, step: int, end: Tensor, paths: Tensor) -> Float[Tensor, " batch"]:
+    def _losses(self, stage: Stage, step: int, end: Tensor, paths: Tensor) -> Float[Tensor, " batch"]:
         """Return losses by where particles and tools are before a control step, differentiably by both."""
 
     @abc.abstractmethod
@@ -89,21 +91,17 @@ class MpmScene(Environment):  # noqa: D101 -- `about` prints the docstrings of a
         """Return what bodies are called in an episode."""
 
     @abc.abstractmethod
-    def _surroundings(self, tools: Float[Tensor, "step_plus_1 slot 3"]) -> Mapping[str, Float[Tensor, "frame 3"]]:
-        """Return what stands around the bodies, by name."""
+    def _tool_names(self) -> Sequence[str]:
+        """Return what tools' slots are called in an episode."""
 
     @abc.abstractmethod
     def _parts(self, bodies: Sequence[Tensor], tools: Float[Tensor, "frame slot 3"]) -> tuple[Part, ...]:
         """Return what is to be drawn."""
 
-    @abc.abstractmethod
-    def _view(self) -> View:
-        """Return where it is seen from."""
-
     @staticmethod
     def _make_stage(
         make_solver: Callable[..., Solver], model: Model, stop: threading.Event, settings: Mapping[str, Any]
-    ) -> Any:
+    ) -> Stage:
         """Return what a thread simulates and judges with; takes no scene, whose memory it would hold on to."""
         return Stage(make_solver(model, stop=stop, **settings))
 

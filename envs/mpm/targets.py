@@ -7,7 +7,6 @@ import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -148,24 +147,8 @@ def compare(mass: Float[Tensor, "batch node"], target: Target) -> Float[Tensor, 
 
     These are sum |m - m_target| and sum m d. Rows are added up one by one: a batched sum rounds as its batch is large.
     """
-    both: Tensor = _Compared.apply(mass, target)  # type: ignore[no-untyped-call]
-    return both
-
-
-class _Compared(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, mass: Tensor, target: Target) -> Tensor:
-        ctx.save_for_backward(mass)
-        ctx.target = target
-        rows = mass.unbind(dim=0)
-        sums = [torch.stack([(row - target.mass).abs().sum(), (row * target.distance).sum()]) for row in rows]
-        return torch.stack(sums)
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, adj: Tensor) -> tuple[Tensor, None]:
-        (mass,) = ctx.saved_tensors
-        return adj[:, :1] * (mass - ctx.target.mass).sgn() + adj[:, 1:] * ctx.target.distance, None
+    rows = mass.unbind(dim=0)
+    return torch.stack([torch.stack([(row - target.mass).abs().sum(), (row * target.distance).sum()]) for row in rows])
 
 
 def contact(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from itertools import combinations
 
 import numpy as np
@@ -47,10 +48,15 @@ def springs(
     is, so that those along an edge weigh half.
     """
     number = {tuple(point): i for i, point in enumerate(points.tolist())}
-    weights: dict[tuple[int, int], float] = {}
-    _add_cells(weights, points, number, bend=bend, shear=shear)
-    for step in ((reach, 0), (0, reach)):
-        _add_bending(weights, points, number, step, share=bend / reach**2)
+    weights: defaultdict[tuple[int, int], float] = defaultdict(float)
+    for corners in _cells(number):  # each gives its edges and its diagonals half a spring
+        for first, second in combinations(sorted(corners), 2):
+            diagonal = (points[first] != points[second]).all()
+            weights[first, second] += 0.5 * (shear if diagonal else 1.0 - bend)
+    for di, dj in ((reach, 0), (0, reach)):
+        starts = np.array([(i, j) for i, j in number if (i + di, j + dj) in number], dtype=int)
+        for (i, j), area in zip(starts.tolist(), areas(starts), strict=True):  # as much as they stand for by themselves
+            weights[number[i, j], number[i + di, j + dj]] += bend / reach**2 * float(area)
     pairs = np.array(sorted(pair for pair, weight in weights.items() if weight > 0), dtype=int)
     rest = np.linalg.norm(points[pairs[:, 1]] - points[pairs[:, 0]], axis=1)
     return pairs, rest, np.array([weights[first, second] for first, second in pairs.tolist()])
@@ -65,25 +71,19 @@ def plate(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     that are to be multiplied by D over the square of a cell's width. Rotations do no work against them.
     """
     number = {tuple(point): i for i, point in enumerate(points.tolist())}
-    found: dict[tuple[int, int], float] = {}
+    squares: list[tuple[list[int], tuple[float, ...], float]] = []
+    found: defaultdict[tuple[int, int], float] = defaultdict(float)
     for (i, j), area in zip(number, areas(points), strict=True):
         for di, dj in ((1, 0), (0, 1)):
             line = ((i - di, j - dj), (i, j), (i + di, j + dj))
             if all(point in number for point in line):
-                _add_square(found, [number[point] for point in line], (1.0, -2.0, 1.0), float(area))
-    for corners in _cells(number):
-        if len(corners) == 4:
-            _add_square(found, corners, (1.0, -1.0, 1.0, -1.0), 2.0)
+                squares.append(([number[point] for point in line], (1.0, -2.0, 1.0), float(area)))
+    squares += [(corners, (1.0, -1.0, 1.0, -1.0), 2.0) for corners in _cells(number) if len(corners) == 4]
+    for numbers, factors, share in squares:
+        for (one, a), (other, b) in combinations(zip(numbers, factors, strict=True), 2):
+            found[min(one, other), max(one, other)] -= share * a * b
     pairs = sorted(pair for pair, stiffness in found.items() if stiffness)
     return np.array(pairs, dtype=int), np.array([found[pair] for pair in pairs])
-
-
-def _add_square(
-    found: dict[tuple[int, int], float], numbers: list[int], factors: tuple[float, ...], share: float
-) -> None:
-    for (i, a), (j, b) in combinations(zip(numbers, factors, strict=True), 2):
-        pair = min(i, j), max(i, j)
-        found[pair] = found.get(pair, 0.0) - share * a * b
 
 
 def merge(
@@ -104,34 +104,3 @@ def _cells(number: dict[tuple[int, ...], int]) -> list[list[int]]:
     around = [((i, j), (i, j + 1), (i + 1, j + 1), (i + 1, j)) for i, j in places]
     cells = [[number[corner] for corner in corners if corner in number] for corners in around]
     return [corners for corners in cells if len(corners) > 2]
-
-
-def _add_cells(
-    weights: dict[tuple[int, int], float],
-    points: np.ndarray,
-    number: dict[tuple[int, ...], int],
-    *,
-    bend: float,
-    shear: float,
-) -> None:
-    """Add what each cell gives its edges and its diagonals: half a spring each."""
-    for corners in _cells(number):
-        for first, second in combinations(sorted(corners), 2):
-            diagonal = (points[first] != points[second]).all()
-            share = 0.5 * (shear if diagonal else 1.0 - bend)
-            weights[first, second] = weights.get((first, second), 0.0) + share
-
-
-def _add_bending(
-    weights: dict[tuple[int, int], float],
-    points: np.ndarray,
-    number: dict[tuple[int, ...], int],
-    step: tuple[int, int],
-    *,
-    share: float,
-) -> None:
-    """Add the springs between points a `step` apart, by the area that their first ends stand for among themselves."""
-    starts = np.array([p for p in points.tolist() if (p[0] + step[0], p[1] + step[1]) in number], dtype=int)
-    for (i, j), area in zip(starts.tolist(), areas(starts), strict=True):
-        pair = number[i, j], number[i + step[0], j + step[1]]
-        weights[pair] = weights.get(pair, 0.0) + share * float(area)

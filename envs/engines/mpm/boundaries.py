@@ -208,7 +208,7 @@ class Boundary(abc.ABC):
 
     def data(self, name: str, device: str) -> Any:
         """Return the function's data."""
-        return fill_struct(self.function(name)[1](), self)
+        return fill_struct(self.function(name)[1], vars(self))
 
 
 @dataclass(frozen=True)

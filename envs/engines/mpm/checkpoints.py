@@ -6,9 +6,9 @@ from typing import Any, NamedTuple, TypeVar
 
 import warp as wp
 
-from ..runtime import precision
+from ..runtime import fill_struct, precision
 from .boundaries import LANES, SUMS
-from .columns import Lists
+from .columns import arrays_of, list_struct
 from .model import Box, Model, place_grid
 from .stencil import particles
 
@@ -34,9 +34,7 @@ class Frame:
     def particles(self) -> Any:
         """x, v and C as kernels take them."""
         vec3: Any = self.x.dtype
-        found: Any = particles(vec3._wp_scalar_type_.__name__)()
-        found.x, found.v, found.C = self.x, self.v, self.C
-        return found
+        return fill_struct(particles(vec3._wp_scalar_type_.__name__), {"x": self.x, "v": self.v, "C": self.C})
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,17 +88,14 @@ class Allocator:
         """A of the latest substep, for all tapes together, where sums are made by columns."""
         return self.affine_momentum()
 
-    def lists(self, room: "Sizes") -> Lists:
-        """Return lists of no particles."""
-        return Lists(
-            order=self.array(wp.int32, self.model.particles),
-            full=wp.zeros(self.capacity, dtype=wp.int32, device=self.device),
-            walks=self.array(wp.vec4i, 1 + room.nodes // 2),  # each has two nodes at least
-            planes=self.array(wp.int32, room.segments),
-            starts=self.array(wp.int32, room.columns),
-            nodes=self.array(wp.int32, room.nodes),
-            touched=self.array(wp.int32, 2),
-        )
+    def lists(self, room: "Sizes") -> Any:
+        """Return `Lists` of no particles."""
+        sizes = {"order": self.model.particles, "planes": room.segments, "starts": room.columns}
+        sizes |= {"nodes": room.nodes, "touched": 2}
+        arrays = {field: self.array(wp.int32, size) for field, size in sizes.items()}
+        arrays["full"] = wp.zeros(self.capacity, dtype=wp.int32, device=self.device)
+        arrays["walks"] = self.array(wp.vec4i, 1 + room.nodes // 2)  # each has two nodes at least
+        return fill_struct(list_struct(), arrays)
 
     def paths(self) -> wp.array:
         """Return zeros [environment, step, slot]."""
@@ -156,7 +151,7 @@ class Tape:
         self._kept = [allocator.affine_momentum() for _ in range(0 if allocator.columns else held)]
         self.A: Cycle[wp.array] = Cycle(self._kept or [allocator.latest_affine_momentum])
         self.grids: Cycle[Grid] = Cycle(allocator.grid(cells) for _ in range(held))
-        self.lists: Cycle[Lists] = Cycle(allocator.lists(room) for _ in range(held if allocator.columns else 0))
+        self.lists: Cycle[Any] = Cycle(allocator.lists(room) for _ in range(held if allocator.columns else 0))
         self.box, self.lattice = NOWHERE, place_grid(model)
         self._allocator = allocator
 
@@ -164,7 +159,7 @@ class Tape:
     def bytes(self) -> int:
         """What its arrays take."""
         frames = [array for frame in set(self.frames) for array in frame.arrays()]
-        lists = [array for one in self.lists for array in one.arrays()]
+        lists = [array for one in self.lists for array in arrays_of(one)]
         return sum(array.capacity for array in (*frames, *self.smoothed.values(), *self._kept, *self._nodes, *lists))
 
     def growth(self, needed: Sizes) -> int:

@@ -7,7 +7,7 @@ nodes, nor on chance.
 """
 
 from dataclasses import dataclass
-from functools import cache, cached_property, partial
+from functools import cache, partial
 from types import SimpleNamespace
 from typing import Any, no_type_check
 
@@ -15,7 +15,7 @@ import warp as wp
 
 from .. import cpp
 from ..launches import BLOCK, blocks
-from ..runtime import Ints, fill_struct, precision
+from ..runtime import Ints, precision
 from .model import Box
 from .stencil import lattice, layout, particles, stencil
 
@@ -25,11 +25,22 @@ from .stencil import lattice, layout, particles, stencil
 @cache
 @no_type_check
 def list_struct() -> Any:
-    """Return the struct of `Lists`."""
+    """Return the struct `Lists`."""
 
     @partial(wp.struct, module="gradscape.lists")
-    class Listed:
-        """The fields of Lists."""
+    class Lists:
+        """The particles by cell: `order` [environment, place], and the walks along its segments.
+
+        There are `full` [environment] of them, and `walks` [environment, walk] says of each which segment it goes
+        along, the first place of the particles it takes, how many they are, and, counted from the segment's first,
+        which planes of nodes it leaves and where it begins: the lowest plane, 256 times the one beyond the highest, and
+        65536 times the cell. The planes that a segment's particles touch are the bits of `planes` [environment,
+        segment].
+
+        Nodes that particles touch have places in grids, one column after the other: `touched` [environment, 2] is how
+        many nodes there are, and columns, `nodes` [environment, place] which node of the box has a place, and `starts`
+        [environment, column] the place of the column's node 0, if it had one.
+        """
 
         order: Ints
         full: wp.array[wp.int32]
@@ -39,7 +50,12 @@ def list_struct() -> Any:
         nodes: Ints
         touched: Ints
 
-    return Listed
+    return Lists
+
+
+def arrays_of(lists: Any) -> list[wp.array]:
+    """Return every array of `Lists`."""
+    return [getattr(lists, field) for field in list_struct().vars]
 
 
 @cache
@@ -81,12 +97,14 @@ HIGHEST = 1 << 30  # beyond all planes of nodes
 
 @cache
 @no_type_check
-def takers() -> SimpleNamespace:
-    """Return the functions `places` and `number`.
+def list_functions() -> SimpleNamespace:
+    """Return the functions `take_places, take_number, take_node, group_of, row_of`.
 
     The first takes the next `count` places of an environment, and `parts` of another kind; the second counts one more
-    at a place, and returns how many there were.
+    at a place, and returns how many there were; the third says which node has a place in the grid, -1 if none has. A
+    lane of a warp has a group, its segment, of which there is none from three on, and a row of nodes.
     """
+    Lists = list_struct()
 
     @cpp.func_native()
     def take_places(used: Ints, e: int, count: int, parts: int) -> wp.vec2i: ...
@@ -94,48 +112,20 @@ def takers() -> SimpleNamespace:
     @cpp.func_native()
     def take_number(counts: Ints, e: int, cell: int) -> int: ...
 
-    return SimpleNamespace(places=take_places, number=take_number)
+    @cpp.func_native(called="group_of_lane")
+    def group_of(lane: int) -> int: ...
 
-
-@cache
-@no_type_check
-def node_placer(name: str):
-    """Return the function that gives the nodes of a column that are touched, and those between them, their places.
-
-    A warp's lanes call it together, for neighbouring columns.
-    """
-    Lattice, Listed, take_places = lattice(name), list_struct(), takers().places
-
-    @cpp.func_native(template=[HIGHEST])
-    def find_touched(lattice: Lattice, spans: Ints, e: int, column: int) -> wp.vec2i: ...
-
-    @cpp.func_native()
-    def name_nodes(nodes: Ints, e: int, column: int, depth: int, low: int, count: int, start: int): ...
-
-    @wp.func(module=f"gradscape.cells.{name}")
-    def place_nodes(lattice: Lattice, spans: Ints, lists: Listed, e: int, column: int):
-        found = find_touched(lattice, spans, e, column)
-        low, count = found[0], found[1] - found[0]
-        start = take_places(lists.touched, e, count, wp.min(count, 1))[0]
-        if column < lattice.nx * lattice.ny:
-            lists.starts[e, column] = start - low
-        name_nodes(lists.nodes, e, column, lattice.nz, low, count, start)
-
-    return place_nodes
-
-
-@cache
-@no_type_check
-def node_taker():
-    """Return the function that says which node has a place in the grid, -1 if none has."""
-    Listed = list_struct()
+    @cpp.func_native(called="row_of_lane")
+    def row_of(lane: int) -> int: ...
 
     @wp.func(module="gradscape.columns.nodes")
-    def take_node(lists: Listed, e: int, place: int):
+    def take_node(lists: Lists, e: int, place: int):
         node, count = lists.nodes[e, place], lists.touched[e, 0]  # the one does not wait for the other
         return wp.where(place < count and count <= lists.nodes.shape[1], node, -1)
 
-    return take_node
+    return SimpleNamespace(
+        take_places=take_places, take_number=take_number, take_node=take_node, group_of=group_of, row_of=row_of
+    )
 
 
 # ---- Which particles lie in which cells at a substep, so that a scatter can go from cell to cell.
@@ -159,51 +149,9 @@ STRETCH = 4  # planes of nodes that a walk of a small batch leaves, and the last
 STEP, SIZES = 4, 32  # walks are of one size up to so many particles apart, and the largest of so many sizes
 
 
-@dataclass(frozen=True, eq=False)
-class Lists:
-    """The particles by cell: `order` [environment, place], and the walks along its segments.
-
-    There are `full` [environment] of them, and `walks` [environment, walk] says of each which segment it goes along,
-    the first place of the particles it takes, how many they are, and, counted from the segment's first, which planes of
-    nodes it leaves and where it begins: the lowest plane, 256 times the one beyond the highest, and 65536 times the
-    cell. The planes that a segment's particles touch are the bits of `planes` [environment, segment].
-
-    Nodes that particles touch have places in grids, one column after the other: `touched` [environment, 2] is how many
-    nodes there are, and columns, `nodes` [environment, place] which node of the box has a place, and `starts`
-    [environment, column] the place of the column's node 0, if it had one.
-    """
-
-    order: wp.array
-    full: wp.array
-    walks: wp.array
-    planes: wp.array
-    starts: wp.array
-    nodes: wp.array
-    touched: wp.array
-
-    def arrays(self) -> tuple[wp.array, ...]:
-        """Return every array of the lists."""
-        return (self.order, self.full, self.walks, self.planes, self.starts, self.nodes, self.touched)
-
-    @cached_property
-    def struct(self) -> Any:
-        """The lists as kernels take them."""
-        return fill_struct(list_struct()(), self)
-
-
 def whole_warps(threads: int) -> int:
     """Return the number of threads of the warps that so many threads need."""
     return -(-threads // 32) * 32
-
-
-def warps(box: Box) -> int:
-    """Return the number of threads, in whole warps, that a box's segments take one each."""
-    return whole_warps(segments(box))
-
-
-def placing_warps(particles: int, box: Box) -> int:
-    """Return the number of threads, in whole warps, that so many particles take one each, and a box's columns."""
-    return whole_warps(max(particles, box.columns))
 
 
 def segments(box: Box) -> int:
@@ -222,7 +170,7 @@ def most_walks(box: Box, stretch: int) -> int:
 def counter(name: str):
     """Return the function that tells a particle at x its cell, and its number there in the order of arrival."""
     vec3, Counting = precision(name).vec3, count_struct()
-    Lattice, base_node, take_number = lattice(name), stencil(name).base_node, takers().number
+    Lattice, base_node, take_number = lattice(name), stencil(name).base_node, list_functions().take_number
 
     @wp.func(module=f"gradscape.cells.{name}")
     def count_in_cell(lattice: Lattice, x: vec3, e: int, p: int, found: Counting):
@@ -247,10 +195,9 @@ def cell_kernels(name: str) -> SimpleNamespace:
 
     Where g2p has counted particles, `count` need not.
     """
-    Vectors, Lattice, Counting, Listed = precision(name).rows[1], lattice(name), count_struct(), list_struct()
+    Vectors, Lattice, Counting, Lists = precision(name).rows[1], lattice(name), count_struct(), list_struct()
     count_in_cell, module = counter(name), cpp.module(f"gradscape.cells.{name}")
-    take_number, take_places, place_nodes = takers().number, takers().places, node_placer(name)
-
+    take_number, take_places = list_functions().take_number, list_functions().take_places
     Counts = wp.types.vector(SEGMENT, wp.int32)
 
     @cpp.func_native(template=[SEGMENT])
@@ -261,6 +208,22 @@ def cell_kernels(name: str) -> SimpleNamespace:
 
     @cpp.func_native()
     def count_before(arrived: Ints, e: int, places: wp.vec2i, p: int) -> int: ...
+
+    @cpp.func_native(template=[HIGHEST])
+    def find_touched(lattice: Lattice, spans: Ints, e: int, column: int) -> wp.vec2i: ...
+
+    @cpp.func_native()
+    def name_nodes(nodes: Ints, e: int, column: int, depth: int, low: int, count: int, start: int): ...
+
+    @wp.func(module=module)
+    def place_nodes(lattice: Lattice, spans: Ints, lists: Lists, e: int, column: int):
+        """Give nodes of a column that are touched, and those between them, places; a warp calls it together."""
+        found = find_touched(lattice, spans, e, column)
+        low, count = found[0], found[1] - found[0]
+        start = take_places(lists.touched, e, count, wp.min(count, 1))[0]
+        if column < lattice.nx * lattice.ny:
+            lists.starts[e, column] = start - low
+        name_nodes(lists.nodes, e, column, lattice.nz, low, count, start)
 
     @wp.func(module=module)
     def size_of(particles: int):
@@ -273,7 +236,7 @@ def cell_kernels(name: str) -> SimpleNamespace:
         count_in_cell(lattice, x[e, p], e, p, counts)
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
-    def place_segments(lattice: Lattice, counts: Counting, lists: Listed, stretch: int):
+    def place_segments(lattice: Lattice, counts: Counting, lists: Lists, stretch: int):
         """Give each segment its places in the list, each of its cells, too, and walks a number among those of a size.
 
         Counts are 0 again.
@@ -317,7 +280,7 @@ def cell_kernels(name: str) -> SimpleNamespace:
             wp.atomic_max(counts.spans, e, 2 * column + 1, first + high)
 
     @wp.func(module=module)
-    def place_walk(counts: Counting, lists: Listed, e: int, i: int):
+    def place_walk(counts: Counting, lists: Lists, e: int, i: int):
         walk = counts.found[e, i]
         at = counts.ranks[e, i]
         for larger in range(size_of(walk[2]) + 1, SIZES):
@@ -326,7 +289,7 @@ def cell_kernels(name: str) -> SimpleNamespace:
             lists.walks[e, at] = walk
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
-    def place(lattice: Lattice, counts: Counting, lists: Listed):
+    def place(lattice: Lattice, counts: Counting, lists: Lists):
         """List particles by cell, those of a cell as they arrived, and walks by size, the largest first.
 
         Give the nodes of each column that particles touch, and those between them, places one after the other. Where
@@ -346,7 +309,7 @@ def cell_kernels(name: str) -> SimpleNamespace:
                 place_walk(counts, lists, e, w)
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
-    def tidy(lattice: Lattice, counts: Counting, lists: Listed, needed: wp.array[wp.int32]):
+    def tidy(lattice: Lattice, counts: Counting, lists: Lists, needed: wp.array[wp.int32]):
         """List them by cell, those of a cell as they lie in memory; count walks from 0 again.
 
         Note how many nodes an environment has `needed` at most.
@@ -382,20 +345,6 @@ def cell_kernels(name: str) -> SimpleNamespace:
 
 PLANES = SEGMENT + 2  # of nodes that the cells of a segment touch
 PARTS = 9 * PLANES  # numbers of four parts that a segment leaves
-
-
-@cache
-@no_type_check
-def lane_numbers() -> SimpleNamespace:
-    """Return the functions `group` and `row` of a lane of a warp: its segment, none from three on, and its nodes."""
-
-    @cpp.func_native(called="group_of_lane")
-    def group(lane: int) -> int: ...
-
-    @cpp.func_native(called="row_of_lane")
-    def row(lane: int) -> int: ...
-
-    return SimpleNamespace(group=group, row=row)
 
 
 @cache
@@ -496,10 +445,10 @@ def walk_taker(team: Team):
     The first says of a thread's walk (segment, first place, count, span), none if it has none; the second which
     particle has a place in the list, or the `last` one of a walk.
     """
-    lanes, groups, group_of, Listed = team.lanes, team.groups, lane_numbers().group, list_struct()
+    lanes, groups, group_of, Lists = team.lanes, team.groups, list_functions().group_of, list_struct()
 
     @wp.func(module=f"gradscape.columns.{lanes}")
-    def take_walk(e: int, t: int, lists: Listed):
+    def take_walk(e: int, t: int, lists: Lists):
         group = group_of(t % lanes)
         i = t / lanes * groups + group
         mine = lists.walks[e, wp.min(i, lists.walks.shape[1] - 1)]  # does not wait for how many there are
@@ -520,7 +469,7 @@ def walking_kernel(key: str, name: str, team: Team, given: Any, *, sloping: bool
     It runs over [environment, thread of a `team`], and takes what WALK says, OWN being what `given` takes besides the
     lattice, an environment and a particle. What particles give is `sloping`, or not, as the `walker` has it.
     """
-    steps, row_of, (take_walk, listed) = walker(name, sloping=sloping), lane_numbers().row, walk_taker(team)
+    steps, row_of, (take_walk, listed) = walker(name, sloping=sloping), list_functions().row_of, walk_taker(team)
     most, open_segment, walk, close_segment = steps.most, steps.open, steps.walk, steps.close
     lanes, groups, size = team.lanes, team.groups, team.size
 
@@ -538,18 +487,6 @@ def walking_kernel(key: str, name: str, team: Team, given: Any, *, sloping: bool
         options={"enable_backward": False} | bounds,
         source=WALK.replace("OWN", ", ".join(own)),
     )
-
-
-@cache
-@no_type_check
-def node_sum(name: str):
-    """Return the function (lattice, planes, parts, e, node) that adds up what the parts say of a node, in one order."""
-    Lattice, vec4, Nodes = lattice(name), precision(name).vec4, precision(name).rows[2]
-
-    @cpp.func_native(template=[SEGMENT, PARTS])
-    def add_up_node(lattice: Lattice, planes: Ints, parts: Nodes, e: int, node: int) -> vec4: ...
-
-    return add_up_node
 
 
 @cache

@@ -9,7 +9,7 @@ from .. import cpp
 from ..launches import blocks
 from ..runtime import Ints, precision
 from .boundaries import LANES, Boundary, Sums, substep_struct
-from .columns import PARTS, SEGMENT, list_struct, node_taker
+from .columns import PARTS, SEGMENT, list_functions, list_struct
 from .stencil import lattice
 
 
@@ -102,7 +102,7 @@ def velocity_of_columns(name: str, boundary_velocity: Any, Data: Any) -> Any:
 
     It runs over [environment, place in the grid].
     """
-    types, take_node, Listed = precision(name), node_taker(), list_struct()
+    types, take_node, Lists = precision(name), list_functions().take_node, list_struct()
     real, vec4, Nodes, Paths = types.real, types.vec4, types.rows[2], wp.array3d[types.vec3]
     Lattice, Substep, velocity_at_node = lattice(name), substep_struct(name), velocity_at(name, boundary_velocity, Data)
 
@@ -125,7 +125,7 @@ def velocity_of_columns(name: str, boundary_velocity: Any, Data: Any) -> Any:
         sums: Sums,
         grid_m: Nodes,
         grid_v: Nodes,
-        lists: Listed,
+        lists: Lists,
         parts: Nodes,
     ):
         e, i = wp.tid()

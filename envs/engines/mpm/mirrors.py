@@ -16,7 +16,7 @@ import warp as wp
 
 from .. import cpp
 from ..runtime import Ints, precision
-from .columns import list_struct, node_taker
+from .columns import list_functions, list_struct
 from .stencil import lattice
 
 
@@ -34,13 +34,14 @@ def mirror_kernels(name: str) -> SimpleNamespace:
 @no_type_check
 def mirrors_of_columns(name: str) -> SimpleNamespace:
     """Return `unfold` of one precision for a GPU, over [environment, place in the grid]; `add_up_folded` folds."""
-    Nodes, Lattice, Listed, take_node = precision(name).rows[2], lattice(name), list_struct(), node_taker()
+    Nodes, Lattice, Lists = precision(name).rows[2], lattice(name), list_struct()
+    take_node = list_functions().take_node
 
     @cpp.func_native()
     def unfold_node(lattice: Lattice, starts: Ints, grid: Nodes, e: int, i: int, node: int): ...
 
     @wp.kernel(module=cpp.module(f"gradscape.mirrors.{name}.columns"), enable_backward=False, grid_stride=False)
-    def unfold(lattice: Lattice, lists: Listed, grid: Nodes):
+    def unfold(lattice: Lattice, lists: Lists, grid: Nodes):
         e, i = wp.tid()
         node = take_node(lists, e, i)
         if node >= 0:

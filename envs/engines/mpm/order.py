@@ -15,7 +15,7 @@ import warp as wp
 
 from .. import cpp
 from ..launches import Launches
-from ..runtime import Ints, load, precision, to_torch
+from ..runtime import Ints, fill_struct, load, precision, to_torch
 from .model import Model, place_grid
 from .stencil import lattice, layout, particles
 
@@ -124,13 +124,7 @@ class Order:
         real, numbers = precision(model.precision).real, np.arange(model.particles, dtype=np.int32)
         self.place, self.name = rows(numbers, wp.int32), rows(numbers, wp.int32)
         self.mass, self.volume = rows(model.mass, real), rows(model.volume, real)
-        self.struct = order_struct(model.precision)()
-        self.struct.place, self.struct.name, self.struct.mass, self.struct.volume = (
-            self.place,
-            self.name,
-            self.mass,
-            self.volume,
-        )
+        self.struct = fill_struct(order_struct(model.precision), vars(self))
 
     def to_model(self, x: torch.Tensor) -> torch.Tensor:
         """Return what lies in this order, shape (batch, particle, *), in the model's."""

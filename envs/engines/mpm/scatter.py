@@ -5,11 +5,12 @@ from __future__ import annotations
 import abc
 import weakref
 from functools import partial
+from operator import attrgetter
 from typing import Any
 
 import warp as wp
 
-from ..runtime import load
+from ..runtime import fill_struct, load
 from .checkpoints import Frame, spare
 from .columns import (
     CPU_TEAM,
@@ -21,11 +22,12 @@ from .columns import (
     cell_kernels,
     column_kernels,
     count_struct,
-    placing_warps,
     segments,
-    warps,
+    whole_warps,
 )
 from .model import Box
+
+nodes = attrgetter("cells")  # of a box
 
 
 class Scatter(abc.ABC):
@@ -128,12 +130,13 @@ class ByColumns(Scatter):
     def list_particles(self, step: int, substep: int, frame: Frame, batch: int, *, counted: bool) -> None:
         """Find out where particles are, before a substep; g2p may have `counted` them already."""
         solver, tape, kernels = self.solver, self.solver.tape(step), self.listing
-        lists, count = tape.lists[substep].struct, solver.model.particles
+        lists, count = tape.lists[substep], solver.model.particles
         if not counted:
             solver.launch(kernels.count, count, batch, [tape.lattice, frame.x, self.counts])
         inputs = [tape.lattice, self.counts, lists]
-        solver.launch_on_box(kernels.place_segments, warps, batch, [*inputs, self.stretch(batch)])
-        solver.launch_on_box(kernels.place, partial(placing_warps, count), batch, inputs)
+        by_segment, by_column = lambda box: whole_warps(segments(box)), lambda box: whole_warps(max(count, box.columns))
+        solver.launch_on_box(kernels.place_segments, by_segment, batch, [*inputs, self.stretch(batch)])
+        solver.launch_on_box(kernels.place, by_column, batch, inputs)
         solver.launch(kernels.tidy, count, batch, [*inputs, solver.needed])
 
     def where(self, step: int, substep: int) -> list[Any]:
@@ -160,7 +163,7 @@ class ByColumns(Scatter):
     def walk(self, kernel: Any, step: int, substep: int, batch: int, inputs: list[Any]) -> None:
         """Launch a kernel that leaves parts of sums at nodes, after the substep's lists."""
         tape = self.solver.tape(step)
-        given = [tape.lattice, batch, tape.lists[substep].struct, *inputs, self.parts]
+        given = [tape.lattice, batch, tape.lists[substep], *inputs, self.parts]
         self.solver.launch_on_box(kernel, partial(self.team.threads, stretch=self.stretch(batch)), batch, given)
 
     def stretch(self, batch: int) -> int:
@@ -174,7 +177,7 @@ class ByColumns(Scatter):
 
     def to_add_up(self, step: int, substep: int) -> list[Any]:
         """Return what nodes add up themselves, as their kernel takes it."""
-        return [self.solver.tape(step).lists[substep].struct, self.parts]
+        return [self.solver.tape(step).lists[substep], self.parts]
 
     def _allocate(self, count: int) -> None:
         """Allocate what so many segments take."""
@@ -184,13 +187,5 @@ class ByColumns(Scatter):
         kinds = {"counts": (wp.int32, count * SEGMENT), "places": (wp.vec2i, count * SEGMENT)}
         kinds |= {"found": (wp.vec4i, walks), "ranks": (wp.int32, walks)}
         kinds |= {"spans": (wp.int32, count * 2)}  # of columns, of which there are no more
-        self.counts = count_struct()()
-        for field, array in self.fixed.items():
-            setattr(self.counts, field, array)
-        for field, (kind, size) in kinds.items():
-            setattr(self.counts, field, allocator.array(kind, size))
-
-
-def nodes(box: Box) -> int:
-    """Return the number of nodes of a box."""
-    return box.cells
+        sized = {field: allocator.array(kind, size) for field, (kind, size) in kinds.items()}
+        self.counts = fill_struct(count_struct(), self.fixed | sized)

@@ -20,8 +20,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from .. import cpp
-from ..runtime import Ints, precision
-from .columns import Team, list_struct, node_sum, node_taker, walker, walking_kernel
+from ..runtime import Ints, fill_struct, precision
+from .columns import PARTS, SEGMENT, Team, list_functions, list_struct, walker, walking_kernel
 from .model import Model
 from .scatter import nodes
 from .stencil import gatherers, lattice, layout, stencil
@@ -69,11 +69,10 @@ class Smoother:
 
     def _fluid(self, solver: Any, step: int) -> Any:
         """Return the body at a step's beginning as kernels take it."""
-        found, before = smoothed_struct(solver.model.precision)(), solver.checkpoints[step]
-        found.first, found.slope, found.share = self.first, self.slope, self.share
-        found.volume, found.x, found.J = solver.orders[step].volume, before.x, before.S[self.body]
-        found.J_new = solver.tape(step).smoothed[self.body]
-        return found
+        before, after = solver.checkpoints[step], solver.tape(step).smoothed[self.body]
+        values = {"first": self.first, "slope": self.slope, "share": self.share, "J_new": after}
+        values |= {"volume": solver.orders[step].volume, "x": before.x, "J": before.S[self.body]}
+        return fill_struct(smoothed_struct(solver.model.precision), values)
 
 
 class ColumnSmoother(Smoother):
@@ -207,16 +206,15 @@ def smoothing_columns(name: str, team: Team) -> SimpleNamespace:
     types, lies, sums_of = precision(name), layout(name), gatherers(name)
     real, vec3, vec4, mat33 = types.real, types.vec3, types.vec4, types.mat33
     Reals, Vectors, Nodes, _ = types.rows
-    Lattice, Fluid, Listed = lattice(name), smoothed_struct(name), list_struct()
+    Lattice, Fluid, Lists = lattice(name), smoothed_struct(name), list_struct()
     base_node, at_nodes = stencil(name).base_node, walker(name, sloping=False).at_nodes
-    gather, from_base, add_up_node, take_node = sums_of.gather, sums_of.from_base, node_sum(name), node_taker()
+    gather, from_base, take_node = sums_of.gather, sums_of.from_base, list_functions().take_node
     module = cpp.module(f"gradscape.smoothing.{name}.columns.{team.lanes}")
-    read_number, read_vector, read_node, write_node = (
-        lies.read_number,
-        lies.read_vector,
-        lies.read_node,
-        lies.write_node,
-    )
+    read_number, read_vector = lies.read_number, lies.read_vector
+    read_node, write_node = lies.read_node, lies.write_node
+
+    @cpp.func_native(template=[SEGMENT, PARTS])
+    def add_up_node(lattice: Lattice, planes: Ints, parts: Nodes, e: int, node: int) -> vec4: ...
 
     @wp.func(module=module)
     def at(lattice: Lattice, starts: Ints, nodes: Nodes, e: int, x: vec3, q: vec3):
@@ -244,7 +242,7 @@ def smoothing_columns(name: str, team: Team) -> SimpleNamespace:
         return given
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
-    def add_up(lattice: Lattice, lists: Listed, parts: Nodes, nodes: Nodes):
+    def add_up(lattice: Lattice, lists: Lists, parts: Nodes, nodes: Nodes):
         """Set the nodes' means, and what these are shared by."""
         e, i = wp.tid()
         node = take_node(lists, e, i)
@@ -265,7 +263,7 @@ def smoothing_columns(name: str, team: Team) -> SimpleNamespace:
         fluid.J_new[e, p] = wp.exp(here + fluid.share * (sums[0][0] - (here - fluid.slope * there[1])))
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
-    def add_up_adjoint(lattice: Lattice, lists: Listed, parts: Nodes, nodes: Nodes):
+    def add_up_adjoint(lattice: Lattice, lists: Lists, parts: Nodes, nodes: Nodes):
         """Set the nodes' parts of the adjoint of s."""
         e, i = wp.tid()
         node = take_node(lists, e, i)

@@ -52,31 +52,24 @@ def compile_all(model: Model, device: str) -> None:
 
 def kernels(model: Model, device: str) -> Iterator[Any]:
     """Yield a kernel or more of each module, those first that take longest to compile."""
-    name = model.precision
-    yield from (_of_cpu if device == "cpu" else _of_gpu)(name, any(body.material.smoothing for body in model.groups))
-    yield velocity_on(name, model.boundary, columns=device != "cpu")
+    name, columns = model.precision, device != "cpu"
+    if columns:
+        yield from (transfers_of_columns(name).g2p, column_kernels(name, GPU_TEAM).p2g, cell_kernels(name).count)
+        yield settle_kernel(name)
+    else:
+        yield transfers(name).p2g
+    if any(body.material.smoothing for body in model.groups):
+        yield (smoothing_columns(name, GPU_TEAM) if columns else smoothing_kernels(name)).spread
+    yield velocity_on(name, model.boundary, columns=columns)
     if any(chain.from_iterable(walls_that_reflect(model))):
-        yield (mirror_kernels if device == "cpu" else mirrors_of_columns)(name).unfold
+        yield (mirrors_of_columns if columns else mirror_kernels)(name).unfold
     for body in model.groups:
-        yield from body.material.kernels(name, columns=device != "cpu")
+        yield from body.material.kernels(name, columns=columns)
     yield extent_kernels(name).look
     sorting = sorting_kernels(name, wp.int32)  # with which all but huge batches are sorted
     yield sorting.label
     for body in model.groups:
         yield from sorting.states[body.material.state(name)]
-
-
-def _of_cpu(name: str, smooth: bool) -> Iterator[Any]:
-    yield transfers(name).p2g
-    if smooth:
-        yield smoothing_kernels(name).spread
-
-
-def _of_gpu(name: str, smooth: bool) -> Iterator[Any]:
-    yield from (transfers_of_columns(name).g2p, column_kernels(name, GPU_TEAM).p2g, cell_kernels(name).count)
-    yield settle_kernel(name)
-    if smooth:
-        yield smoothing_columns(name, GPU_TEAM).spread
 
 
 # ---- The backward pass of MLS-MPM: the adjoints of the states of particles, control step by control step, and of
@@ -166,14 +159,14 @@ class Adjoint:
             inputs = [*given, self.grid.m, old.x, old.v, self.A]
             solver.launch(solver.kernels.adjoint_p2g, solver.model.particles, batch, inputs)
         for b, (_, adjoint) in enumerate(solver.materials):
-            inputs = [*solver.material_inputs(b, step, frame), new.S[b]]
+            law = solver.law(b, step)
             if solver.columns:
-                given = [frame.x, frame.v, self.grid.m, old.v, tape.grids[substep].v, new.x, new.v, new.C, old.x]
-                inputs = [*solver.scatter.where(step, substep), *given, *inputs]
+                given = [frame.particles, new.particles, old.particles, self.grid.m, tape.grids[substep].v]
+                inputs = [*solver.scatter.where(step, substep), *given, law, frame.S[b], new.S[b], old.S[b]]
             else:
-                inputs += [self.A]
+                inputs = [law, frame.S[b], frame.C, new.S[b], self.A, old.S[b], old.C]
             with solver.parallel_to_others(b):
-                solver.launch(adjoint, solver.size(b), batch, [*inputs, old.S[b], old.C])
+                solver.launch(adjoint, solver.size(b), batch, inputs)
         solver.launches.join()
 
 
@@ -589,7 +582,7 @@ class Solver:
     def _update(self, step: int, frame: Frame, new: Frame, A: wp.array, batch: int) -> None:
         for b, (update, _) in enumerate(self.materials):
             with self.parallel_to_others(b):
-                self.launch(update, self.size(b), batch, [*self.material_inputs(b, step, frame), new.S[b], A])
+                self.launch(update, self.size(b), batch, [self.law(b, step), frame.S[b], frame.C, new.S[b], A])
 
     def _fill_grid(self, frame: Frame, step: int, substep: int, batch: int) -> None:
         """Fill the substep's grid: momentum and mass from particles, then velocity."""
@@ -607,7 +600,7 @@ class Solver:
     def unfold(self, grid: wp.array, step: int, substep: int, batch: int) -> None:
         """Give nodes beyond walls that reflect the image of what those before them hold."""
         if self.reflects and self.columns:
-            inputs = [self.tape(step).lattice, self.tape(step).lists[substep].struct, grid]
+            inputs = [self.tape(step).lattice, self.tape(step).lists[substep], grid]
             self.launch_at_nodes(self.mirrors.unfold, step, batch, inputs)
         elif self.reflects:
             self.launch(self.mirrors.unfold, 1, batch, [self.tape(step).lattice, grid])
@@ -618,12 +611,13 @@ class Solver:
         inputs = [*where, self.model.dt, frame.x, grid_v, *moved, self.left_box, *self.scatter.counting(followed)]
         self.launch(self.kernels.g2p, self.model.particles, batch, inputs)
 
-    def material_inputs(self, b: int, step: int, frame: Frame) -> list[Any]:
-        """Return what both kernels of a material take."""
+    def law(self, b: int, step: int) -> Any:
+        """Return what both kernels of a group's material share."""
         model, order = self.model, self.orders[step]
         law = model.groups[b].material.law(model.precision)
         law.first, law.dt, law.scale = self.first[b], model.dt, -model.dt * 4.0 / model.dx**2
-        return [law, order.mass, order.volume, frame.S[b], frame.C]
+        law.mass, law.volume = order.mass, order.volume
+        return law
 
     def velocity_inputs(self, step: int, substep: int) -> list[Any]:
         """Return the arguments of the grid's velocity kernel."""

@@ -198,31 +198,20 @@ def adjoint_gatherers(name: str) -> SimpleNamespace:
     `p2g` takes a particle's affine `momentum` A as a matrix. The adjoint of x is the sum of both.
     """
     types, lies, sums_of = precision(name), layout(name), gatherers(name)
-    real, mat33, (Reals, Vectors, Nodes, Matrices) = types.real, types.mat33, types.rows
-    Lattice, base_node = lattice(name), stencil(name).base_node
+    real, mat33, (Reals, Vectors, Nodes, _) = types.real, types.mat33, types.rows
+    Lattice, Particles, base_node = lattice(name), particles(name), stencil(name).base_node
     module = f"gradscape.gathers.{name}"
     gather, gather_with_mass, from_base = sums_of.gather, sums_of.gather_with_mass, sums_of.from_base
     read_number, read_vector, read_matrix = lies.read_number, lies.read_vector, lies.read_matrix
 
     @wp.func(module=module)
-    def g2p(
-        lattice: Lattice,
-        starts: Ints,
-        dt: real,
-        x: Vectors,
-        grid_v: Nodes,
-        adj_x_new: Vectors,
-        adj_v_new: Vectors,
-        adj_C_new: Matrices,
-        e: int,
-        p: int,
-    ):
+    def g2p(lattice: Lattice, starts: Ints, dt: real, x: Vectors, grid_v: Nodes, adj_new: Particles, e: int, p: int):
         here = read_vector(x, e, p)
         base = base_node((here - lattice.origin) * lattice.inv_dx, lattice)
         f = from_base(here, base, lattice)
-        a = (real(4.0) * lattice.inv_dx) * read_matrix(adj_C_new, e, p)
-        adj = read_vector(adj_x_new, e, p)
-        q = read_vector(adj_v_new, e, p) + dt * adj - a * f
+        a = (real(4.0) * lattice.inv_dx) * read_matrix(adj_new.C, e, p)
+        adj = read_vector(adj_new.x, e, p)
+        q = read_vector(adj_new.v, e, p) + dt * adj - a * f
         sums = gather(lattice, starts, grid_v, e, base - lattice.first, f, q, a, real(0.0))
         return adj + lattice.inv_dx * (sums[4] - wp.transpose(a) * sums[0])
 

@@ -31,11 +31,11 @@ template <typename Real> struct FluidTrial {
 
 template <typename Real, typename Law>
 inline void fluid_update(
-    int e, const Law& law, const Rows<Real>& mass, const Rows<Real>& volume,
-    const Rows<Real>& J, const Rows<Mat33<Real>>& C, const Rows<Real>& J_new, const Rows<Mat33<Real>>& A, double torn) {
+    int e, const Law& law, const Rows<Real>& J, const Rows<Mat33<Real>>& C, const Rows<Real>& J_new,
+    const Rows<Mat33<Real>>& A, double torn) {
     const int first = law.first;
     const Real dt = law.dt, scale = law.scale, bulk = law.bulk, viscosity = law.viscosity;
-    const Real *M = row_of(mass, e, first), *VOLUME = row_of(volume, e, first), *JJ = row_of(J, e);
+    const Real *M = row_of(law.mass, e, first), *VOLUME = row_of(law.volume, e, first), *JJ = row_of(J, e);
     const Real* CC = row_of(C, e, first);
     Real *JN = row_of(J_new, e), *AA = row_of(A, e, first);
     for (int p = 0, count = J.shape[1]; p < count; p += lanes) {
@@ -53,12 +53,11 @@ inline void fluid_update(
 
 template <typename Real, typename Law>
 inline void fluid_adjoint(
-    int e, const Law& law, const Rows<Real>& mass, const Rows<Real>& volume,
-    const Rows<Real>& J, const Rows<Mat33<Real>>& C, const Rows<Real>& adj_J_new, const Rows<Mat33<Real>>& adj_A,
-    const Rows<Real>& adj_J, const Rows<Mat33<Real>>& adj_C, double torn) {
+    int e, const Law& law, const Rows<Real>& J, const Rows<Mat33<Real>>& C, const Rows<Real>& adj_J_new,
+    const Rows<Mat33<Real>>& adj_A, const Rows<Real>& adj_J, const Rows<Mat33<Real>>& adj_C, double torn) {
     const int first = law.first;
     const Real dt = law.dt, scale = law.scale, bulk = law.bulk, viscosity = law.viscosity;
-    const Real *M = row_of(mass, e, first), *VOLUME = row_of(volume, e, first), *JJ = row_of(J, e);
+    const Real *M = row_of(law.mass, e, first), *VOLUME = row_of(law.volume, e, first), *JJ = row_of(J, e);
     const Real *CC = row_of(C, e, first), *JN = row_of(adj_J_new, e), *AA = row_of(adj_A, e, first);
     Real *JA = row_of(adj_J, e), *CA = row_of(adj_C, e, first);
     for (int p = 0, count = J.shape[1]; p < count; p += lanes) {
@@ -249,15 +248,13 @@ template <typename Real> struct PlasticTrial {
 
 template <typename Real, typename Law>
 inline void plasticine_update(
-    int e, const Law& law, const Rows<Real>& mass,
-    const Rows<Real>& volume, const Rows<Mat33<Real>>& F, const Rows<Mat33<Real>>& C, const Rows<Mat33<Real>>& F_new,
-    const Rows<Mat33<Real>>& A,
-    double least, double rounded, double round_off, double tiny, int sweeps) {
+    int e, const Law& law, const Rows<Mat33<Real>>& F, const Rows<Mat33<Real>>& C, const Rows<Mat33<Real>>& F_new,
+    const Rows<Mat33<Real>>& A, double least, double rounded, double round_off, double tiny, int sweeps) {
     const int first = law.first;
     const Real dt = law.dt, scale = law.scale, mu = law.mu, lam = law.lam, kappa = law.kappa;
     const Yield<Real> yield{Real(least), Real(rounded), Real(round_off), Real(tiny), sweeps};
     using V = Eight<Real>;
-    const Real *M = row_of(mass, e, first), *VOLUME = row_of(volume, e, first);
+    const Real *M = row_of(law.mass, e, first), *VOLUME = row_of(law.volume, e, first);
     const Real *CC = row_of(C, e, first), *FF = row_of(F, e);
     Real *FN = row_of(F_new, e), *AA = row_of(A, e, first);
     for (int p = 0, count = F.shape[1]; p < count; p += lanes) {
@@ -392,16 +389,14 @@ inline void turn_back_trial(
 
 template <typename Real, typename Law>
 inline void plasticine_adjoint(
-    int e, const Law& law, const Rows<Real>& mass,
-    const Rows<Real>& volume, const Rows<Mat33<Real>>& F, const Rows<Mat33<Real>>& C,
+    int e, const Law& law, const Rows<Mat33<Real>>& F, const Rows<Mat33<Real>>& C,
     const Rows<Mat33<Real>>& adj_F_new, const Rows<Mat33<Real>>& adj_A, const Rows<Mat33<Real>>& adj_F,
-    const Rows<Mat33<Real>>& adj_C,
-    double least, double rounded, double round_off, double tiny, int sweeps) {
+    const Rows<Mat33<Real>>& adj_C, double least, double rounded, double round_off, double tiny, int sweeps) {
     const int first = law.first;
     const Real dt = law.dt, scale = law.scale, mu = law.mu, lam = law.lam, kappa = law.kappa;
     const Yield<Real> yield{Real(least), Real(rounded), Real(round_off), Real(tiny), sweeps};
     using V = Eight<Real>;
-    const Real *M = row_of(mass, e, first), *VOLUME = row_of(volume, e, first);
+    const Real *M = row_of(law.mass, e, first), *VOLUME = row_of(law.volume, e, first);
     const Real *CC = row_of(C, e, first), *FF = row_of(F, e), *FA = row_of(adj_F_new, e), *AA = row_of(adj_A, e, first);
     Real *FO = row_of(adj_F, e), *CO = row_of(adj_C, e, first);
     for (int p = 0, count = F.shape[1]; p < count; p += lanes) {

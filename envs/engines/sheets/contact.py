@@ -39,7 +39,7 @@ class Surface(abc.ABC):
 
     def data(self, name: str) -> Any:
         """Return the function's data."""
-        return fill_struct(self.function(name)[1](), self)
+        return fill_struct(self.function(name)[1], vars(self))
 
     @abc.abstractmethod
     def stop(self, name: str, rule: Rule) -> Any:
@@ -123,9 +123,7 @@ class PanOverFloor(Surface):
 
     def data(self, name: str) -> Any:
         """Return the function's data."""
-        data = self.function(name)[1]()
-        data.pan, data.floor = self.pan.data(name), self.floor.data(name)
-        return data
+        return fill_struct(self.function(name)[1], {"pan": self.pan.data(name), "floor": self.floor.data(name)})
 
     def stop(self, name: str, rule: Rule) -> Any:
         """Return the Warp function that takes velocities into the pan, then those into the floor."""

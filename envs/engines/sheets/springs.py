@@ -20,7 +20,7 @@ import warp as wp
 
 from .. import cpp
 from ..launches import Launches
-from ..runtime import free_memory, load, precision, to_torch
+from ..runtime import fill_struct, free_memory, load, precision, to_torch
 from .contact import Rule, Surface, contact_kernel, contact_kernel_in_rows, sum_kernel_in_rows, sum_kernels
 
 STRETCH = 50  # steps that are launched at once
@@ -237,16 +237,12 @@ class Solver:
 def _network(sheet: Sheet, Network: Any, types: Any, device: str, *, in_rows: bool) -> Any:
     """List every vertex's springs in the order of their other ends."""
     count, lists = (_slots if in_rows else _lists)(sheet)
-    network = Network()
-    network.count = wp.array(count, dtype=int, device=device)
-    for name, values in lists.items():
-        dtype = torch.int32 if name == "neighbor" else types.torch
-        setattr(network, name, wp.from_torch(torch.from_numpy(values).to(dtype).flatten().to(device)))
     masses = torch.from_numpy(sheet.masses.copy()).to(types.torch)
-    network.mass, network.inverse_mass = (wp.from_torch(value.to(device)) for value in (masses, 1.0 / masses))
-    for name in ("damping", "drag", "gravity"):
-        setattr(network, name, getattr(sheet, name))
-    return network
+    tensors = {"count": torch.from_numpy(count).int(), "mass": masses, "inverse_mass": 1.0 / masses}
+    for name, values in lists.items():
+        tensors[name] = torch.from_numpy(values).to(torch.int32 if name == "neighbor" else types.torch).flatten()
+    arrays = {name: wp.from_torch(values.to(device)) for name, values in tensors.items()}
+    return fill_struct(Network, arrays | {name: getattr(sheet, name) for name in ("damping", "drag", "gravity")})
 
 
 def _ends(sheet: Sheet) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:

@@ -6,7 +6,7 @@ import warp as wp
 
 from gradscape.envs.engines import cpp
 from gradscape.envs.engines.mpm.boundaries import substep_struct
-from gradscape.envs.engines.mpm.materials.adjoints import alone
+from gradscape.envs.engines.mpm.materials.kernels import alone, update_kernel
 from gradscape.envs.engines.mpm.stencil import lattice
 from gradscape.envs.engines.runtime import precision, to_torch
 
@@ -70,9 +70,9 @@ class MaterialBench:
     def _launch(self, which, dt, given, wanted):
         count, law = len(given[0]), self.material.law(self.types.name)
         law.dt, law.scale = dt, SCALE
-        each = [wp.array(np.full((1, count), value), dtype=self.types.real) for value in (MASS, VOLUME)]
+        law.mass, law.volume = (wp.array(np.full((1, count), one), dtype=self.types.real) for one in (MASS, VOLUME))
         results = [self._array(torch.zeros_like(like)) for like in wanted]
-        inputs, kernel = [law, *each, *map(self._array, given), *results], self.kernels[which]
+        inputs, kernel = [law, *map(self._array, given), *results], self.kernels[which]
         wp.launch(kernel, (1, cpp.threads(kernel, count)), inputs, record_tape=False)
         return tuple(to_torch(array)[0].double().clone() for array in results)
 
@@ -81,16 +81,16 @@ class MaterialBench:
         return wp.array(values.to(self.types.torch)[None].contiguous().numpy(), dtype=kind, copy=True)
 
 
-def in_warp(material, kernels, name):
+def in_warp(material, response, name):
     """Return a bench of a material's functions for a GPU, one particle at a time."""
-    bench, found = MaterialBench(material, name), kernels(name)
-    bench.kernels = found.update, alone(name, found)
+    bench, found = MaterialBench(material, name), response(name)
+    bench.kernels = update_kernel(name, found), alone(name, found)
     return bench
 
 
-def assert_rows_have_the_same_bits(material, kernels, state, C, adj_new, adj_A):
-    """Hold a material's kernels in C++ against its `kernels` in Warp."""
-    one, rows = in_warp(material, kernels, "float32"), MaterialBench(material, "float32")
+def assert_rows_have_the_same_bits(material, response, state, C, adj_new, adj_A):
+    """Hold a material's kernels in C++ against its `response` in Warp."""
+    one, rows = in_warp(material, response, "float32"), MaterialBench(material, "float32")
     for wanted, found in (
         *zip(one.update(state, C), rows.update(state, C), strict=True),
         *zip(one.adjoint(state, C, adj_new, adj_A), rows.adjoint(state, C, adj_new, adj_A), strict=True),

@@ -26,34 +26,52 @@ def test_work_that_is_interrupted_is_not_taken_for_whole_when_it_comes_again():
     assert done == ["first", "again", *["first", "second"] * 2]
 
 
-def test_what_comes_after_an_interrupted_run_waits_for_what_that_has_begun(monkeypatch):
+@pytest.fixture
+def seen(monkeypatch):
+    """Return what stand-ins for a GPU's streams, commands and graphs are told."""
+    seen, names = [], iter(["first", *(f"stream {number}" for number in range(1, 9))])
+
     class Stream:
-        def __init__(self, name):
-            self.name = name
+        def __init__(self):
+            self.name = next(names)
 
         def wait_stream(self, other):
-            waits.append((self.name, other.name))
+            seen.append((self.name, "waits for", other.name))
 
-    class Command:
-        def launch(self, stream=None):
-            if stream and stream.name == "first":
-                raise KeyboardInterrupt
+    first = Stream()
+    monkeypatch.setattr(wp, "ScopedCapture", lambda device: nullcontext(SimpleNamespace(graph="graph")))
+    monkeypatch.setattr(wp, "capture_launch", seen.append)
+    monkeypatch.setattr(wp, "get_stream", lambda device: first)
+    monkeypatch.setattr(wp, "Stream", lambda device: Stream())
+    return seen
 
-    waits = []
-    monkeypatch.setattr(wp, "get_stream", lambda device: Stream("first"))
-    monkeypatch.setattr(wp, "Stream", lambda device: Stream("beside"))
+
+class Command:
+    """Launch nothing, and note on which stream."""
+
+    def __init__(self, name, seen):
+        self.name, self.seen = name, seen
+
+    def launch(self, stream=None):
+        if self.name == "interrupted":
+            raise KeyboardInterrupt
+        self.seen.append((self.name, "on", stream.name if stream else None))
+
+
+def test_what_comes_after_an_interrupted_run_waits_for_what_that_has_begun(seen):
     launches = Launches("cuda")
 
     def work():
         with launches.on_stream(1):
-            launches._recording.launches.append(Command())
-        launches._recording.launches.append(Command())
+            launches._recording.launches.append(Command("beside", seen))
+        launches._recording.launches.append(Command("interrupted", seen))
         launches.join()
 
     launches.run("key", 1, work, small=False)
     with pytest.raises(KeyboardInterrupt):
         launches.run("key", 1, work, small=False)
-    assert waits == [("beside", "first"), ("first", "beside")]
+    stream = "stream 1"
+    assert seen == [(stream, "waits for", "first"), ("beside", "on", stream), ("first", "waits for", stream)]
 
 
 def test_launches_of_which_some_were_moved_are_all_moved_again():
@@ -123,32 +141,11 @@ def test_a_program_of_a_cpu_launches_what_it_is_made_of_over_any_extent(monkeypa
 
 
 @pytest.mark.parametrize("small", [True, False])
-def test_a_gpu_runs_beside_each_other_what_does_not_wait_for_each_other(monkeypatch, small):
-    class Stream:
-        def __init__(self, name):
-            self.name = name
-            made.append(name)
-
-        def wait_stream(self, other):
-            seen.append((self.name, "waits for", other.name))
-
-    class Command:
-        def __init__(self, name):
-            self.name = name
-
-        def launch(self, stream=None):
-            seen.append((self.name, "on", stream.name if stream else None))
-
-    made, seen = [], []
-    first = Stream("first")
-    monkeypatch.setattr(wp, "ScopedCapture", lambda device: nullcontext(SimpleNamespace(graph="graph")))
-    monkeypatch.setattr(wp, "capture_launch", lambda graph: seen.append(graph))
-    monkeypatch.setattr(wp, "get_stream", lambda device: first)
-    monkeypatch.setattr(wp, "Stream", lambda device: Stream(f"stream {len(made)}"))
+def test_a_gpu_runs_beside_each_other_what_does_not_wait_for_each_other(seen, small):
     launches = Launches("cuda")
 
     def launch(name):
-        launches._recording.launches.append(Command(name))
+        launches._recording.launches.append(Command(name, seen))
 
     def work():
         for number in (1, 2, 1):

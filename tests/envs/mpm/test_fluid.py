@@ -74,69 +74,64 @@ def test_the_pressure_of_syrup_at_rest_is_hydrostatic(monkeypatch):
 
 
 @pytest.fixture(scope="module")
-def speeds():
-    """Speeds upwards of cubes in the middle of a narrow tank without a ladle, by viscosity and density."""
-    with pytest.MonkeyPatch.context() as patch:
-        for name, value in {"RIM": (0.0, 10.0, 0.0), "FILL": 0.2, "TANK_WIDTH": 0.2}.items():
-            patch.setattr(fluid, name, value)
-        patch.setattr(fluid, "CUBE_CENTER", (0.0, 0.1, 0.0))
-        fidelity = Fidelity("narrow", dt=SPAN / 22, resolution=24, sampling=4 / 3)
-        cases = [(30.0, 1800.0), (30.0, 860.0), (60.0, 1800.0), (60.0, 860.0), (30.0, SYRUP_DENSITY)]
-        made = {case: Fluid(fidelity=fidelity, device="cpu", viscosity=case[0], cube_density=case[1]) for case in cases}
-        return {case: rising(scene) for case, scene in made.items()}
+def narrow():
+    """Return what makes a narrow tank of syrup, its cube's centre at a height [m], and lets it go without a ladle.
+
+    It returns the scene, and where particles are before some control steps.
+    """
+
+    def run(height, steps, fidelity, *, fill=FILL, **options):
+        away = torch.tensor([0.0, 10.0, 0.0], dtype=torch.float64).expand(1, max(steps) + 1, 1, 3)
+        changes = {"RIM": (0.0, 10.0, 0.0), "FILL": fill, "TANK_WIDTH": 0.2, "CUBE_CENTER": (0.0, height, 0.0)}
+        with pytest.MonkeyPatch.context() as patch:
+            for name, value in changes.items():
+                patch.setattr(fluid, name, value)
+            scene = Fluid(fidelity=fidelity, device="cpu", horizon=max(1.0, max(steps) / STEPS), **options)
+        with scene._solvers.lend() as stage:
+            stage.solver.run(away)
+            return scene, [stage.solver.read_positions(step, 1).double() for step in steps]
+
+    return run
 
 
-def rising(scene):
-    """Return (speed upwards over the last half of 20 control steps [m/s], rise over all [m]) of the cube, no ladle."""
-    away = torch.tensor([0.0, 10.0, 0.0], dtype=torch.float64).expand(1, 21, 1, 3)
-    with scene._solvers.lend() as stage:
-        stage.solver.run(away)
-        places = [stage.solver.read_positions(step, 1).double() for step in (0, 10, 20)]
-        start, before, end = (float(scene._center(place)[0, 1]) for place in places)
-    return (end - before) / (SPAN * 10), end - start
+@pytest.fixture(scope="module")
+def speeds(narrow):
+    """Speeds upwards of cubes in syrup over the last half of 20 control steps, by viscosity and density."""
+    fidelity, found = Fidelity("narrow", dt=SPAN / 22, resolution=24, sampling=4 / 3), {}
+    for case in [(30.0, 1800.0), (30.0, 860.0), (60.0, 1800.0), (60.0, 860.0), (30.0, SYRUP_DENSITY)]:
+        scene, places = narrow(0.1, (10, 20), fidelity, fill=0.2, viscosity=case[0], cube_density=case[1])
+        before, end = (float(scene._center(place)[0, 1]) for place in places)
+        found[case] = (end - before) / (SPAN * 10)
+    return found
 
 
-def test_a_cube_half_as_heavy_as_syrup_floats_half_in_and_leaves_the_surface_still(monkeypatch):
-    for name, value in {"RIM": (0.0, 10.0, 0.0), "TANK_WIDTH": 0.2, "CUBE_CENTER": (0.0, FILL, 0.0)}.items():
-        monkeypatch.setattr(fluid, name, value)
+def test_a_cube_half_as_heavy_as_syrup_floats_half_in_and_leaves_the_surface_still(narrow):
     fidelity = Fidelity("narrow", dt=SPAN / 16, resolution=12, sampling=4 / 3)
-    scene = Fluid(fidelity=fidelity, device="cpu", cube_density=SYRUP_DENSITY / 2)
-    away = torch.tensor([0.0, 10.0, 0.0], dtype=torch.float64).expand(1, STEPS + 1, 1, 3)
-    with scene._solvers.lend() as stage:
-        stage.solver.run(away)
-        start, end = (stage.solver.read_positions(step, 1).double()[0] for step in (0, STEPS))
+    scene, places = narrow(FILL, (0, STEPS), fidelity, cube_density=SYRUP_DENSITY / 2)
+    start, end = (place[0] for place in places)
     syrup = len(scene.model.bodies[0].x)
     assert abs(float((end - start)[syrup:, 1].mean())) < 2e-3  # of 50 mm
     top = start[:syrup, 1] > start[:syrup, 1].max() - 1e-9
     assert float((end - start)[:syrup][top, 1].abs().max()) < 1e-3
 
 
-def test_a_heavy_cube_sinks_and_a_light_one_rises(speeds):
-    for viscosity in (30.0, 60.0):
-        assert speeds[viscosity, 1800.0][0] < -0.001
-        assert speeds[viscosity, 860.0][0] > 0.001
-    # A neutral one stays: what drives it is less than a twentieth of the weight of syrup that it displaces.
-    assert abs(speeds[30.0, SYRUP_DENSITY][0]) < 0.05 * SYRUP_DENSITY / 470.0 * known_speed(30.0, 0.2, 0.2, 470.0)
-
-
 @pytest.mark.parametrize("viscosity", [30.0, 60.0])
 def test_a_cube_sinks_and_rises_as_fast_as_is_known_of_cubes_between_walls(speeds, viscosity):
+    assert speeds[viscosity, 1800.0] < -0.001 < 0.001 < speeds[viscosity, 860.0]
     # Half the difference of the two is free of what a neutral cube drifts.
-    half = (speeds[viscosity, 860.0][0] - speeds[viscosity, 1800.0][0]) / 2
+    half = (speeds[viscosity, 860.0] - speeds[viscosity, 1800.0]) / 2
     assert half == pytest.approx(known_speed(viscosity, 0.2, 0.2, 470.0), rel=0.1)
 
 
-def test_a_heavy_cube_that_is_half_in_goes_under(monkeypatch):
-    # It neither sticks where its top is at the surface, nor does the syrup lose volume on the way.
-    for name, value in {"RIM": (0.0, 10.0, 0.0), "TANK_WIDTH": 0.2, "CUBE_CENTER": (0.0, FILL, 0.0)}.items():
-        monkeypatch.setattr(fluid, name, value)
-    fidelity = Fidelity("narrow", dt=SPAN / 14, resolution=16, sampling=1.5)
-    steps = 150
-    scene = Fluid(fidelity=fidelity, device="cpu", cube_density=2000.0, horizon=steps / STEPS)
-    away = torch.tensor([0.0, 10.0, 0.0], dtype=torch.float64).expand(1, steps + 1, 1, 3)
-    with scene._solvers.lend() as stage:
-        stage.solver.run(away)
-        places = [stage.solver.read_positions(step, 1).double() for step in (0, steps - 20, steps)]
+def test_a_neutral_cube_stays(speeds):
+    """What drives it is less than a twentieth of the weight of syrup that it displaces."""
+    assert abs(speeds[30.0, SYRUP_DENSITY]) < 0.05 * SYRUP_DENSITY / 470.0 * known_speed(30.0, 0.2, 0.2, 470.0)
+
+
+def test_a_heavy_cube_that_is_half_in_goes_under(narrow):
+    """It neither sticks where its top is at the surface, nor does the syrup lose volume on the way."""
+    steps, fidelity = 150, Fidelity("narrow", dt=SPAN / 14, resolution=16, sampling=1.5)
+    scene, places = narrow(FILL, (0, steps - 20, steps), fidelity, cube_density=2000.0)
     before, end = (float(scene._center(place)[0, 1]) for place in places[1:])
     assert end + CUBE_EDGE / 2 < FILL - 0.01
     assert (before - end) / (20 * SPAN) > 0.008
@@ -164,6 +159,7 @@ def test_the_ladles_speed_eases(tiny):
     speed = tiny.tools(x)[0, :, 0, 0].diff() / SPAN / UNIT
     ramp = torch.arange(1, EASING + 1, dtype=torch.float64) / EASING
     steps = STEPS // SEGMENTS
+    torch.testing.assert_close(tiny.tools(x)[0, 0, 0], torch.tensor(RIM, dtype=torch.float64))
     torch.testing.assert_close(speed[:EASING], 0.5 * ramp)
     torch.testing.assert_close(speed[steps : steps + EASING], 0.5 - ramp)
     jumping = Fluid(fidelity=TINY, device="cpu", easing=False).tools(x)[0, :, 0, 0].diff() / SPAN / UNIT
@@ -212,21 +208,16 @@ def test_an_episode_is_its_own_mirror_image_in_depth(shift):
     assert (end - start).norm(dim=1).max() > 0.01
 
 
-def test_the_printed_goal_turns_the_sign_of_the_height(draft):
-    printed = Fluid(fidelity="draft", device="cpu", goal="printed")
-    x = torch.stack([STILL[0], draft.example("scoop")])
-    ours, theirs = draft.evaluate(x, grad=False), printed.evaluate(x, grad=False)
-    height = draft.cube(x)[:, 1]
-    assert height.min() < TANK_HEIGHT < height.max()
-    torch.testing.assert_close(ours.loss - theirs.loss, TANK_HEIGHT - height, rtol=0, atol=1e-12)
-
-
-def test_the_loss_is_height_missing_plus_distances_to_ladle_and_axis(tiny):
-    x = tiny.space.uniform(4, seed=1)
-    cube, ladle = tiny.cube(x), tiny.tools(x)[:, -1, 0]
+@pytest.mark.parametrize("goal", ["high", "printed"])
+def test_the_loss_is_height_missing_plus_distances_to_ladle_and_axis(draft, goal):
+    """The goal as it is printed turns the sign of the height."""
+    scene, x = Fluid(fidelity="draft", device="cpu", goal=goal), torch.stack([STILL[0], draft.example("scoop")])
+    cube, ladle = scene.cube(x), scene.tools(x)[:, -1, 0]
+    above = cube[:, 1] - TANK_HEIGHT
+    assert above.min() < 0 < above.max()
     aside, from_axis = (cube - ladle)[:, [0, 2]].norm(dim=1), cube[:, [0, 2]].norm(dim=1)
-    wanted = (TANK_HEIGHT - cube[:, 1]).clamp_min(0) + 3 * aside + from_axis
-    torch.testing.assert_close(tiny.evaluate(x, grad=False).loss, wanted, rtol=0, atol=1e-14)
+    wanted = (above if goal == "printed" else -above).clamp_min(0) + 3 * aside + from_axis
+    torch.testing.assert_close(scene.evaluate(x, grad=False).loss, wanted, rtol=0, atol=1e-14)
 
 
 @settings(max_examples=50)
@@ -238,15 +229,6 @@ def test_the_ladle_stays_in_the_tank(tiny, speeds):
     assert (x.abs() + BOWL + SHELL <= TANK_WIDTH / 2 + 1e-12).all()
     assert (y - BOWL - SHELL >= 0).all()
     assert (z == RIM[2]).all()
-
-
-def test_away_from_its_limits_the_ladle_goes_speed_times_time():
-    # From the rim's start: right 0.02 m a segment, up 0.01 m a segment.
-    scene = Fluid(fidelity=TINY, device="cpu", easing=False)
-    speeds = torch.tensor([[1.0, 0.5] * SEGMENTS], dtype=torch.float64)
-    time = SPAN * torch.arange(STEPS + 1, dtype=torch.float64)
-    wanted = torch.tensor(RIM, dtype=torch.float64) + time[:, None] * torch.tensor([0.2, 0.1, 0.0])
-    torch.testing.assert_close(scene.tools(speeds)[0, :, 0], wanted)
 
 
 def test_single_precision_gives_the_same_landscape(draft):

@@ -11,7 +11,6 @@ from gradscape.envs.engines.mpm.boundaries import Kind
 from gradscape.envs.mpm.plasticine import DEMONSTRATION, PARTICLE, SEGMENTS, TERMS, Plasticine
 from gradscape.envs.mpm.plasticine_scenes import Assembly, RollingPin, Rope, Torus, TripleMove, Writer
 from gradscape.envs.mpm.scene import STEPS
-from gradscape.envs.mpm.targets import Target
 from gradscape.envs.registry import environment_class
 
 from ..scenes import SOFT, cheap
@@ -25,11 +24,10 @@ def made(kind, **options):
     return kind(fidelity=TINY, device="cpu", **options)
 
 
-def scene_id(kind):
-    return kind.name
+scenes = pytest.mark.parametrize("kind", SCENES, ids=lambda kind: kind.name)
 
 
-@pytest.mark.parametrize("kind", SCENES, ids=scene_id)
+@scenes
 def test_the_demonstration_is_far_better_than_doing_nothing(kind):
     env = kind(device="cpu")
     still = torch.zeros(env.space.dim, dtype=torch.float64)
@@ -37,34 +35,24 @@ def test_the_demonstration_is_far_better_than_doing_nothing(kind):
     assert shown < 0.25 * idle
 
 
-@pytest.mark.parametrize("kind", SCENES, ids=scene_id)
-def test_memory_is_that_of_particles_and_grids_are_little_of_it(kind):
+@scenes
+def test_a_scene_takes_the_memory_of_its_particles_keeps_a_gpu_busy_and_weighs_what_upstream_says(kind, monkeypatch):
     """A frame of each step (x, v, C, F), a tape of one with adjoints; grids and rasters are half as much at most."""
-    env = kind(fidelity="standard", device="cpu")
-    frame, model = 24, env.model
+    env, frame = kind(fidelity="standard", device="cpu"), 24
+    model = env.model
     tape = (model.substeps + 1) * (frame + 9)
     own = 4 * ((model.steps + 3) * frame + tape) * model.particles
     assert own <= env.memory() <= 1.5 * own
-
-
-@pytest.mark.parametrize("kind", SCENES, ids=scene_id)
-def test_enough_standard_environments_fit_a_gpu_to_keep_it_busy(kind, monkeypatch):
     monkeypatch.setattr(solver, "free_memory", lambda: FREE)
-    env = kind(fidelity="standard", device="cpu")
-    batch = solver.capacity(env.model, "cuda")
-    assert solver.BUSY <= batch * env.model.particles <= solver.FULL_CARD
+    batch = solver.capacity(model, "cuda")
+    assert solver.BUSY <= batch * model.particles <= solver.FULL_CARD
     assert batch * env.memory() < FREE
-
-
-@pytest.mark.parametrize("kind", SCENES, ids=scene_id)
-def test_bodies_weigh_what_upstream_has_them_weigh(kind):
-    for fidelity in ("draft", "standard"):
-        model = kind(fidelity=fidelity, device="cpu").model
-        weights = [body.mass.sum() / PARTICLE for body in model.bodies]
+    for one in (model, kind(fidelity="draft", device="cpu").model):
+        weights = [body.mass.sum() / PARTICLE for body in one.bodies]
         assert np.allclose(weights, [piece.particles for piece in kind.scene.pieces])
 
 
-@pytest.mark.parametrize("kind", SCENES, ids=scene_id)
+@scenes
 def test_tools_start_in_place_and_go_as_far_as_their_steps_say(kind):
     env = made(kind)
     still = env.tools(torch.zeros(1, env.space.dim, dtype=torch.float64))[0]
@@ -121,7 +109,7 @@ def test_the_sum_over_control_steps_ends_with_the_final_frame():
     torch.testing.assert_close(torch.stack(list(env.terms(x).values()), dim=1), each[-1:])
 
 
-@pytest.mark.parametrize("kind", [Torus, RollingPin], ids=scene_id)
+@pytest.mark.parametrize("kind", [Torus, RollingPin], ids=lambda kind: kind.name)
 def test_the_sums_gradient_is_its_slope(kind):
     env = made(kind, loss="sum")
     x = env.space.uniform(1, seed=1).requires_grad_()
@@ -153,7 +141,7 @@ def test_triple_moves_targets_are_at_the_listed_centres():
         assert np.allclose(np.ptp(block, axis=0), 0.1, atol=2e-3)
 
 
-@pytest.mark.parametrize("kind", SCENES, ids=scene_id)
+@scenes
 def test_gradients_are_slopes_where_bodies_start_undeformed_and_where_they_yield(kind):
     """To 1e-4, central differences in float64 at 1e-7, along the gradient itself and along a random direction."""
     env = kind(fidelity=replace(TINY, particles=200), device="cpu")
@@ -188,15 +176,3 @@ def test_plasticine_at_rest_on_a_sticky_floor_stays():
     moved = (frames.points["plasticine 1"][-1] - frames.points["plasticine 1"][0]).norm(dim=1)
     assert float(moved.max()) < 2e-3  # it settles under gravity by less than a fifteenth of a cell
     assert float(moved.median()) < 5e-4
-
-
-def test_targets_do_not_depend_on_the_tools_weights():
-    one, other = made(Writer), made(Writer, contact=1.0, loss="sum")
-    assert isinstance(one._target, Target)
-    assert torch.equal(one._target.mass, other._target.mass)
-
-
-def test_a_scene_and_its_family_say_what_they_are():
-    about = Writer.about()
-    assert about.startswith("Write a stroke")
-    assert Plasticine.__doc__.split("\n")[0] in about

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from gradscape.envs.sheets import sheets
+from gradscape.envs.sheets.flip import Flip
 from gradscape.envs.sheets.swing import Swing, SwingStiffness, SwingVelocity
 from gradscape.landscapes.objective import Status
 
@@ -177,9 +178,8 @@ def test_an_unstable_simulation_is_a_failure_and_no_error(cls):
 
 
 @pytest.mark.slow
-def test_the_corners_of_the_box_can_be_simulated(cls):
-    env = cls(fidelity="draft", device="cpu")
-    rng = torch.Generator().manual_seed(0)
+@pytest.mark.parametrize("kind", [SwingVelocity, SwingStiffness, Flip])
+def test_the_corners_of_the_box_can_be_simulated(kind):
+    env, rng = kind(fidelity="draft", device="cpu"), torch.Generator().manual_seed(0)
     corner = torch.randint(0, 2, (64, env.space.dim), generator=rng).bool()
-    result = env.evaluate(torch.where(corner, env.space.upper, env.space.lower))
-    assert (result.status == Status.OK).all()
+    assert (env.evaluate(torch.where(corner, env.space.upper, env.space.lower)).status == Status.OK).all()

@@ -15,26 +15,46 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
+import warp as wp
 
-from ...runtime import precision
+from ...runtime import fill_struct, precision
 from . import elastic, fluid, plasticine
-from .adjoints import after_p2g, alone, law_struct
+from .kernels import Response, after_p2g, alone, kernels_in_rows, law_struct, update_kernel
 
 
 class _Material(abc.ABC):
-    """What a solver asks of a material."""
+    """What a solver asks of a material; `blocks` of its adjoint are to find registers on a GPU at once."""
+
+    blocks: ClassVar[int] = 4
 
     @abc.abstractmethod
     def constants(self) -> dict[str, float]:
         """Return what the kernels take besides state and motion, by name."""
 
+    @abc.abstractmethod
+    def response(self, name: str) -> Response:
+        """Return what the material does in one precision, as Warp functions."""
+
     def law(self, name: str) -> Any:
         """Return the struct of one precision that the kernels take, with the constants in it."""
-        constants = self.constants()
-        found = law_struct(name, *constants)()
-        for constant, value in constants.items():
-            setattr(found, constant, value)
-        return found
+        return fill_struct(law_struct(name, *self.constants()), self.constants())
+
+    def kernels(self, name: str, *, columns: bool = False) -> tuple[Any, Any]:
+        """Return (update, adjoint) of one precision for a CPU, or for `columns`."""
+        if not columns and (rows := self.rows(name)):
+            array2d: Any = wp.array2d  # of a type that is known at run time alone
+            return kernels_in_rows(name, law_struct(name, *self.constants()), array2d[self.state(name)], *rows)
+        response = self.response(name)
+        adjoint = after_p2g(name, response, self.blocks) if columns else alone(name, response)
+        return update_kernel(name, response), adjoint
+
+    def rows(self, name: str) -> tuple[Any, ...]:
+        """Return what kernels in C++ are called after, which take eight particles at a time, and their constants."""
+        return ()
+
+    @abc.abstractmethod
+    def state(self, name: str) -> Any:
+        """Return the Warp type of one particle's state."""
 
 
 @dataclass(frozen=True)
@@ -52,22 +72,24 @@ class Fluid(_Material):
     bulk: float
     viscosity: float
     smoothing: float = 0.0
+    blocks: ClassVar[int] = 5
 
     def volume_ratio(self, pressure: np.ndarray) -> np.ndarray:
         """Return J at which the fluid bears `pressure` [Pa], counted on its reference volume."""
         return np.asarray(np.exp(-pressure / self.bulk))  # K log J = -pressure
 
-    def kernels(self, name: str, *, columns: bool = False) -> tuple[Any, Any]:
-        """Return (update, adjoint) of one precision for a CPU, or for `columns`."""
-        found: tuple[Any, Any] = fluid.kernels_in_rows(name)
-        if columns:
-            on_gpu = fluid.kernels(name)
-            found = on_gpu.update, after_p2g(name, on_gpu, 5)
-        return found
-
     def constants(self) -> dict[str, float]:
         """Return what the kernels take besides state and motion."""
         return {"bulk": self.bulk, "viscosity": self.viscosity}
+
+    def response(self, name: str) -> Response:
+        """Return what the material does in one precision, as Warp functions."""
+        found: Response = fluid.response(name)
+        return found
+
+    def rows(self, name: str) -> tuple[Any, ...]:
+        """Return what kernels in C++ are called after, and their constants."""
+        return "fluid", fluid.TORN
 
     def state(self, name: str) -> Any:
         """Return the Warp type of one particle's state."""
@@ -120,14 +142,14 @@ class Elastic(_Solid):
         modulus = density * speed**2  # lam + 2 mu
         return cls(density, modulus * (1.0 + poisson) * (1.0 - 2.0 * poisson) / (1.0 - poisson), poisson)
 
-    def kernels(self, name: str, *, columns: bool = False) -> tuple[Any, Any]:
-        """Return (update, adjoint) of one precision for a CPU, or for `columns`."""
-        found = elastic.kernels(name)
-        return found.update, after_p2g(name, found, 4) if columns else alone(name, found)
-
     def constants(self) -> dict[str, float]:
         """Return what the kernels take besides state and motion."""
         return {"mu": self.mu, "lam": self.lam}
+
+    def response(self, name: str) -> Response:
+        """Return what the material does in one precision, as Warp functions."""
+        found: Response = elastic.response(name)
+        return found
 
 
 @dataclass(frozen=True)
@@ -136,17 +158,17 @@ class Plasticine(_Solid):
 
     yield_stress: float
 
-    def kernels(self, name: str, *, columns: bool = False) -> tuple[Any, Any]:
-        """Return (update, adjoint) of one precision for a CPU, or for `columns`."""
-        found: tuple[Any, Any] = plasticine.kernels_in_rows(name)
-        if columns:
-            on_gpu = (plasticine.series_kernels if name == "float32" else plasticine.kernels)(name)
-            found = on_gpu.update, after_p2g(name, on_gpu, 4)
-        return found
-
     def constants(self) -> dict[str, float]:
         """Return what the kernels take besides state and motion; `kappa` is the largest deviatoric log strain."""
         return {"mu": self.mu, "lam": self.lam, "kappa": self.yield_stress / (2.0 * self.mu)}
+
+    def response(self, name: str) -> Response:
+        """Return what the material does in one precision, as Warp functions: float32 is as exact as series are."""
+        return (plasticine.response_by_series if name == "float32" else plasticine.response)(name)
+
+    def rows(self, name: str) -> tuple[Any, ...]:
+        """Return what kernels in C++ are called after, and their constants."""
+        return "plasticine", *plasticine.constants_of_rows(name)
 
 
 Material = Fluid | Elastic | Plasticine

@@ -1,4 +1,4 @@
-"""Kernels of a fixed-corotated solid with von Mises plasticity, which carries its elastic deformation gradient F.
+"""A fixed-corotated solid with von Mises plasticity, which carries its elastic deformation gradient F.
 
 The trial deformation (I + dt C) F = U diag(s) V^T returns to the yield surface in log strain e = log s:
 
@@ -19,8 +19,7 @@ import warp as wp
 
 from ... import cpp
 from ...runtime import precision
-from ..stencil import layout
-from .adjoints import MaterialKernels, law_struct
+from .kernels import Response, law_struct
 
 # ---- Singular value decomposition of deformation gradients, as a Warp function.
 
@@ -279,87 +278,53 @@ def responses(name: str) -> SimpleNamespace:
 
 
 @cache
-def kernels(name: str) -> MaterialKernels:
-    """Return the kernels of a GPU."""
-    found: MaterialKernels = kernels_of(name, responses(name), cpp.module(f"gradscape.plasticine.{name}"))
+def response(name: str) -> Response:
+    """Return the functions of one precision, by decompositions."""
+    found: Response = response_of(name, responses(name), cpp.module(f"gradscape.plasticine.{name}"))
     return found
 
 
 @no_type_check
-def kernels_of(name: str, found: Any, module: str) -> MaterialKernels:
-    """Return the kernels of a material of these `responses`."""
-    types = precision(name)
-    real, mat33, (Reals, _, _, Matrices) = types.real, types.mat33, types.rows
-    Law = law_struct(name, "mu", "lam", "kappa")
-    Strain, strain_of, respond, respond_back = found.Strain, found.strain, found.respond, found.turn_back
-    read_matrix, write_matrix = layout(name).read_matrix, layout(name).write_matrix
+def response_of(name: str, found: Any, module: str) -> Response:
+    """Return a material of these `responses` as functions of a particle."""
+    real, mat33, Law = precision(name).real, precision(name).mat33, law_struct(name, "mu", "lam", "kappa")
+    Strain, strain_of, respond_to, turn_trial_back = found.Strain, found.strain, found.respond, found.turn_back
 
     @wp.func(module=module)
-    def strain(law: Law, F: Matrices, C: Matrices, n: int, p: int):
-        return strain_of(
-            (wp.identity(n=3, dtype=real) + law.dt * read_matrix(C, n, law.first + p)) * read_matrix(F, n, p)
-        )
+    def advance(law: Law, C: mat33) -> mat33:
+        return wp.identity(n=3, dtype=real) + law.dt * C
 
     @wp.func(module=module)
-    def affine_momentum(
-        law: Law, mass: Reals, volume: Reals, F: Matrices, C: Matrices, strain: Strain, n: int, p: int
-    ) -> mat33:
-        c = read_matrix(C, n, law.first + p)
-        advance = wp.identity(n=3, dtype=real) + law.dt * c
-        _, stress = respond(advance * read_matrix(F, n, p), strain, law.mu, law.lam, law.kappa)
-        return law.scale * volume[n, law.first + p] * stress + mass[n, law.first + p] * c
+    def respond(law: Law, F: mat33, C: mat33):
+        trial = F + law.dt * C * F
+        return respond_to(trial, strain_of(trial), law.mu, law.lam, law.kappa)
 
-    @wp.kernel(module=module, enable_backward=False)
-    def update(law: Law, mass: Reals, volume: Reals, F: Matrices, C: Matrices, F_new: Matrices, A: Matrices):
-        e, p = wp.tid()
-        c, before = read_matrix(C, e, law.first + p), read_matrix(F, e, p)
-        trial = before + law.dt * c * before
-        after, stress = respond(trial, strain_of(trial), law.mu, law.lam, law.kappa)
-        write_matrix(F_new, e, p, after)
-        write_matrix(A, e, law.first + p, law.scale * volume[e, law.first + p] * stress + mass[e, law.first + p] * c)
+    @wp.func(module=module)
+    def strain(law: Law, F: mat33, C: mat33):
+        return strain_of(advance(law, C) * F)
+
+    @wp.func(module=module)
+    def stress(law: Law, F: mat33, C: mat33, strain: Strain) -> mat33:
+        _, tau = respond_to(advance(law, C) * F, strain, law.mu, law.lam, law.kappa)
+        return tau
 
     @wp.func(module=module)
     def turn_back(
-        law: Law,
-        mass: Reals,
-        volume: Reals,
-        F: Matrices,
-        C: Matrices,
-        strain: Strain,
-        adj_F_new: Matrices,
-        adj_a: mat33,
-        adj_F: Matrices,
-        adj_C: Matrices,
-        n: int,
-        p: int,
+        law: Law, F: mat33, C: mat33, strain: Strain, adj_F_new: mat33, weight: real, adj_a: mat33, carried: mat33
     ):
-        advance = wp.identity(n=3, dtype=real) + law.dt * read_matrix(C, n, law.first + p)
-        before = read_matrix(F, n, p)
-        weight, adj_after = law.scale * volume[n, law.first + p], read_matrix(adj_F_new, n, p)
-        adj_trial = respond_back(advance * before, strain, law.mu, law.lam, law.kappa, adj_after, weight, adj_a)
-        write_matrix(adj_F, n, p, wp.transpose(advance) * adj_trial)
-        adj_c = mass[n, law.first + p] * adj_a + law.dt * adj_trial * wp.transpose(before)
-        write_matrix(adj_C, n, law.first + p, adj_c)
+        step = advance(law, C)
+        adj_trial = turn_trial_back(step * F, strain, law.mu, law.lam, law.kappa, adj_F_new, weight, adj_a)
+        return wp.transpose(step) * adj_trial, carried + law.dt * adj_trial * wp.transpose(F)
 
-    return MaterialKernels(update, turn_back, affine_momentum, strain)
+    return Response(module, Law, mat33, respond, turn_back, strain, stress, Strain)
 
 
-@cache
-@no_type_check
-def kernels_in_rows(name: str) -> tuple[Any, Any]:
-    """Return (update, adjoint) of one precision for a CPU, in C++: eight particles at a time (`native/materials.h`)."""
-    numbers, _, _, matrices = precision(name).rows
-    declare = partial(cpp.kernel_in_rows, f"gradscape.plasticine.{name}.rows")
-    constants = [SMALLEST, ROUNDED, ROUND_OFF[name], TINY, SWEEPS]
-    given = {"law": law_struct(name, "mu", "lam", "kappa"), "mass": numbers, "volume": numbers}
-    given |= {"F": matrices, "C": matrices}
-    adjoints = dict.fromkeys(("adj_F_new", "adj_A", "adj_F", "adj_C"), matrices)
-    update = declare("plasticine_update", *constants, **given, F_new=matrices, A=matrices)
-    return update, declare("plasticine_adjoint", *constants, **given, **adjoints)
+def constants_of_rows(name: str) -> tuple[float, ...]:
+    """Return what the kernels of a CPU take of the above."""
+    return SMALLEST, ROUNDED, ROUND_OFF[name], TINY, SWEEPS
 
 
-# ---- Kernels of `plasticine` in float32 for a GPU: by series in its strain, without a decomposition where that is
-# small.
+# ---- Plasticine in float32 on a GPU: by series in its strain, without a decomposition where that is small.
 #
 # With J = det F, s = J^(1/3) and exp(d) the stretch that changes shape alone, so that F F^T = s^2 exp(2 d),
 #
@@ -374,22 +339,22 @@ def kernels_in_rows(name: str) -> tuple[Any, Any]:
 #
 # (Higham 2008, Functions of matrices, chapters 10 and 11.) Nothing here is divided by differences of singular values.
 # Plasticine that yields is never far from its yield surface, where strains are 0.05 at most. Where X is larger than
-# NEAR, or F almost flat, the kernels decompose F as `plasticine` does.
+# NEAR, or F almost flat, they decompose F as `responses` do.
 
 NEAR = 0.2  # Frobenius norm of X up to which series are as exact as float32 is
 
 
 @cache
-def series_kernels(name: str) -> MaterialKernels:
-    """Return the kernels of a GPU in float32, by series."""
-    found: MaterialKernels = kernels_of(name, series(name), cpp.module(f"gradscape.plasticine.series.{name}"))
+def response_by_series(name: str) -> Response:
+    """Return the functions of one precision, by series."""
+    found: Response = response_of(name, series(name), cpp.module(f"gradscape.plasticine.series.{name}"))
     return found
 
 
 @cache
 @no_type_check
 def series(name: str) -> SimpleNamespace:
-    """Return the functions `strain, respond, turn_back` of one precision, as `plasticine.responses` does."""
+    """Return the functions `strain, respond, turn_back` of one precision, as `responses` does."""
     types, decomposed = precision(name), responses(name)
     real, vec3, mat33 = types.real, types.vec3, types.mat33
     decompose, respond_far, turn_back_far = decomposed.strain, decomposed.respond, decomposed.turn_back

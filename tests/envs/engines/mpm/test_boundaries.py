@@ -40,9 +40,10 @@ def random(count, size, seed):
     return 2 * size * draw(count, 3, seed=seed)
 
 
-def test_empty_space_changes_nothing():
-    v = random(20, 3.0, seed=0)
-    assert torch.equal(built(Open())(random(20, 1.0, seed=1), v), v)
+def test_empty_space_and_the_tanks_inside_change_nothing(tank):
+    v, inside = random(3, 3.0, seed=0), vectors((0.19, 0.01, -0.19), (0.0, 0.3, 0.0), (-0.19, 0.59, 0.19))
+    assert torch.equal(built(Open())(random(3, 1.0, seed=1), v), v)
+    assert torch.equal(tank(inside, v), v)
 
 
 @pytest.mark.parametrize(
@@ -64,30 +65,29 @@ def test_walls_let_go_and_let_slide_but_let_nothing_in(tank, room, kind, place, 
     torch.testing.assert_close(met, v - through * inward)
 
 
-def test_inside_the_tank_velocities_are_free(tank):
-    p = vectors((0.19, 0.01, -0.19), (0.0, 0.3, 0.0), (-0.19, 0.59, 0.19))
-    v = random(3, 3.0, seed=3)
-    assert torch.equal(tank(p, v), v)
+DOWN = vectors((0, -0.01, 0))[0]  # in one control step, so 1 m/s
 
 
-def test_what_runs_into_the_ladle_is_rubbed_by_coulombs_law(tank):
-    p = (BELOW - vectors((0, TANK.half_thickness, 0))).expand(2, 3)  # on its outside, whose normal is down
-    fast, slow = (2.0, 1.0, 0.0), (0.1, 1.0, 0.1)
-    rubbed = tank(p, vectors(fast, slow), start=RIM)
-    torch.testing.assert_close(rubbed, vectors((2.0 - TANK.friction * 1.0, 0, 0), (0, 0, 0)), rtol=0, atol=1e-6)
-
-
-def test_what_leaves_the_ladle_is_free(tank):
-    p = (BELOW - vectors((0, TANK.half_thickness, 0))).expand(2, 3)
-    leaving = vectors((2.0, -0.5, 0.0), (0.0, -0.1, 1.0))
-    assert torch.equal(tank(p, leaving, start=RIM), leaving)
-
-
-def test_the_ladle_takes_along_what_it_hits(tank):
-    motion = vectors((0, -0.01, 0))[0]  # in one control step, so 1 m/s down
-    p = BELOW - vectors((0, TANK.half_thickness, 0))
-    met = tank(p, vectors((0, 0, 0)), start=RIM, end=RIM + motion)
-    torch.testing.assert_close(met, RATE * motion[None])
+@pytest.mark.parametrize(
+    ("v", "end", "wanted"),
+    [
+        ((2.0, 1.0, 0.0), RIM, (2.0 - TANK.friction * 1.0, 0, 0)),
+        ((0.1, 1.0, 0.1), RIM, (0, 0, 0)),
+        ((2.0, -0.5, 0.0), RIM, (2.0, -0.5, 0.0)),
+        ((0.0, -0.1, 1.0), RIM, (0.0, -0.1, 1.0)),
+        ((0, 0, 0), RIM + DOWN, tuple((RATE * DOWN).tolist())),
+    ],
+    ids=[
+        "what runs into it is rubbed",
+        "and stuck",
+        "what leaves is free",
+        "or slides off",
+        "what it hits it takes along",
+    ],
+)
+def test_the_ladle_stops_what_runs_into_it_by_coulombs_law(tank, v, end, wanted):
+    p = BELOW - vectors((0, TANK.half_thickness, 0))  # on its outside, whose normal is down
+    torch.testing.assert_close(tank(p, vectors(v), start=RIM, end=end), vectors(wanted), rtol=0, atol=1e-6)
 
 
 def test_the_ladles_grip_fades_over_the_band(tank):

@@ -68,7 +68,8 @@ def decomposed(F, name):
 
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("case", MATRICES)
-def test_factors_give_the_matrix_back_and_are_rotations(case, name):
+def test_factors_are_rotations_that_give_the_matrix_back_and_values_are_numpys(case, name):
+    """The last value bears the determinant's sign."""
     F = MATRICES[case].to(precision(name).torch).double()  # rounded as the function will see it
     U, s, V = decomposed(F, name)
     size = s[:, :2].amax(dim=1)[:, None, None]
@@ -76,13 +77,6 @@ def test_factors_give_the_matrix_back_and_are_rotations(case, name):
     for Q in (U, V):
         assert (Q.mT @ Q - IDENTITY).abs().max() < ROUND_OFF[name]
         assert (torch.linalg.det(Q) - 1).abs().max() < ROUND_OFF[name]
-
-
-@pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("case", MATRICES)
-def test_values_are_numpys_and_the_last_one_bears_the_sign(case, name):
-    F = MATRICES[case].to(precision(name).torch).double()
-    _, s, _ = decomposed(F, name)
     wanted = torch.from_numpy(np.linalg.svd(F.numpy(), compute_uv=False))
     error = (s.abs().sort(dim=1, descending=True).values - wanted).abs() / wanted[:, :1]
     assert error.max() < ROUND_OFF[name]

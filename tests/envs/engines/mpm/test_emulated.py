@@ -45,7 +45,7 @@ class Scattering:
         emulate(
             kernel,
             (ROWS, GPU_TEAM.threads(self.box, self.stretch)),
-            [self.lattice, ROWS, lists.struct, *inputs, parts],
+            [self.lattice, ROWS, lists, *inputs, parts],
         )
         momentum, velocity = self.zeros(self.box.cells, wp.vec4), self.zeros(self.box.cells, wp.vec4)
         now = substep_struct("float32")()
@@ -53,7 +53,7 @@ class Scattering:
         tools, sums = wp.zeros((ROWS, 1, 1), dtype=wp.vec3), wp.zeros((1, 1), dtype=wp.int64)
         given = [self.lattice, Open().data("float32", "cpu"), now, tools, sums, momentum, velocity]
         kernel = velocity_on("float32", Open(), columns=True)
-        emulate(kernel, (ROWS, self.box.cells), [*given, lists.struct, parts])
+        emulate(kernel, (ROWS, self.box.cells), [*given, lists, parts])
         found = torch.zeros(ROWS, self.box.cells, 4)
         for row, (count, _) in enumerate(to_torch(lists.touched).tolist()):
             found[row, to_torch(lists.nodes)[row, :count].long()] = to_torch(momentum)[row, :count]

@@ -14,49 +14,33 @@ from .bodies import free_model
 BATCH = 3
 
 
-parts = pytest.mark.parametrize(
-    "parts", [(1, 1), (7, 5), (1000, 64)], ids=["a CPU's", "that divide nothing", "more than particles"]
+@pytest.mark.parametrize(
+    ("shares", "lanes"), [(1, 1), (7, 5), (1000, 64)], ids=["a CPU's", "that divide nothing", "more than particles"]
 )
-
-
-def found(parts, change=lambda x, left: None, batch=BATCH):
+def test_corners_are_those_of_all_particles_of_the_batch_and_one_that_left_is_told(shares, lanes):
     allocator = Allocator(free_model(), BATCH, "cpu")
     frame, left = allocator.frame(), wp.zeros(BATCH, dtype=wp.int32, device="cpu")
-    x = to_torch(frame.x)
-    x[:] = torch.randn(x.shape, generator=torch.Generator().manual_seed(1), dtype=x.dtype)
-    change(x, to_torch(left))
-    one = Extent(allocator, Launches("cpu"), shares=parts[0], lanes=parts[1])
     needed = wp.array([5, 7, 6], dtype=wp.int32, device="cpu")
-    one.find(frame.x, left, needed, batch, small=False)
-    return x, *one.read()
+    one, x = Extent(allocator, Launches("cpu"), shares=shares, lanes=lanes), to_torch(frame.x)
+    x[:] = torch.randn(x.shape, generator=torch.Generator().manual_seed(1), dtype=x.dtype)
 
+    def found(batch):
+        one.find(frame.x, left, needed, batch, small=False)
+        return one.read()
 
-@parts
-@pytest.mark.parametrize("batch", [1, BATCH])
-def test_corners_are_those_of_all_particles_of_the_batch(parts, batch):
-    x, low, high, left, needed = found(parts, batch=batch)
-    assert (low == x[:batch].amin(dim=(0, 1)).numpy()).all()
-    assert (high == x[:batch].amax(dim=(0, 1)).numpy()).all()
-    assert not left
-    assert needed == (7 if batch == BATCH else 5)
-
-
-@parts
-def test_one_row_that_left_is_told(parts):
-    def leave(x, left):
-        left[1] = 2
-
-    assert found(parts, leave)[3]
-    assert not found(parts, leave, batch=1)[3]
-
-
-@parts
-@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
-def test_corners_are_not_finite_where_a_particle_is_not(parts, value):
-    def explode(x, left):
+    for batch in (1, BATCH):
+        low, high, gone, most = found(batch)
+        assert (low == x[:batch].amin(dim=(0, 1)).numpy()).all()
+        assert (high == x[:batch].amax(dim=(0, 1)).numpy()).all()
+        assert not gone
+        assert most == (7 if batch == BATCH else 5)
+    to_torch(left)[1] = 2
+    assert [found(batch)[2] for batch in (1, BATCH)] == [False, True]
+    for value in (torch.nan, torch.inf, -torch.inf):  # so that a loss which does not look at that particle is told
+        left.zero_()
         x[2, -1, 1] = value
-
-    _, low, high, left, _ = found(parts, explode)
-    assert not torch.tensor([*low, *high]).isfinite().all()
-    assert left
-    assert not found(parts, explode, batch=2)[3]
+        low, high, gone, _ = found(BATCH)
+        assert not torch.tensor([*low, *high]).isfinite().all()
+        assert gone
+        left.zero_()
+        assert not found(2)[2]

@@ -96,20 +96,14 @@ def kernels():
     return Kernels(model(0.7, seed=1), 3)
 
 
-def test_fluid_at_rest_keeps_its_volume_ratios():
-    tank = model(seed=2)
+@pytest.mark.parametrize("gravity", [0.0, GRAVITY])
+def test_fluid_at_rest_keeps_its_volume_ratios(gravity):
+    tank = model(seed=2, gravity=gravity)
     x = positions(tank)
-    J = torch.from_numpy(EVEN.volume_ratio(DENSITY * GRAVITY * (SIDE - x.numpy()[..., 1])))
-    assert J.max() - J.min() > 0.05
-    torch.testing.assert_close(smoothed(tank, J), J, rtol=1e-14, atol=0)
-    ours = Kernels(tank, 1)
-    torch.testing.assert_close(ours.run(x, J), J, rtol=1e-14, atol=0)
-
-
-def test_without_gravity_one_ratio_stays_what_it_is():
-    space = model(seed=3, gravity=0.0)
-    J = torch.full((1, COUNT**3), 0.93, dtype=torch.float64)
-    torch.testing.assert_close(smoothed(space, J), J, rtol=1e-14, atol=0)
+    J = torch.from_numpy(EVEN.volume_ratio(1e4 + DENSITY * gravity * (SIDE - x.numpy()[..., 1])))
+    assert (J.max() - J.min() > 0.05) == (gravity > 0)
+    for found in (smoothed(tank, J), Kernels(tank, 1).run(x, J)):
+        torch.testing.assert_close(found, J, rtol=1e-14, atol=0)
 
 
 def test_unevenness_goes_and_a_slope_across_the_fluid_stays_inside():
@@ -165,30 +159,6 @@ def test_the_kernels_do_what_the_reference_does(kernels):
     wanted = torch.autograd.grad((smoothed(kernels.model, J, x) * weight).sum(), (x, J))
     for ours, theirs in zip(kernels.run_back(weight), wanted, strict=True):
         torch.testing.assert_close(ours, theirs, rtol=0, atol=1e-12 * float(theirs.abs().max()))
-
-
-def test_the_adjoint_is_the_slope(kernels):
-    x, J = positions(kernels.model, 3), rough(kernels.model, batch=3)
-    generator = torch.Generator().manual_seed(8)
-    kernels.run(x, J)
-    weight = rough(kernels.model, seed=9, batch=3) - 1
-    adjoints = kernels.run_back(weight)
-    ways = [torch.rand(t.shape, generator=generator, dtype=torch.float64) - 0.5 for t in (x, J)]
-    for way, adjoint, scale in zip(ways, adjoints, (DX, 1.0), strict=True):
-        slope, errors = float((adjoint * way).sum()), []
-        for step in (1e-4, 1e-5, 1e-6):
-            moves = [(step * scale * way, 0 * J) if way is ways[0] else (0 * x, step * way)]
-            ends = [float((kernels.run(x + s * a, J + s * b) * weight).sum()) for s in (1, -1) for a, b in moves]
-            errors.append(abs((ends[0] - ends[1]) / (2 * step * scale) - slope) / abs(slope))
-        assert min(errors) < 1e-7
-
-
-def test_two_runs_have_the_same_bits(kernels):
-    x, J = positions(kernels.model, 3), rough(kernels.model, batch=3)
-    first, back = kernels.run(x, J), kernels.run_back(J - 1)
-    assert torch.equal(kernels.run(x, J), first)
-    for again, before in zip(kernels.run_back(J - 1), back, strict=True):
-        assert torch.equal(again, before)
 
 
 def test_particles_in_the_middle_of_cells_are_neighbours_of_nobody_else():

@@ -109,16 +109,6 @@ def test_matter_slides_on_a_tool_by_coulombs_law(kind, motion):
 
 
 @KINDS
-def test_a_sticky_tool_takes_along_what_it_hits(kind):
-    p, normal, same = nodes_at(kind, torch.full((300,), -1e-3, dtype=torch.float64))
-    motion = (0.01, -0.03, 0.02)
-    body = RATE * vectors(motion)
-    met = room(Tool(kind, SIZES[kind], 1e6))(p, torch.zeros_like(p), slots(kind, PLACE, motion))
-    hit = same & (dot(-body, normal) < -1e-2)[:, 0]
-    torch.testing.assert_close(met[hit], body.expand_as(met)[hit], rtol=0, atol=1e-9)
-
-
-@KINDS
 def test_the_grip_fades_in_the_shell(kind):
     gaps = torch.linspace(0, 0.999, 300, dtype=torch.float64) * SHELL
     p, normal, same = nodes_at(kind, gaps)

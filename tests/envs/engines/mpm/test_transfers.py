@@ -1,11 +1,12 @@
 """Transfers between particles and grid: conservation laws, exactness on affine fields, and formulas in torch."""
 
-from itertools import product
+from types import SimpleNamespace
 
 import pytest
 import torch
 import warp as wp
 
+from gradscape.envs.engines.mpm.smoothing import _stencil
 from gradscape.envs.engines.mpm.transfers import transfers
 from gradscape.envs.engines.runtime import precision, to_torch
 
@@ -88,14 +89,8 @@ def outside(x):
 
 def stencil(x):
     """Return the numbers of the 27 nodes around each particle, their weights, and how far they are from it [m]."""
-    s, nodes = (x - torch.tensor(ORIGIN, dtype=torch.float64)) / DX, torch.tensor(NODES)
-    base = (s.detach() - 0.5).floor().long().clamp_min(0).minimum(nodes - 3)
-    f = s - base
-    along = torch.stack([(1.5 - f) ** 2 / 2, 0.75 - (f - 1) ** 2, (f - 0.5) ** 2 / 2], dim=-1)
-    weight = torch.einsum("bpi,bpj,bpk->bpijk", *along.unbind(dim=2)).flatten(2)
-    offsets = torch.tensor(list(product(range(3), repeat=3)))
-    i, j, k = (base[:, :, None] + offsets).unbind(dim=3)
-    return (i * NODES[1] + j) * NODES[2] + k, weight, DX * (offsets - f[:, :, None])
+    node, weight = _stencil(SimpleNamespace(origin=ORIGIN, dx=DX, nodes=NODES), x)
+    return node, weight, node_positions()[node] - x[:, :, None]
 
 
 def reference_p2g(x, v, a):

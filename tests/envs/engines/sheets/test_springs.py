@@ -198,11 +198,6 @@ def test_a_finer_chain_sags_as_a_continuous_one_does():
         assert sag / (0.3 * 9.81 / (2 * K)) == pytest.approx(1 + 1 / n, rel=1e-8)
 
 
-def test_twice_the_stiffness_halves_the_sag():
-    soft, stiff = (hang(chain(4), k) - torch.from_numpy(chain(4).x) for k in (K, 2 * K))
-    torch.testing.assert_close(soft, 2 * stiff, rtol=0, atol=1e-9)
-
-
 def test_columns_of_a_cloth_hung_from_its_upper_edge_sag_like_chains():
     cells = 4
     points = lattice.square(cells)
@@ -327,20 +322,6 @@ def test_the_adjoint_is_autograds_of_the_same_steps_written_as_loops(differentia
             scale = float(theirs.abs().max())
             assert scale > 1e-5
             torch.testing.assert_close(ours[row], theirs, rtol=0, atol=1e-10 * scale)
-
-
-def test_the_adjoint_is_the_slope_between_jumps(differentiated):
-    _, solver, _, inputs, adj_end, _, gradient = differentiated
-    step, rng = 1e-8, torch.Generator().manual_seed(5)
-    for _ in range(3):
-        ways = [torch.randn(part.shape, generator=rng, dtype=torch.float64) for part in inputs]
-        ends = [
-            solver.run(*(p + sign * step * way for p, way in zip(inputs, ways, strict=True)))[-1] * adj_end
-            for sign in (1, -1)
-        ]
-        slope = (ends[0] - ends[1]).sum(dim=(1, 2)) / (2 * step)
-        ours = sum((g * way).flatten(1).sum(dim=1) for g, way in zip(gradient, ways, strict=True))
-        torch.testing.assert_close(ours, slope, rtol=1e-6, atol=1e-6)
 
 
 def test_a_second_gradient_is_not_added_to_the_first(differentiated):
