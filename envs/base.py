@@ -399,8 +399,8 @@ class Environment(Objective):
     @property
     def horizon(self) -> float | None:
         """How long an episode is, in the unit of the setting that says so; None where none does."""
-        value = vars(self.options).get(self.horizon_option)
-        return None if value is None else float(value)
+        value = {**vars(self.options), **self.fidelity.settings}.get(self.horizon_option)
+        return float(value) if isinstance(value, int | float) else None
 
     def with_horizon(self, horizon: float) -> Environment:
         """Return this environment with episodes of another length, in whole numbers where its setting is one.

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -16,58 +15,22 @@ from torch import Tensor
 
 from ...landscapes.objective import SimulatorError
 from ..base import check_shape
-from ..user_functions import Backend, Compute, Function
-from .runtime import cuda_available, precision
+from ..user_functions import Compute, Function
+from .runtime import cuda_available as cuda_available
+from .runtime import precision as types_of
 from .warp_origins import warp_origin, wrong_kernel
 
 CORRUPTS = "This may corrupt gradient computation"  # how Warp ends what it says of an array that is overwritten
 
 
-@dataclass(frozen=True)
-class WarpBackend(Backend):
-    """Call functions that launch Warp kernels."""
+class WarpCompute(Compute):
+    """Call a function that launches Warp kernels; it is `unchecked` until one has looked for what is overwritten."""
 
-    engine = "warp"
-    check_overwrites: bool
-    device: str = "auto"
-
-    def has_cuda(self) -> bool:
-        """Say whether Warp finds a CUDA device."""
-        return cuda_available()
-
-    def bind(self, call: Function, settings: Mapping[str, Any], precision: str, device: str) -> Compute:
-        """Return what computes the function with these keyword arguments."""
-        fn = partial(call.fn, **settings)
-        return WarpFunction(fn, call.name, precision, device, unchecked=self.check_overwrites)
-
-    def nan_origin(
-        self, call: Function, settings: Mapping[str, Any], precision: str, device: str, x: Float[Tensor, "one dim"]
-    ) -> str:
-        """Return which kernel makes the gradient at a point not finite, and by which argument."""
-        return self._looked_at(call, settings, precision, device).nan_origin(x)
-
-    def wrong_origin(
-        self, call: Function, settings: Mapping[str, Any], precision: str, device: str, x: Float[Tensor, "one dim"]
-    ) -> str:
-        """Return which kernel's adjoint differs from its differences at a point."""
-        return self._looked_at(call, settings, precision, device).wrong_origin(x)
-
-    def _looked_at(self, call: Function, settings: Mapping[str, Any], precision: str, device: str) -> WarpFunction:
-        return WarpFunction(partial(call.fn, **settings), call.name, precision, device, unchecked=False)
-
-
-@dataclass(eq=False)
-class WarpFunction:
-    """A function of Warp points; `unchecked` until it has looked for what is overwritten."""
-
-    fn: Callable[[Any], Any]
-    name: str
-    precision: str
-    device: str
-    unchecked: bool
-
-    def __post_init__(self) -> None:
-        self.real = precision(self.precision).real
+    def __init__(
+        self, unchecked: bool, call: Function, settings: Mapping[str, Any], precision: str, device: str
+    ) -> None:
+        self.unchecked, self.fn, self.name = unchecked, partial(call.fn, **settings), call.name
+        self.precision, self.real, self.device = precision, types_of(precision).real, device
 
     def __call__(self, x: Float[Tensor, "batch dim"], grad: bool) -> tuple[Tensor, Tensor | None, str]:
         """Return losses, gradients if asked for, and the type of numbers that losses come in."""
