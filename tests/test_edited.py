@@ -312,32 +312,19 @@ class Throw(Environment):
     def _evaluate(self, x, *, grad):
         x = x.requires_grad_(grad)
         mass = float(Path(__file__).with_name("mass.txt").read_text())
-        scale = float(Path(__file__).with_name("body.xml").read_text().split('"')[1])
-        loss = mass * scale * force(x) + work(x) + memory(x)
+        loss = mass * force(x) + x[:, 0] + 0.5 * x[:, 1]
         slope = torch.autograd.grad(loss.sum(), x)[0] if grad else None
         return Evaluation.from_results(loss.detach(), slope)
-
-
-def work(x):
-    return x[:, 0]
-
-
-def memory(x):
-    return 0.5 * x[:, 1]
 """
 FILES = {
     "my.py": MINE,
     "helper.py": "def soft(x):\n    return (x**2).sum(dim=1)\n\n\ndef hard(x):\n    return (x**4).sum(dim=1)\n",
     "mass.txt": "1.0",
-    "body.xml": '<geom size="1.0"/>',
 }
 EDITS = {
     "an imported module": ("helper.py", "x**2", "x**3"),
     "an import line": ("my.py", "import soft as", "import hard as"),
     "a data file": ("mass.txt", "1.0", "2.0"),
-    "a model's file": ("body.xml", "1.0", "3.0"),
-    "a function called work": ("my.py", "return x[:, 0]", "return 2 * x[:, 0]"),
-    "a function called memory": ("my.py", "return 0.5 *", "return 0.6 *"),
 }
 COMMANDS = (
     "slice my.py:Throw --dims 0 1 --resolution 6 --out cut",

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -139,37 +140,23 @@ class WarpCompute(Compute):
 
 @contextmanager
 def _overwrites() -> Iterator[list[str]]:
-    """Let Warp look for arrays that are written to after they were read, and gather what it says of them."""
-    listener, logger = _Listener(), wp.get_logger()
+    """Let Warp look for arrays that are written to after they were read, and gather what it says of them alone."""
+    said, logger = list[str](), wp.get_logger()
+
+    def warning(message: str, category: Any = None, stacklevel: int = 1) -> None:
+        if CORRUPTS in message:  # from where the array's own text ends
+            said.append(" ".join(message.split(" passed to ", 1)[-1].split(CORRUPTS)[0].split()))
+
+    def drop(message: str) -> None: ...
+
     level, verify = wp.config.log_level, wp.config.verify_autograd_array_access
-    wp.set_logger(listener)
+    wp.set_logger(SimpleNamespace(warning=warning, debug=drop, info=drop, error=drop))
     wp.config.log_level, wp.config.verify_autograd_array_access = wp.LOG_WARNING, True
     try:
-        yield listener.said
+        yield said
     finally:
         wp.config.log_level, wp.config.verify_autograd_array_access = level, verify
         wp.set_logger(logger)
-
-
-class _Listener:
-    """Keep what Warp says of arrays that are overwritten, and nothing else."""
-
-    def __init__(self) -> None:
-        self.said: list[str] = []
-
-    def warning(self, message: str, category: Any = None, stacklevel: int = 1) -> None:
-        """Keep a warning of an overwritten array, from where the array's own text ends."""
-        if CORRUPTS in message:
-            self.said.append(" ".join(message.split(" passed to ", 1)[-1].split(CORRUPTS)[0].split()))
-
-    def debug(self, message: str) -> None:
-        """Drop it."""
-
-    def info(self, message: str) -> None:
-        """Drop it."""
-
-    def error(self, message: str) -> None:
-        """Drop it: what fails raises."""
 
 
 def _wanted_type(error: Exception, real: Any) -> str:

@@ -85,19 +85,6 @@ def test_gradients_pass_while_a_tool_moves_and_stop_where_it_is_stopped():
     assert grad[0, :, 1].tolist() == [SPAN] * 6
 
 
-@pytest.mark.parametrize("size", [1.0, 100.0])
-def test_paths_and_gradients_have_the_bits_of_one_step_after_the_other(size):
-    velocity, weight = velocities(4, 30, 2, size=size).requires_grad_(), velocities(4, 31, 2)
-    positions = [START.expand(4, -1)]
-    for step in range(30):
-        positions.append(torch.clamp(positions[-1] + SPAN * velocity[:, step], LOWER, UPPER))
-    plain = torch.stack(positions, dim=1)
-    assert torch.equal(drive(velocity), plain)
-    found, wanted = (torch.autograd.grad((path * weight).sum(), velocity)[0] for path in (drive(velocity), plain))
-    assert torch.equal(found, wanted)
-    assert (found == 0).any() == (size > 1)
-
-
 def test_the_map_from_segments_to_path_is_differentiated():
     segments = velocities(2, 3, 2, size=20).requires_grad_()
     assert torch.autograd.gradcheck(lambda s: drive(hold(s, 6)), (segments,))

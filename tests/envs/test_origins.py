@@ -28,10 +28,6 @@ def torch_where(p):
     return torch.where(p[:, 0] > 0, root, p[:, 1])
 
 
-def torch_acos(p):
-    return torch.acos(p[:, 0]) + p[:, 1]
-
-
 def torch_ratio(p):
     ratio = p[:, 0] / p[:, 1]
     return ratio.nan_to_num() + p[:, 0]
@@ -63,10 +59,6 @@ def jax_norm(p):
 def jax_where(p):
     root = jnp.sqrt(p[0])
     return jnp.where(p[0] > 0, root, p[1])
-
-
-def jax_acos(p):
-    return jnp.arccos(p[0]) + p[1]
 
 
 def jax_ratio(p):
@@ -122,7 +114,6 @@ def jax_own(p):
 TORCH = [
     (torch_norm, ORIGIN, "sqrt", "return squares.sqrt()"),
     (torch_where, NEGATIVE, "sqrt", "root = p[:, 0].sqrt()"),
-    (torch_acos, ONE, "acos", "return torch.acos(p[:, 0]) + p[:, 1]"),
     (torch_ratio, ORIGIN, "div", "ratio = p[:, 0] / p[:, 1]"),
     (torch_own, ONE, "Slip", "return Slip.apply(p[:, 0])"),
 ]
@@ -137,7 +128,6 @@ def jax_single(p, key=0):
 JAX = [
     (jax_norm, ORIGIN, "sqrt", "size = jnp.linalg.norm(p)"),
     (jax_where, NEGATIVE, "sqrt", "root = jnp.sqrt(p[0])"),
-    (jax_acos, ONE, "acos", "return jnp.arccos(p[0]) + p[1]"),
     (jax_ratio, ORIGIN, "div", "ratio = p[0] / p[1]"),
     (jax_jitted, ORIGIN, "sqrt", "return jnp.linalg.norm(p)"),
     (jax_loop, ORIGIN, "sqrt", "length = jnp.linalg.norm(state)"),
@@ -163,12 +153,6 @@ def _length(p: wp.array(dtype=wp.vec2d), loss: wp.array(dtype=wp.float64)):
 def _root(p: wp.array(dtype=wp.vec2d), loss: wp.array(dtype=wp.float64)):
     i = wp.tid()
     loss[i] = wp.where(p[i][0] > wp.float64(0.0), wp.sqrt(p[i][0]), p[i][1])
-
-
-@wp.kernel
-def _angle(p: wp.array(dtype=wp.vec2d), loss: wp.array(dtype=wp.float64)):
-    i = wp.tid()
-    loss[i] = wp.acos(p[i][0])
 
 
 @wp.kernel
@@ -250,19 +234,6 @@ def test_warp_says_the_kernel_and_the_argument(kernel, x):
     line = LINES.index(next(one for one in LINES if one.startswith(f"def {name}(")))  # of the decorator above
     assert quiet_origin(objective, x) == f"kernel {name} in line {line} of test_origins.py, by its argument p"
     assert objective.nan_origin(torch.tensor([0.3, 0.7]).double()) == ""
-
-
-def test_nothing_is_said_of_an_arc_cosine_whose_end_warp_guards():
-    objective = gs.from_warp(warp_through(_angle), SPACE, precision="float64", device="cpu")
-    assert bool(objective.evaluate(ONE[None]).has_gradient)
-    assert objective.nan_origin(ONE) == ""
-
-
-@pytest.mark.parametrize(
-    "objective", [gs.from_torch(torch_norm, SPACE), gs.from_jax(jax_norm, SPACE), gs.make("branin")]
-)
-def test_nothing_is_said_where_the_gradient_is_finite(objective):
-    assert objective.nan_origin(objective.space.center + 0.3) == ""
 
 
 def test_what_wraps_an_objective_passes_it_on():
