@@ -46,22 +46,6 @@ def test_a_ramp_is_linear_between_waypoints_whatever_the_number_of_steps(steps):
         assert torch.equal(path[:, :: steps // 5], corners)
 
 
-def test_every_waypoint_moves_its_own_two_segments_of_a_ramp():
-    """The shares of a waypoint are a hat function: over 2 x 6 steps they add up to 6; the last has only half a hat."""
-    waypoints = velocities(2, 5, 2).requires_grad_()
-    (grad,) = torch.autograd.grad(ramp(START, waypoints, 30).sum(), waypoints)
-    hats = torch.tensor([6.0, 6.0, 6.0, 6.0, 3.5], dtype=torch.float64)
-    torch.testing.assert_close(grad, hats[:, None].expand(2, 5, 2))
-
-
-def test_a_tool_travels_speed_times_time_within_its_reach():
-    path = drive(velocities(4, 30, 2))
-    assert path.shape == (4, 31, 2)
-    torch.testing.assert_close(
-        path, START + torch.nn.functional.pad(SPAN * velocities(4, 30, 2), (0, 0, 1, 0)).cumsum(1)
-    )
-
-
 def test_a_tool_stops_at_its_limits_and_turns_back_at_once():
     there, back = torch.full((1, 50, 2), 9.0, dtype=torch.float64), torch.full((1, 3, 2), -1.0, dtype=torch.float64)
     path = drive(torch.cat([there, back], dim=1))

@@ -66,21 +66,14 @@ def _fluid(name: str) -> tuple[Any, Any]:
     """J' = min(exp(dt tr C) J, TORN), tau = K log J' I + J' mu (C + C^T - 2/3 tr C I)."""
     real, array = types(name)
 
-    @ti.kernel
-    def update(
-        s: ti.i32, batch: ti.i32, first: ti.i32, dt: real, scale: real, bulk: real, viscosity: real,
-        mass: array(1), volume: array(1), C: array(3, 3, 3), J: array(3), A: array(3, 3, 3),
-    ):  # fmt: skip
-        for e, p in ti.ndrange(batch, J.shape[2]):
-            c = C[s, e, first + p]
-            one = ti.Matrix.identity(real, 3)
-            j = ti.min(ti.exp(dt * c.trace()) * J[s, e, p], real(TORN))
-            shear = c + c.transpose() - real(2.0 / 3.0) * c.trace() * one
-            tau = bulk * ti.log(j) * one + j * viscosity * shear
-            J[s + 1, e, p] = j
-            A[s, e, first + p] = scale * volume[first + p] * tau + mass[first + p] * c
+    @ti.func
+    def law(J, c, dt, bulk, viscosity):
+        one = ti.Matrix.identity(real, 3)
+        j = ti.min(ti.exp(dt * c.trace()) * J, real(TORN))
+        shear = c + c.transpose() - real(2.0 / 3.0) * c.trace() * one
+        return j, bulk * ti.log(j) * one + j * viscosity * shear
 
-    return update, update.grad
+    return _by_the_compiler(name, law, array(3))
 
 
 @cache
@@ -89,17 +82,29 @@ def _elastic(name: str) -> tuple[Any, Any]:
     """F' = (I + dt C) F, tau = mu (F' F'^T - I) + lam log(det F') I."""
     real, array = types(name)
 
+    @ti.func
+    def law(F, c, dt, mu, lam):
+        one = ti.Matrix.identity(real, 3)
+        f = (one + dt * c) @ F
+        return f, mu * (f @ f.transpose() - one) + lam * ti.log(f.determinant()) * one
+
+    return _by_the_compiler(name, law, array(3, 3, 3))
+
+
+@no_type_check
+def _by_the_compiler(name: str, law: Any, states: Any) -> tuple[Any, Any]:
+    """Return the kernels of a law (S, C, dt, two constants) -> (S', tau) whose adjoint is the compiler's."""
+    real, array = types(name)
+
     @ti.kernel
     def update(
-        s: ti.i32, batch: ti.i32, first: ti.i32, dt: real, scale: real, mu: real, lam: real,
-        mass: array(1), volume: array(1), C: array(3, 3, 3), F: array(3, 3, 3), A: array(3, 3, 3),
+        s: ti.i32, batch: ti.i32, first: ti.i32, dt: real, scale: real, one: real, other: real,
+        mass: array(1), volume: array(1), C: array(3, 3, 3), S: states, A: array(3, 3, 3),
     ):  # fmt: skip
-        for e, p in ti.ndrange(batch, F.shape[2]):
+        for e, p in ti.ndrange(batch, S.shape[2]):
             c = C[s, e, first + p]
-            one = ti.Matrix.identity(real, 3)
-            f = (one + dt * c) @ F[s, e, p]
-            tau = mu * (f @ f.transpose() - one) + lam * ti.log(f.determinant()) * one
-            F[s + 1, e, p] = f
+            new, tau = law(S[s, e, p], c, dt, one, other)
+            S[s + 1, e, p] = new
             A[s, e, first + p] = scale * volume[first + p] * tau + mass[first + p] * c
 
     return update, update.grad

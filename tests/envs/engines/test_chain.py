@@ -104,16 +104,6 @@ def test_the_equations_of_motion_are_euler_and_lagranges():
     torch.testing.assert_close(force, wanted, rtol=1e-7, atol=1e-6)
 
 
-def test_energy_is_conserved_without_control_to_the_integrators_order():
-    errors = []
-    for dt in (1 / 400, 1 / 800, 1 / 1600):
-        phi, p = move(BENT, REST, FREE[:, None], dt=dt, hold=round(1 / dt))
-        totals = energy(phi[:: round(0.1 / dt), 0], p[:: round(0.1 / dt), 0])
-        errors.append(float((totals - totals[0]).abs().max()))
-    np.testing.assert_allclose(np.log2(np.divide(errors[:-1], errors[1:])), 4, atol=0.25)
-    assert errors[-1] < 1e-9
-
-
 def test_motions_converge_at_fourth_order():
     control = torch.tensor([[[0.5, 3.0, -2.0, 0.4], [-1.0, -4.0, 1.0, -0.3]]], dtype=torch.float64)
     ends = [move(BENT, REST, control, dt=0.4 / hold, hold=hold)[0][-1] for hold in (20, 40, 80, 640)]

@@ -1,4 +1,4 @@
-"""Which kernel of Warp makes a finite gradient wrong: one whose adjoint is not that of what it computes."""
+"""Which kernel of Warp makes a gradient NaN, or a finite one wrong: its adjoint is not that of what it computes."""
 
 import numpy as np
 import pytest
@@ -39,6 +39,12 @@ def _take(x: wp.array2d(dtype=float), out: wp.array(dtype=float)):
 def _own_adjoint(a: wp.array(dtype=float), out: wp.array(dtype=float)):
     i = wp.tid()
     out[i] = doubled(a[i])
+
+
+@wp.kernel
+def _root(a: wp.array(dtype=float), out: wp.array(dtype=float)):
+    i = wp.tid()
+    out[i] = wp.where(a[i] > 0.5, wp.sqrt(a[i] - 0.5), a[i])  # below 0.5 the slope of what is not taken is NaN
 
 
 @wp.kernel
@@ -138,6 +144,17 @@ def test_the_kernel_with_another_adjoint_than_its_own_is_named(fn, name, capfd):
     objective.evaluate(X[None])
     capfd.readouterr()
     assert objective.wrong_origin(X).startswith(f"kernel {name} in line ")
+    assert capfd.readouterr() == ("", "")
+
+
+def test_the_kernel_and_the_argument_by_which_a_gradient_is_not_finite_are_named(capfd):
+    objective = of(through(_root))
+    assert objective.nan_origin(torch.tensor([1.0, 1.0], dtype=torch.float64)) == ""
+    objective.evaluate(torch.tensor([[0.2, 0.2]], dtype=torch.float64))
+    capfd.readouterr()
+    said = objective.nan_origin(torch.tensor([0.2, 0.2], dtype=torch.float64))
+    line = _root.adj.fun_lineno
+    assert said == f"kernel _root in line {line} of test_warp_origins.py, by its argument a"
     assert capfd.readouterr() == ("", "")
 
 

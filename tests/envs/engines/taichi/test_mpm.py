@@ -15,8 +15,7 @@ from gradscape.envs.engines.mpm.model import Body, Model
 from gradscape.envs.engines.taichi import mpm as taichi_mpm
 from gradscape.envs.engines.taichi.mpm import boundary_contact, kernels
 from gradscape.envs.engines.taichi.runtime import real, start
-from gradscape.envs.mpm import fluid, plasticine
-from gradscape.envs.mpm.plasticine_scenes import RollingPin
+from gradscape.envs.mpm import fluid
 
 from ..bench import DT, IDENTITY, MASS, SCALE, VOLUME, MaterialBench, draw, rotations, vectors
 
@@ -27,24 +26,12 @@ SPONGE = Elastic(1000.0, 2e4, 0.3)
 CLAY = Plasticine(1000.0, 2e4, 0.3, yield_stress=100.0)
 
 
-def shortened(model, tools, steps=20):
-    return replace(model, steps=steps), tools[:, : steps + 1].contiguous()
-
-
 def scene(**options):
     """Return the coarsest fluid scene with these options, and two paths of its ladle."""
     tiny = Fidelity("tiny", dt=fluid.SPAN / 2, precision="float64", resolution=6, sampling=1.5)
     environment = fluid.Fluid(fidelity=tiny, device="cpu", **options)
     x = torch.stack([environment.example("scoop"), 2 * draw(10, seed=1)])
-    return shortened(environment.model, environment.tools(x))
-
-
-def rolling():
-    """Return a coarse rolling-pin scene, and two paths of its pin."""
-    tiny = replace(RollingPin.fidelities["draft"], dt=plasticine.SPAN / 5, resolution=16, particles=100)
-    environment = RollingPin(fidelity=replace(tiny, precision="float64"), device="cpu")
-    x = torch.stack([environment.example("demonstration"), 2 * draw(environment.space.dim, seed=2)])
-    return shortened(environment.model, environment.tools(x))
+    return replace(environment.model, steps=20), environment.tools(x)[:, :21].contiguous()
 
 
 def block(material, x):
@@ -74,9 +61,7 @@ def crowded(friction=0.5, **changes):
 
 
 MODELS = {
-    "fluid": scene,
     "bowl between sticky walls": lambda: scene(handle=False, walls="stick"),
-    "rolling-pin": rolling,
     "crowded": crowded,
     "sticky": lambda: crowded(STICKY),
 }
