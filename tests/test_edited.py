@@ -1,7 +1,6 @@
 """A simulator that was edited does not continue with what was stored before: it is refused with both numbers."""
 
 import os
-import shutil
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -298,7 +297,6 @@ MINE = """
 from pathlib import Path
 import torch
 from gradscape import Environment, Evaluation, ParameterSpace
-import helper
 from helper import soft as force
 
 
@@ -313,55 +311,35 @@ class Throw(Environment):
         slope = torch.autograd.grad(loss.sum(), x)[0] if grad else None
         return Evaluation.from_results(loss.detach(), slope)
 """
-FILES = {
-    "my.py": MINE,
-    "helper.py": "def soft(x):\n    return (x**2).sum(dim=1)\n\n\ndef hard(x):\n    return (x**4).sum(dim=1)\n",
-    "mass.txt": "1.0",
-}
-EDITS = {
-    "an imported module": ("helper.py", "x**2", "x**3"),
-    "an import line": ("my.py", "import soft as", "import hard as"),
-    "a data file": ("mass.txt", "1.0", "2.0"),
-}
+HELPER = "def soft(x):\n    return (x**2).sum(dim=1)\n"
 COMMANDS = (
     "slice my.py:Throw --dims 0 1 --resolution 6 --out cut",
     "optimize my.py:Throw --method random --budget 4 --out run",
 )
 
 
-@pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A slice and a run of a class in a file."""
-    folder = tmp_path_factory.mktemp("made")
-    for name, content in FILES.items():
-        (folder / name).write_text(content)
-    for command in COMMANDS:
-        done = alone(partial(landscape, *command.split()), folder)
-        assert done.returncode == 0, done.stderr
-    return folder
+@pytest.mark.parametrize("edited_file", ["helper.py", "mass.txt"])
+def test_an_edit_of_what_a_class_uses_is_noticed_where_it_changes_a_number(tmp_path: Path, edited_file: str) -> None:
+    """Between two commands: of an imported module within a second, or of a data file."""
 
+    def edit(name: str, before: str, after: str) -> None:
+        file = tmp_path / name
+        written = file.stat().st_mtime_ns
+        assert before in file.read_text()
+        file.write_text(file.read_text().replace(before, after))
+        os.utime(file, ns=(written, written))
 
-@pytest.mark.parametrize("edit", EDITS)
-def test_an_edit_of_anything_that_a_class_uses_is_noticed(made: Path, tmp_path: Path, edit: str) -> None:
-    shutil.copytree(made, tmp_path / "here")
-    name, before, after = EDITS[edit]
-    file = tmp_path / "here" / name
-    assert before in file.read_text()
-    written = file.stat().st_mtime_ns
-    file.write_text(file.read_text().replace(before, after))
-    os.utime(file, ns=(written, written))  # as when the edit follows within a second
-    for command in COMMANDS:
-        done = alone(partial(landscape, *command.split()), tmp_path / "here")
-        assert done.returncode == 2, done.stderr
-        assert "of mine whose losses are others now:" in done.stderr
-        assert done.stderr.strip().count("\n") == 0, done.stderr
-
-
-def test_commands_go_on_after_an_edit_that_changes_no_number(made: Path, tmp_path: Path) -> None:
-    shutil.copytree(made, tmp_path / "here")
-    helper = tmp_path / "here/helper.py"
-    helper.write_text(helper.read_text().replace("x", "points"))
-    for command in COMMANDS:
-        done = alone(partial(landscape, *command.split()), tmp_path / "here")
-        assert done.returncode == 0, done.stderr
-        assert "are there already" in done.stderr
+    for name, content in {"my.py": MINE, "helper.py": HELPER, "mass.txt": "1.0"}.items():
+        (tmp_path / name).write_text(content)
+    commands = COMMANDS if edited_file == "helper.py" else COMMANDS[:1]
+    for step in range(3):
+        if step == 1:
+            edit("helper.py", "x", "points")
+        if step == 2:
+            edit(edited_file, *{"helper.py": ("**2", "**3"), "mass.txt": ("1.0", "2.0")}[edited_file])
+        for command in commands:
+            done = alone(partial(landscape, *command.split()), tmp_path)
+            assert done.returncode == (2 if step == 2 else 0), done.stderr
+            assert ("are there already" in done.stderr) is (step == 1)
+            assert ("of mine whose losses are others now:" in done.stderr) is (step == 2)
+            assert step < 2 or done.stderr.strip().count("\n") == 0

@@ -84,12 +84,10 @@ def restitution(ball: Ball) -> float:
     return math.exp(-zeta / root * math.atan2(root, zeta))
 
 
-def instant_flight(ball: Ball, y: float, v: float, time: float) -> tuple[float, int]:
-    """Return the height of a ball that leaves the ground at once, with the effective restitution, and its bounces."""
-    bounces, e = 0, restitution(ball)
+def instant_flight(ball: Ball, y: float, v: float, time: float) -> float:
+    """Return the height of a ball that leaves the ground at once, with the effective restitution."""
     while True:
         lasting = (v + math.sqrt(v**2 + 2 * ball.gravity * (y - ball.radius))) / ball.gravity
         if lasting >= time:
-            return y + v * time - ball.gravity * time**2 / 2, bounces
-        time, y, v = time - lasting, ball.radius, -e * (v - ball.gravity * lasting)
-        bounces += 1
+            return y + v * time - ball.gravity * time**2 / 2
+        time, y, v = time - lasting, ball.radius, -restitution(ball) * (v - ball.gravity * lasting)

@@ -69,7 +69,7 @@ def test_a_stiffer_contact_comes_closer_to_an_instantaneous_bounce():
         ball = replace(BALL, ke=stiffer * BALL.ke, kd=math.sqrt(stiffer) * BALL.kd)
         assert restitution(ball) == pytest.approx(restitution(BALL))
         end = fly(upright(SPEEDS), ball=ball, dt=1 / 7680)[0][-1, :, 1]
-        instant = torch.tensor([instant_flight(ball, HEIGHT, float(v), DURATION)[0] for v in SPEEDS])
+        instant = torch.tensor([instant_flight(ball, HEIGHT, float(v), DURATION) for v in SPEEDS])
         gaps.append(float((end - instant).abs().mean()))
     # What is left is the length of the contact, pi sqrt(m / ke).
     np.testing.assert_allclose(np.array(gaps[:-1]) / gaps[1:], 2, atol=0.35)
@@ -147,23 +147,6 @@ def test_gradients_over_horizontal_velocity_are_smoother_than_over_vertical_velo
     assert variation[1] > 5 * variation[0]
     assert sign_changes[0] == 1
     assert sign_changes[1] > 10
-
-
-def test_bounces_are_counted_as_the_closed_form_has_them():
-    fine = Bounce(fidelity="reference", device="cpu")
-    speeds = torch.linspace(-9.9, 9.9, 67, dtype=torch.float64)
-
-    def exact(shift=0.0, later=0.0):
-        """Return the counts of throws a little faster, at a moment a little later."""
-        return torch.tensor([instant_flight(BALL, HEIGHT, float(v) + shift, DURATION + later)[1] for v in speeds])
-
-    near = [exact(-0.05), exact(0.05), exact(later=-0.08), exact(later=1e-3)]  # two contacts last 0.07 s
-    clear = torch.stack([counts == exact() for counts in near]).all(dim=0)
-    assert clear.sum() > 50
-    assert exact()[clear].unique().tolist() == [0, 1, 2]
-    counts = fine.bounces(upright(speeds))
-    assert torch.equal(counts[clear], exact()[clear])
-    assert fine.bounces(upright(speeds)[:0]).shape == (0,)
 
 
 def test_the_number_of_bounces_changes_as_a_throw_does_and_not_with_what_a_step_hits():
