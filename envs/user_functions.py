@@ -129,13 +129,9 @@ class Function:
         self.defaults = chosen | ({"seed": 0} if self.seed_argument else {})
         self.known_fidelities = _read_fidelities(self.name, given, _check_precision(self.precision, who))
         self.fidelity_arguments = tuple(own)
-        self._refuse_uncallable()
-
-    def _refuse_uncallable(self) -> None:
-        """Raise ValueError where a replica is no function."""
-        for changed, fn in (self.replicas or {}).items():
-            if not callable(fn):
-                raise ValueError(f"{self.name}'s replica {changed!r} must be a function; got {type(fn).__name__}")
+        for changed, replica in (self.replicas or {}).items():
+            if not callable(replica):
+                raise ValueError(f"{self.name}'s replica {changed!r} must be a function; got {type(replica).__name__}")
 
     def with_call(self, fn: Callable[..., Any]) -> Function:
         """Return another function with all that is said of this one but its replicas; what it binds is no setting."""
