@@ -463,7 +463,6 @@ def _ladle(ladle: LadleInTank, name: str) -> list[Any]:
     """Return the contacts with its bowl and, where it has one, with its handle, an upright capsule on the rim."""
     real, laws, shapes = real_type(name), _laws(name), _shapes(name)
     grip, held = _ladle_shares(ladle, name)
-    half, thickness = real(ladle.height / 2), real(ladle.half_thickness)
 
     @ti.func
     def up():
@@ -471,12 +470,13 @@ def _ladle(ladle: LadleInTank, name: str) -> list[Any]:
 
     @ti.func
     def bowl(p, rim):
-        return shapes.bowl(p - rim, up(), real(ladle.radius), thickness)
+        return shapes.bowl(p - rim, up(), real(ladle.radius), real(ladle.half_thickness))
 
     @ti.func
     def handle(p, rim):
+        half = real(ladle.height / 2)
         middle = rim + ti.Vector([-real(ladle.radius), half, real(0.0)])
-        return shapes.capsule(p - middle, up(), half, thickness)
+        return shapes.capsule(p - middle, up(), half, real(ladle.half_thickness))
 
     def contact_with(distance):
         @ti.func
