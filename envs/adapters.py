@@ -7,6 +7,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, fields, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, Literal, Unpack, get_args
 
 import numpy as np
@@ -56,12 +57,6 @@ class FunctionEnvironment(Environment):
         """float32 or float64: the precision of the losses, by their type of numbers."""
         return "float32" if self.loss_type in ("float32", "float16", "bfloat16") else self.fidelity.precision
 
-    @property
-    def horizon(self) -> float | None:
-        """How long an episode is, in the unit of the keyword that says so; None where none does."""
-        value = {**vars(self.options), **self.fidelity.settings}.get(self.horizon_option)
-        return float(value) if isinstance(value, int | float) else None
-
     def with_horizon(self, horizon: float) -> Environment:
         """Return this environment with episodes of another length; where the keyword is a whole number, rounded.
 
@@ -104,21 +99,20 @@ class FunctionEnvironment(Environment):
         found = self.evaluate(x[None])
         if int(found.status[0]) != Status.NO_GRADIENT:
             return ""
-        return self._first_said(self.function.backend.nan_origin, x)
+        return self._first_said("nan_origin", x)
 
     def wrong_origin(self, x: Float[Tensor, " dim"]) -> str:
         """Return which operation's own derivative is wrong at a point, where it is finite; "" where none is known.
 
         A sentence's end, such as `kernel step in line 12 of my.py`.
         """
-        return self._first_said(self.function.backend.wrong_origin, x)
+        return self._first_said("wrong_origin", x)
 
-    def _first_said(self, ask: Callable[..., str], x: Float[Tensor, " dim"]) -> str:
+    def _first_said(self, asked: Literal["nan_origin", "wrong_origin"], x: Float[Tensor, " dim"]) -> str:
         """Return what a library says of the function at a point, for the first seed of which it says something."""
-        values, precision = self.space.to_values(self._check_points(x[None])), self.fidelity.precision
-        said = (ask(self.function, self._settings_of(seed), precision, self.device, values) for seed in self._seeds)
+        values = self.space.to_values(self._check_points(x[None]))
         with torch.inference_mode(False), torch.enable_grad(), suppress(Exception):  # it is no more than a hint
-            return next(filter(None, said), "")
+            return next(filter(None, (getattr(self._compute(seed), asked)(values) for seed in self._seeds)), "")
         return ""
 
     def replicas(self) -> Mapping[str, Environment]:
@@ -170,14 +164,10 @@ class FunctionEnvironment(Environment):
 
     def _compute(self, seed: int) -> Compute:
         if seed not in self._computes:
-            settings, precision = self._settings_of(seed), self.fidelity.precision
-            self._computes[seed] = self.function.backend.bind(self.function, settings, precision, self.device)
+            function = self.function
+            settings = {**self._settings, **({function.seed_argument: seed} if function.seed_argument else {})}
+            self._computes[seed] = function.backend.bind(function, settings, self.fidelity.precision, self.device)
         return self._computes[seed]
-
-    def _settings_of(self, seed: int) -> dict[str, Any]:
-        """Return the function's keyword arguments, its random numbers included."""
-        argument = self.function.seed_argument
-        return {**self._settings, **({argument: seed} if argument else {})}
 
     def _evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
         losses, slopes, sign = [], [], -1.0 if self.function.maximize else 1.0
@@ -221,7 +211,7 @@ def from_torch(
     Raises ValueError for settings that the function does not take; evaluating raises it where the function returns no
     losses of the batch, or losses that carry no gradient.
     """
-    return _wrap(fn, space, _Torch(vectorized, device), said)
+    return _wrap(fn, space, Backend("torch", partial(_Torch, vectorized), torch.cuda.is_available, device), said)
 
 
 def from_numpy(
@@ -243,7 +233,7 @@ def from_numpy(
     Raises ValueError where `differences` is no fraction of the bounds, or lost in rounding relative to them.
     """
     step = None if differences is None else _step(differences, space)
-    return _wrap(fn, space, _NumPy(vectorized, step), said)
+    return _wrap(fn, space, Backend("numpy", partial(_NumPy, vectorized, step), device="cpu", devices=("cpu",)), said)
 
 
 def from_jax(
@@ -270,10 +260,10 @@ def from_jax(
         if value not in get_args(known):
             raise ValueError(f"from_jax takes {option} {' or '.join(get_args(known))}; got {value!r}")
     try:
-        from .engines.jax_functions import JaxBackend
+        from .engines.jax_functions import JaxCompute, has_cuda
     except ImportError as error:
         raise ValueError(f"from_jax needs JAX, which is not here ({error}): pip install jax") from error
-    return _wrap(fn, space, JaxBackend(mode, batch), said)
+    return _wrap(fn, space, Backend("jax", partial(JaxCompute, mode, batch), has_cuda, own_programs=True), said)
 
 
 def from_warp(
@@ -299,9 +289,10 @@ def from_warp(
     Raises ValueError for other precisions and devices; evaluating raises it where the function returns no such array,
     launches nothing, does not read its points, or writes to what was read.
     """
-    from .engines.warp_functions import WarpBackend
+    from .engines.warp_functions import WarpCompute, cuda_available
 
-    return _wrap(fn, space, WarpBackend(check_overwrites, device), {"precision": "float32", **said})
+    backend = Backend("warp", partial(WarpCompute, check_overwrites), cuda_available, device)
+    return _wrap(fn, space, backend, {"precision": "float32", **said})
 
 
 def from_step(
@@ -357,51 +348,38 @@ def _wrap(fn: Callable[..., Any], space: ParameterSpace, backend: Backend, said:
     return FunctionEnvironment(Function(fn, space, backend, **said))
 
 
-@dataclass(frozen=True)
-class _Torch(Backend):
-    """Call functions of torch."""
-
-    engine = "torch"
+@dataclass(frozen=True, eq=False)
+class _Torch(Compute):
     vectorized: bool
+    call: Function
+    settings: Mapping[str, Any]
+    precision: str
     device: str
 
-    def has_cuda(self) -> bool:
-        """Say whether torch finds a CUDA device."""
-        return torch.cuda.is_available()
+    def __call__(self, x: Float[Tensor, "batch dim"], grad: bool) -> tuple[Tensor, Tensor | None, str]:
+        points = x.to(self.device, getattr(torch, self.precision), copy=True).requires_grad_(grad)
+        loss = self._losses(points)
+        losses = _numbers(loss, f"the loss of {self.call.name}")
+        slope = _autograd(loss, points, self.call.name) if grad else None
+        return losses, slope, str(loss.dtype).removeprefix("torch.")
 
-    def bind(self, call: Function, settings: Mapping[str, Any], precision: str, device: str) -> Compute:
-        """Return what computes the function with these keyword arguments."""
+    def nan_origin(self, x: Float[Tensor, "one dim"]) -> str:
+        return torch_origin(self._losses, x.to(self.device, getattr(torch, self.precision)))
 
-        def compute(x: Float[Tensor, "batch dim"], grad: bool) -> tuple[Tensor, Tensor | None, str]:
-            points = x.to(device, getattr(torch, precision), copy=True).requires_grad_(grad)
-            loss = self._losses(call, points, settings)
-            losses = _numbers(loss, f"the loss of {call.name}")
-            slope = _autograd(loss, points, call.name) if grad else None
-            return losses, slope, str(loss.dtype).removeprefix("torch.")
-
-        return compute
-
-    def nan_origin(
-        self, call: Function, settings: Mapping[str, Any], precision: str, device: str, x: Float[Tensor, "one dim"]
-    ) -> str:
-        """Return which operation makes the gradient at a point not finite, and where it is called."""
-        points = x.to(device, getattr(torch, precision))
-        return torch_origin(lambda own: self._losses(call, own, settings), points)
-
-    def _losses(self, call: Function, x: Float[Tensor, "batch dim"], settings: Mapping[str, Any]) -> Tensor:
+    def _losses(self, x: Float[Tensor, "batch dim"]) -> Tensor:
         if self.vectorized:
-            found = _called(call, x, settings)
+            found = _called(self.call, x, self.settings)
         else:
-            parts = [_called(call, point, settings) for point in x]
+            parts = [_called(self.call, point, self.settings) for point in x]
             found = torch.stack(parts) if all(isinstance(one, Tensor) for one in parts) else parts[0]
         if isinstance(found, tuple):
             raise SimulatorError(
-                f"{call.name} must return losses alone, and torch differentiates them; got {len(found)} values "
+                f"{self.call.name} must return losses alone, and torch differentiates them; got {len(found)} values "
                 "(from_numpy takes losses with gradients)"
             )
         if not isinstance(found, Tensor):
-            raise SimulatorError(f"{call.name} must return a tensor; got {type(found).__name__}")
-        check_shape(tuple(found.shape), (len(x),), "losses", call.name)
+            raise SimulatorError(f"{self.call.name} must return a tensor; got {type(found).__name__}")
+        check_shape(tuple(found.shape), (len(x),), "losses", self.call.name)
         return found
 
 
@@ -429,61 +407,49 @@ def _autograd(loss: Float[Tensor, " batch"], x: Float[Tensor, "batch dim"], name
     return gradient.detach().to("cpu", torch.float64)
 
 
-@dataclass(frozen=True)
-class _NumPy(Backend):
-    """Call functions of NumPy."""
-
-    engine, devices = "numpy", ("cpu",)
+@dataclass(frozen=True, eq=False)
+class _NumPy(Compute):
     vectorized: bool
     differences: float | None
-    device: str = "cpu"
+    call: Function
+    settings: Mapping[str, Any]
+    precision: str
+    device: str
 
-    def bind(self, call: Function, settings: Mapping[str, Any], precision: str, device: str) -> Compute:
-        """Return what computes the function with these keyword arguments."""
+    def __call__(self, x: Float[Tensor, "batch dim"], grad: bool) -> tuple[Tensor, Tensor | None, str]:
+        loss, slope, kind = self._found(x)
+        if grad and slope is None:
+            slope = self._central_differences(x)
+        return loss, slope if grad else None, kind
 
-        def losses(x: Float[Tensor, "batch dim"]) -> tuple[Tensor, Tensor | None, str]:
-            return self._call(call, x, settings, precision)
-
-        def compute(x: Float[Tensor, "batch dim"], grad: bool) -> tuple[Tensor, Tensor | None, str]:
-            loss, slope, kind = losses(x)
-            if grad and slope is None:
-                slope = self._differences(lambda at: losses(at)[0], x, call)
-            return loss, slope if grad else None, kind
-
-        return compute
-
-    def _call(
-        self, call: Function, x: Float[Tensor, "batch dim"], settings: Mapping[str, Any], precision: str
-    ) -> tuple[Tensor, Tensor | None, str]:
-        points = x.numpy().astype(precision)  # a copy: what a function does to its points is its own affair
+    def _found(self, x: Float[Tensor, "batch dim"]) -> tuple[Tensor, Tensor | None, str]:
+        points, name = x.numpy().astype(self.precision), self.call.name  # a copy: a function may change its points
         if self.vectorized:
-            result = call.fn(points, **settings)
+            result = self.call.fn(points, **self.settings)
         else:
-            result = _columns([_copied(call.fn(point, **settings)) for point in points])
+            result = _columns([_copied(self.call.fn(point, **self.settings)) for point in points])
         if isinstance(result, tuple) and len(result) != 2:
             raise SimulatorError(
-                f"{call.name} must return losses, or (losses, gradients); got {len(result)} values, so drop the others"
+                f"{name} must return losses, or (losses, gradients); got {len(result)} values, so drop the others"
             )
         loss, gradient = result if isinstance(result, tuple) else (result, None)
         kind = str(np.asarray(loss).dtype)
-        losses = _numbers(loss, f"the loss of {call.name}")
-        check_shape(tuple(losses.shape), (len(x),), "losses", call.name)
+        losses = _numbers(loss, f"the loss of {name}")
+        check_shape(tuple(losses.shape), (len(x),), "losses", name)
         if gradient is None:
             return losses, None, kind
-        slope = _numbers(gradient, f"the gradient of {call.name}")
-        check_shape(tuple(slope.shape), tuple(x.shape), "gradients", call.name)
+        slope = _numbers(gradient, f"the gradient of {name}")
+        check_shape(tuple(slope.shape), tuple(x.shape), "gradients", name)
         return losses, slope, kind
 
-    def _differences(
-        self, losses: Callable[[Tensor], Tensor], x: Float[Tensor, "batch dim"], call: Function
-    ) -> Float[Tensor, "batch dim"]:
+    def _central_differences(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch dim"]:
         """Return central differences, one-sided at the bounds; steps are fractions of the scaled box."""
         if self.differences is None:
             raise SimulatorError(
-                f"{call.name} returned losses without gradients; return (losses, gradients), pass differences=1e-4 "
-                "to from_numpy, or sample with gradients=0 (--no-gradients)"
+                f"{self.call.name} returned losses without gradients; return (losses, gradients), pass "
+                "differences=1e-4 to from_numpy, or sample with gradients=0 (--no-gradients)"
             )
-        space = call.space
+        space = self.call.space
         lower, upper = space.to_values(space.lower), space.to_values(space.upper)
         slopes, scaled = [], space.from_values(x)
         for axis in range(space.dim):
@@ -492,7 +458,7 @@ class _NumPy(Backend):
             ahead = torch.minimum(space.to_values(scaled + step), upper)
             behind = torch.maximum(space.to_values(scaled - step), lower)
             apart = (ahead - behind)[:, axis]
-            slopes.append((losses(ahead) - losses(behind)) / apart)
+            slopes.append((self._found(ahead)[0] - self._found(behind)[0]) / apart)
         return torch.stack(slopes, dim=1)
 
 

@@ -7,7 +7,7 @@ import inspect
 import queue
 import threading
 import weakref
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import asdict, replace
@@ -36,8 +36,6 @@ from .records import unknown_fidelity
 # ---- Spread a batch over threads, and lend them the solvers that serve one thread at a time.
 
 T = TypeVar("T")
-Part = TypeVar("Part")
-Result = TypeVar("Result")
 
 
 def cores() -> int:
@@ -103,22 +101,6 @@ def copied(values: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
     return values.to("cpu", torch.float64, copy=True)
 
 
-def map_parts(
-    work: Callable[[Part], Result], parts: Sequence[Part], *, threads: int, stop: threading.Event
-) -> list[Result]:
-    """Do the work on each part, in several threads at once where there are some; `stop` is set while they give up."""
-    if threads == 1 or len(parts) == 1:
-        return list(map(work, parts))
-    with ThreadPoolExecutor(threads) as executor:
-        try:
-            return list(executor.map(work, parts))
-        except BaseException:  # an interrupt too: let no thread simulate on
-            stop.set()
-            executor.shutdown(cancel_futures=True)
-            stop.clear()
-            raise
-
-
 def describe_presets(presets: Mapping[str, Mapping[str, Any]]) -> str:
     """Return the names of presets as the end of a sentence about a scene."""
     return f"preset{'s' if len(presets) > 1 else ''} {', '.join(presets)}" if presets else "no presets"
@@ -155,9 +137,7 @@ class Environment(Objective):
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {}  # name -> options that are set together, by their names
     devices: ClassVar[tuple[str, ...]] = ("cpu",)
     engines: ClassVar[tuple[str, ...]] = ("warp",)
-    horizon_option: ClassVar[str] = (
-        "horizon"  # the setting that says how long an episode is, where there is one of this name
-    )
+    horizon_option: ClassVar[str] = "horizon"  # the setting that says how long an episode is, where there is one
     control_step: ClassVar[float] = 0.0  # how long a control is held [s], in whole time steps; 0 where any step does
     known_failures: ClassVar[Mapping[str, Mapping[str, str]]] = {}  # fidelity -> check of `landscape check` -> reason
     contact_stiffness: ClassVar[str] = ""  # the option that says how stiff contact is, where it is by penalty
@@ -187,7 +167,7 @@ class Environment(Objective):
         self.deterministic = deterministic
         if deterministic and not self.capabilities.deterministic:
             able = " and ".join(name for name in self.engines if find_engine(name).deterministic)
-            raise ValueError(f"{self.name} is deterministic on engine {able or 'none'} only; got engine {engine}")
+            raise ValueError(f"{self.name} is deterministic on engine {able or 'none'} only; got engine {self.engine}")
         self.options = read_options(self.name, self.Options, options)
         self._stop = threading.Event()
         self._raised: Exception | None = None  # what the simulation has raised now,
@@ -399,8 +379,8 @@ class Environment(Objective):
     @property
     def horizon(self) -> float | None:
         """How long an episode is, in the unit of the setting that says so; None where none does."""
-        value = vars(self.options).get(self.horizon_option)
-        return None if value is None else float(value)
+        value = {**vars(self.options), **self.fidelity.settings}.get(self.horizon_option)
+        return float(value) if isinstance(value, int | float) else None
 
     def with_horizon(self, horizon: float) -> Environment:
         """Return this environment with episodes of another length, in whole numbers where its setting is one.
@@ -587,8 +567,18 @@ class Environment(Objective):
         return max(1, min(-(-rows // self.threads), self._capacity))
 
     def _map_parts(self, work: Callable[[Tensor], T], x: Float[Tensor, "batch dim"]) -> list[T]:
-        parts = torch.split(x, self._rows_per_part(len(x)))
-        return map_parts(work, parts, threads=self.threads, stop=self._stop)
+        """Do the work on each part, in several threads at once where there are some; `_stop` is set while they end."""
+        parts, threads = torch.split(x, self._rows_per_part(len(x))), self.threads
+        if threads == 1 or len(parts) == 1:
+            return list(map(work, parts))
+        with ThreadPoolExecutor(threads) as executor:
+            try:
+                return list(executor.map(work, parts))
+            except BaseException:  # an interrupt too: let no thread simulate on
+                self._stop.set()
+                executor.shutdown(cancel_futures=True)
+                self._stop.clear()
+                raise
 
     def _check_points(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch dim"]:
         x = check_points(x, self.space, self.name)

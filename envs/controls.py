@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -55,35 +54,10 @@ def integrate_velocity(
     upper: Float[Tensor, " axis"],
 ) -> Float[Tensor, "batch step_plus_1 axis"]:
     """Integrate a tool's velocity [m/s] over control steps of `span` [s]; positions [m] stay between the bounds."""
-    path: Tensor = _Held.apply(start.expand(len(velocity), -1), span * velocity, lower, upper)  # type: ignore[no-untyped-call]
-    return path
-
-
-class _Held(torch.autograd.Function):
-    """Add up moves, held between bounds after each: (batch, axis), (batch, step, axis), to (batch, step + 1, axis).
-
-    Torch would note every step, and take two to three times as long.
-    """
-
-    @staticmethod
-    def forward(ctx: Any, start: Tensor, moves: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
-        path, reached = [start], []
-        for move in moves.unbind(dim=1):
-            reached.append(path[-1] + move)
-            path.append(reached[-1].clamp(lower, upper))
-        free = torch.stack(reached, dim=1)
-        ctx.save_for_backward((free >= lower) & (free <= upper))
-        return torch.stack(path, dim=1)
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, adj_path: Tensor) -> tuple[None, Tensor, None, None]:
-        (free,) = ctx.saved_tensors
-        adj, adj_moves = adj_path[:, -1], list[Tensor]()
-        for inside, before in zip(reversed(free.unbind(dim=1)), reversed(adj_path[:, :-1].unbind(dim=1)), strict=True):
-            adj_moves.append(adj.where(inside, 0.0))
-            adj = adj_moves[-1] + before
-        return None, torch.stack(adj_moves[::-1], dim=1), None, None
+    path = [start.expand(len(velocity), -1)]
+    for move in (span * velocity).unbind(dim=1):
+        path.append((path[-1] + move).clamp(lower, upper))
+    return torch.stack(path, dim=1)
 
 
 def roll(

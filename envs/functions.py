@@ -46,16 +46,6 @@ class Function(Environment):
         names = tuple(f"x{i}" for i in range(len(lower)))
         self.space = ParameterSpace(names, lower, upper, ("",) * len(names))
 
-    @property
-    def minimum(self) -> float:
-        """The function's least value."""
-        return float(self.function.optimal_value)
-
-    @property
-    def minimizers(self) -> Float[Tensor, "count dim"]:
-        """Where it is attained."""
-        return torch.as_tensor(self.function.optimizers, dtype=torch.float64)
-
     def memory(self) -> int:
         """Estimate the bytes of one row: what torch keeps of it to differentiate, and its numbers."""
         return 18_000 + 80 * self.space.dim

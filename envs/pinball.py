@@ -139,11 +139,9 @@ class Pinball(Environment):
         bars = _embed(torch.stack([pivots - along, pivots + along], dim=1).view(-1, 2))
         points = {"ball": flight[:, None], "bars": bars.expand(len(time), -1, 3)}
         goal = _embed(self.goal).expand(len(time), 3)
-        parts = (
-            *_draw_case(len(time)),
-            *_draw_movers(points["ball"], points["bars"]),
-            _draw_ball("target", goal[:, None]),
-        )
+        balls = (_draw_ball("rubber", flight[:, None]), Part("trail", "rubber", flight[:, None], (BALL / 8,)))
+        rods = [Part("path", "steel", ends, (BAR,)) for ends in torch.split(points["bars"], 2, dim=1)]
+        parts = (*_draw_case(len(time)), *balls, *rods, _draw_ball("target", goal[:, None]))
         return Episode(time, points, {"goal": goal}, parts, VIEW)
 
     def _setup(self) -> None:
@@ -184,25 +182,9 @@ class Pinball16(Pinball):
 
     name = "pinball-16"
     examples: ClassVar[dict[str, tuple[float, ...]]] = {
-        "aim": (
-            0.77,
-            -0.65,
-            -0.35,
-            -0.9,
-            0.37,
-            -0.25,
-            -0.25,
-            -0.07,
-            -0.96,
-            -0.32,
-            -0.54,
-            0.83,
-            -0.48,
-            -0.82,
-            0.22,
-            -0.93,
-        )
-    }
+        "aim": (0.77, -0.65, -0.35, -0.9, 0.37, -0.25, -0.25, -0.07,
+                -0.96, -0.32, -0.54, 0.83, -0.48, -0.82, 0.22, -0.93)
+    }  # fmt: skip
     pivots = tuple((x, y) for y in (8.1, 6.7, 5.3, 3.9) for x in (0.97, 2.99, 5.01, 7.03))
     half_length = 0.47
     start = (3.5, 9.5)
@@ -211,11 +193,6 @@ class Pinball16(Pinball):
 
 def _draw_ball(material: Literal["rubber", "target"], at: Float[Tensor, "frame 1 3"]) -> Part:
     return Part("sphere", material, at, (BALL,))
-
-
-def _draw_movers(ball: Float[Tensor, "frame 1 3"], bars: Float[Tensor, "frame end 3"]) -> tuple[Part, ...]:
-    rods = [Part("path", "steel", ends, (BAR,)) for ends in torch.split(bars, 2, dim=1)]
-    return (_draw_ball("rubber", ball), Part("trail", "rubber", ball, (BALL / 8,)), *rods)
 
 
 def _draw_case(frames: int) -> list[Part]:

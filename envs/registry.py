@@ -11,15 +11,14 @@ A program or a notebook registers a class by `register`, and the command takes w
 
 from __future__ import annotations
 
-import ast
 import hashlib
 import re
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from importlib import import_module
-from importlib.util import decode_source, module_from_spec, spec_from_file_location
+from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from types import BuiltinFunctionType, FunctionType, MethodType, ModuleType
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -37,7 +36,6 @@ if TYPE_CHECKING:
 
 IN_FILE = re.compile(r".+\.py:\w+", re.DOTALL)  # FILE.py:NAME
 ALL_IN_FILE = re.compile(r".+\.py:\*", re.DOTALL)
-BINDS_UNSEEN = re.compile(r"import\s*\(?\s*\*|\b(globals|locals|vars|setattr|exec|eval|__dict__|modules)\b")
 
 
 def import_named(name: str) -> ModuleType:
@@ -77,31 +75,6 @@ def _load_file(known: str, path: str) -> ModuleType:
         sys.dont_write_bytecode = kept
         del sys.modules[known]
     return module
-
-
-def refuse_absent_name(file: Path, name: str, path: str) -> None:
-    """Raise ValueError where a file has no such name in it, with those it defines; `path` is what it was called.
-
-    The file is read, not run. A file that may bind names which it does not spell is left to whoever imports it.
-    """
-    try:
-        text = decode_source(file.read_bytes())
-        there = [one for one in _defined(ast.parse(text)) if not one.startswith("_")]
-    except (SyntaxError, ValueError):
-        return  # which the import says better
-    if BINDS_UNSEEN.search(text) or re.search(rf"\b{name}\b", text):
-        return
-    raise ValueError(f"{path} holds no {name}; it has {', '.join(there) or 'no name at all'}")
-
-
-def _defined(module: ast.Module) -> Iterator[str]:
-    """Yield what a module calls its classes, functions and values, one after the other."""
-    for statement in module.body:
-        if isinstance(statement, ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
-            yield statement.name
-        elif isinstance(statement, ast.Assign | ast.AnnAssign):
-            targets = statement.targets if isinstance(statement, ast.Assign) else [statement.target]
-            yield from (node.id for one in targets for node in ast.walk(one) if isinstance(node, ast.Name))
 
 
 Kind = TypeVar("Kind", bound="type[Environment] | Environment")
@@ -319,8 +292,7 @@ def refuse_unknown(
     numbers are held against how many a scene has where nothing changes that.
     """
     if IN_FILE.fullmatch(what):
-        file, path, name = _place_in_file(what)
-        refuse_absent_name(file, name, path)
+        _place_in_file(what)
         return
     entry = _find_entry(what)
     if not entry.fidelities:

@@ -7,7 +7,7 @@ import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, make_dataclass, replace
 from functools import cached_property, partial
-from typing import Any, ClassVar, TypedDict
+from typing import Any, TypedDict
 
 from jaxtyping import Float
 from torch import Tensor
@@ -55,37 +55,36 @@ class FunctionKeywords(TypedDict, total=False):
     replicas: Mapping[str, Callable[..., Any]] | None
 
 
-Compute = Callable[[Float[Tensor, "batch dim"], bool], tuple[Tensor, Tensor | None, str]]
-"""Returns losses, gradients if asked for, and the type of numbers that the losses came in, at points."""
-
-
-class Backend(abc.ABC):
-    """A library that a function is written in, and how it is called and differentiated there."""
-
-    engine: ClassVar[str]
-    devices: ClassVar[tuple[str, ...]] = ("cpu", "cuda")
-    own_programs: ClassVar[bool] = False  # whether a function is compiled, for each size of batch
-    device: str  # where it runs by default: auto, cpu or cuda
-
-    def has_cuda(self) -> bool:
-        """Say whether it finds a CUDA device."""
-        return False
+class Compute(abc.ABC):
+    """A function with its keyword arguments in a library, at a precision and on a device, differentiated there."""
 
     @abc.abstractmethod
-    def bind(self, call: Function, settings: Mapping[str, Any], precision: str, device: str) -> Compute:
-        """Return what computes the function with these keyword arguments."""
+    def __call__(self, x: Float[Tensor, "batch dim"], grad: bool) -> tuple[Tensor, Tensor | None, str]:
+        """Return losses, gradients if asked for, and the type of numbers that the losses came in, at points."""
 
-    def nan_origin(
-        self, call: Function, settings: Mapping[str, Any], precision: str, device: str, x: Float[Tensor, "one dim"]
-    ) -> str:
+    def nan_origin(self, x: Float[Tensor, "one dim"]) -> str:
         """Return which operation makes the gradient at a point not finite, and where it is called; "" where unknown."""
         return ""
 
-    def wrong_origin(
-        self, call: Function, settings: Mapping[str, Any], precision: str, device: str, x: Float[Tensor, "one dim"]
-    ) -> str:
+    def wrong_origin(self, x: Float[Tensor, "one dim"]) -> str:
         """Return which operation's own derivative is wrong at a point, where it is finite; "" where unknown."""
         return ""
+
+
+@dataclass(frozen=True)
+class Backend:
+    """A library that a function is written in.
+
+    `bind` makes a `Compute` of a function with keyword arguments, a precision and a device; `device` is where it runs
+    by default: auto, cpu or cuda. With `own_programs` a function is compiled for each size of batch.
+    """
+
+    engine: str
+    bind: Callable[[Function, Mapping[str, Any], str, str], Compute]
+    has_cuda: Callable[[], bool] = bool
+    device: str = "auto"
+    devices: tuple[str, ...] = ("cpu", "cuda")
+    own_programs: bool = False
 
 
 @dataclass(eq=False)
@@ -130,13 +129,9 @@ class Function:
         self.defaults = chosen | ({"seed": 0} if self.seed_argument else {})
         self.known_fidelities = _read_fidelities(self.name, given, _check_precision(self.precision, who))
         self.fidelity_arguments = tuple(own)
-        self._refuse_uncallable()
-
-    def _refuse_uncallable(self) -> None:
-        """Raise ValueError where a replica is no function."""
-        for changed, fn in (self.replicas or {}).items():
-            if not callable(fn):
-                raise ValueError(f"{self.name}'s replica {changed!r} must be a function; got {type(fn).__name__}")
+        for changed, replica in (self.replicas or {}).items():
+            if not callable(replica):
+                raise ValueError(f"{self.name}'s replica {changed!r} must be a function; got {type(replica).__name__}")
 
     def with_call(self, fn: Callable[..., Any]) -> Function:
         """Return another function with all that is said of this one but its replicas; what it binds is no setting."""

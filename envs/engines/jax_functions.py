@@ -15,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ...landscapes.objective import SimulatorError
-from ..user_functions import Backend, Compute, Function
+from ..user_functions import Compute, Function
 from .jax_origins import jax_origin
 from .jax_programs import compile_lowered, keep_compiled, traced
 
@@ -25,40 +25,31 @@ GROWTH = 4
 _TRACED: dict[str, str] = {}  # the precision that JAX has last traced a function in
 
 
-@dataclass(frozen=True)
-class JaxBackend(Backend):
-    """Call functions of JAX, in its default device unless another one is named."""
+def has_cuda() -> bool:
+    """Say whether JAX computes on a CUDA device by default."""
+    return bool(jax.default_backend() != "cpu")
 
-    engine, own_programs = "jax", True
-    mode: str
-    batch: str
-    device: str = "auto"
 
-    def has_cuda(self) -> bool:
-        """Say whether JAX computes on a CUDA device by default."""
-        return bool(jax.default_backend() != "cpu")
+class JaxCompute(Compute):
+    """Call functions of JAX, in its default device unless another one is named; keyword arguments are static."""
 
-    def bind(self, call: Function, settings: Mapping[str, Any], precision: str, device: str) -> Compute:
-        """Return what computes the function with these keyword arguments, which are static."""
-        fn, chosen = _with_settings(call.fn, settings), _device(device)
-        function = JaxFunction(fn, call.space.dim, call.name, precision, call.rows, self.mode, self.batch)
+    def __init__(
+        self, mode: str, batch: str, call: Function, settings: Mapping[str, Any], precision: str, device: str
+    ) -> None:
+        fn = _with_settings(call.fn, settings)
+        self.function = JaxFunction(fn, call.space.dim, call.name, precision, call.rows, mode, batch)
+        self.device = jax.devices("cpu" if device == "cpu" else None)[0]
 
-        def compute(x: Float[Tensor, "batch dim"], grad: bool) -> tuple[Tensor, Tensor | None, str]:
-            with jax.default_device(chosen):
-                return function(x, grad)
+    def __call__(self, x: Float[Tensor, "batch dim"], grad: bool) -> tuple[Tensor, Tensor | None, str]:
+        """Return losses, gradients if asked for, and the type of numbers that losses come in."""
+        with jax.default_device(self.device):
+            return self.function(x, grad)
 
-        return compute
-
-    def nan_origin(
-        self, call: Function, settings: Mapping[str, Any], precision: str, device: str, x: Float[Tensor, "one dim"]
-    ) -> str:
+    def nan_origin(self, x: Float[Tensor, "one dim"]) -> str:
         """Return which primitive makes the gradient at a point not finite, and where it is called."""
-        with computing_in(precision), jax.default_device(_device(device)):
-            return jax_origin(_with_settings(call.fn, settings), jnp.asarray(x[0].numpy(), dtype=precision), self.mode)
-
-
-def _device(name: str) -> Any:
-    return jax.devices("cpu" if name == "cpu" else None)[0]
+        own = self.function
+        with computing_in(own.precision), jax.default_device(self.device):
+            return jax_origin(own.fn, jnp.asarray(x[0].numpy(), dtype=own.precision), own.mode)
 
 
 def _with_settings(fn: Callable[..., Any], settings: Mapping[str, Any]) -> Callable[[Any], Any]:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import partial
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,58 +16,22 @@ from torch import Tensor
 
 from ...landscapes.objective import SimulatorError
 from ..base import check_shape
-from ..user_functions import Backend, Compute, Function
-from .runtime import cuda_available, precision
+from ..user_functions import Compute, Function
+from .runtime import cuda_available as cuda_available
+from .runtime import precision as types_of
 from .warp_origins import warp_origin, wrong_kernel
 
 CORRUPTS = "This may corrupt gradient computation"  # how Warp ends what it says of an array that is overwritten
 
 
-@dataclass(frozen=True)
-class WarpBackend(Backend):
-    """Call functions that launch Warp kernels."""
+class WarpCompute(Compute):
+    """Call a function that launches Warp kernels; it is `unchecked` until one has looked for what is overwritten."""
 
-    engine = "warp"
-    check_overwrites: bool
-    device: str = "auto"
-
-    def has_cuda(self) -> bool:
-        """Say whether Warp finds a CUDA device."""
-        return cuda_available()
-
-    def bind(self, call: Function, settings: Mapping[str, Any], precision: str, device: str) -> Compute:
-        """Return what computes the function with these keyword arguments."""
-        fn = partial(call.fn, **settings)
-        return WarpFunction(fn, call.name, precision, device, unchecked=self.check_overwrites)
-
-    def nan_origin(
-        self, call: Function, settings: Mapping[str, Any], precision: str, device: str, x: Float[Tensor, "one dim"]
-    ) -> str:
-        """Return which kernel makes the gradient at a point not finite, and by which argument."""
-        return self._looked_at(call, settings, precision, device).nan_origin(x)
-
-    def wrong_origin(
-        self, call: Function, settings: Mapping[str, Any], precision: str, device: str, x: Float[Tensor, "one dim"]
-    ) -> str:
-        """Return which kernel's adjoint differs from its differences at a point."""
-        return self._looked_at(call, settings, precision, device).wrong_origin(x)
-
-    def _looked_at(self, call: Function, settings: Mapping[str, Any], precision: str, device: str) -> WarpFunction:
-        return WarpFunction(partial(call.fn, **settings), call.name, precision, device, unchecked=False)
-
-
-@dataclass(eq=False)
-class WarpFunction:
-    """A function of Warp points; `unchecked` until it has looked for what is overwritten."""
-
-    fn: Callable[[Any], Any]
-    name: str
-    precision: str
-    device: str
-    unchecked: bool
-
-    def __post_init__(self) -> None:
-        self.real = precision(self.precision).real
+    def __init__(
+        self, unchecked: bool, call: Function, settings: Mapping[str, Any], precision: str, device: str
+    ) -> None:
+        self.unchecked, self.fn, self.name = unchecked, partial(call.fn, **settings), call.name
+        self.precision, self.real, self.device = precision, types_of(precision).real, device
 
     def __call__(self, x: Float[Tensor, "batch dim"], grad: bool) -> tuple[Tensor, Tensor | None, str]:
         """Return losses, gradients if asked for, and the type of numbers that losses come in."""
@@ -176,37 +140,23 @@ class WarpFunction:
 
 @contextmanager
 def _overwrites() -> Iterator[list[str]]:
-    """Let Warp look for arrays that are written to after they were read, and gather what it says of them."""
-    listener, logger = _Listener(), wp.get_logger()
+    """Let Warp look for arrays that are written to after they were read, and gather what it says of them alone."""
+    said, logger = list[str](), wp.get_logger()
+
+    def warning(message: str, category: Any = None, stacklevel: int = 1) -> None:
+        if CORRUPTS in message:  # from where the array's own text ends
+            said.append(" ".join(message.split(" passed to ", 1)[-1].split(CORRUPTS)[0].split()))
+
+    def drop(message: str) -> None: ...
+
     level, verify = wp.config.log_level, wp.config.verify_autograd_array_access
-    wp.set_logger(listener)
+    wp.set_logger(SimpleNamespace(warning=warning, debug=drop, info=drop, error=drop))
     wp.config.log_level, wp.config.verify_autograd_array_access = wp.LOG_WARNING, True
     try:
-        yield listener.said
+        yield said
     finally:
         wp.config.log_level, wp.config.verify_autograd_array_access = level, verify
         wp.set_logger(logger)
-
-
-class _Listener:
-    """Keep what Warp says of arrays that are overwritten, and nothing else."""
-
-    def __init__(self) -> None:
-        self.said: list[str] = []
-
-    def warning(self, message: str, category: Any = None, stacklevel: int = 1) -> None:
-        """Keep a warning of an overwritten array, from where the array's own text ends."""
-        if CORRUPTS in message:
-            self.said.append(" ".join(message.split(" passed to ", 1)[-1].split(CORRUPTS)[0].split()))
-
-    def debug(self, message: str) -> None:
-        """Drop it."""
-
-    def info(self, message: str) -> None:
-        """Drop it."""
-
-    def error(self, message: str) -> None:
-        """Drop it: what fails raises."""
 
 
 def _wanted_type(error: Exception, real: Any) -> str:

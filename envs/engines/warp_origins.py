@@ -55,11 +55,10 @@ def _describe_kernel(kernel: Any) -> str:
     return f"kernel {adjoint.fun_name} in line {adjoint.fun_lineno} of {Path(adjoint.filename).name}"
 
 
-def _arrays(value: Any, name: str) -> Iterator[tuple[str, Any]]:
-    """Yield the arrays that have gradients in an argument: itself, or those of a struct, with their names."""
+def _arrays(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the arrays in an argument: itself, or those of a struct, with their names."""
     if isinstance(value, wp.array):
-        if value.grad is not None:
-            yield name, value
+        yield name, value
     elif (kind := getattr(value, "_cls", None)) is not None:
         for part in kind.vars:
             yield from _arrays(getattr(value, part), f"{name}.{part}")
@@ -103,7 +102,7 @@ class _Probe:
         self.launch, self.arguments = launch, (*launch[3], *launch[4])
         self.arrays: Arrays = {}
         for value in self.arguments:
-            self.arrays |= {id(array): array for array in _all_arrays(value)}
+            self.arrays |= {id(array): array for _, array in _arrays(value)}
         self.free = [key for key, array in self.arrays.items() if array.requires_grad]
         self.base = {key: _numbers(self.arrays[key]) for key in self.free}
         self.random = np.random.default_rng(0)
@@ -175,15 +174,6 @@ class _Probe:
 def _apart(one: float, other: float) -> float:
     """Return the relative difference of two numbers, 0 of two zeros."""
     return abs(one - other) / (max(abs(one), abs(other)) or 1.0)
-
-
-def _all_arrays(value: Any) -> Iterator[Any]:
-    """Yield the arrays in an argument: itself, or those of a struct."""
-    if isinstance(value, wp.array):
-        yield value
-    elif (kind := getattr(value, "_cls", None)) is not None:
-        for part in kind.vars:
-            yield from _all_arrays(getattr(value, part))
 
 
 def _with_copies(value: Any, copies: Arrays) -> Any:

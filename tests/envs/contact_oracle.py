@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -71,3 +72,22 @@ def touch(ball: Ball, state, time: float, *, smooth: bool):
     leaving.terminal, leaving.direction = True, 1
     found = solve_ivp(rate, (0.0, time), np.concatenate(state), events=leaving, max_step=5e-3, **TIGHT)
     return *found.y[:, -1].reshape(4, 3), float(found.t[-1])
+
+
+def restitution(ball: Ball) -> float:
+    """Return the speed after a contact by that before it, where gravity does nothing in between.
+
+    Approaching is a quarter of a damped oscillation, departing a quarter of an undamped one.
+    """
+    zeta = ball.kd / (2 * math.sqrt(ball.ke * ball.mass))  # below 1 for a contact that swings
+    root = math.sqrt(1 - zeta**2)
+    return math.exp(-zeta / root * math.atan2(root, zeta))
+
+
+def instant_flight(ball: Ball, y: float, v: float, time: float) -> float:
+    """Return the height of a ball that leaves the ground at once, with the effective restitution."""
+    while True:
+        lasting = (v + math.sqrt(v**2 + 2 * ball.gravity * (y - ball.radius))) / ball.gravity
+        if lasting >= time:
+            return y + v * time - ball.gravity * time**2 / 2
+        time, y, v = time - lasting, ball.radius, -restitution(ball) * (v - ball.gravity * lasting)

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
@@ -146,14 +146,7 @@ def write(names: list[str]) -> None:
             else:
                 versions[key] = measure(env, points_of(env, of))
                 print(f"{name} ({key}): written", flush=True)
-            STORED.write_text(json.dumps(_plain(stored()), indent=1, sort_keys=True) + "\n")
-
-
-def _plain(found: Mapping[str, Mapping[str, Mapping[str, Numbers]]]) -> dict[str, object]:
-    return {
-        name: {version: {key: asdict(one) for key, one in numbers.items()} for version, numbers in versions.items()}
-        for name, versions in found.items()
-    }
+            STORED.write_text(json.dumps(stored(), default=asdict, indent=1, sort_keys=True) + "\n")
 
 
 if __name__ == "__main__":

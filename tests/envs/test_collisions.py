@@ -43,22 +43,6 @@ def test_task_1_has_the_slopes_of_reflected_flight() -> None:
     assert slope[4:] == pytest.approx([0.0, -(HELD * 1.0 - HELD**2 / 2)], abs=1e-12)
 
 
-def test_the_papers_slopes_of_task_1_are_those_of_a_scheme_that_is_two_steps_short() -> None:
-    """It prints (0, -1), (0, -0.99559) and (0, -0.0020698), which its convex solver has.
-
-    That scheme advances a place by the velocity before the impact, and a push acts on places a step later: -(T - 2 dt)
-    and -(T - 3 dt) dt. What is left is the tolerance of the solver, the same 2.4e-4 in both.
-    """
-    dt, time = 1 / 480, 1.0
-    place, speed, push = printed = (-1.0, -0.99559, -0.0020698)
-    _, exact = at_start("bounce-once")
-    assert place == exact[1]
-    assert speed == pytest.approx(-(time - 2 * dt), abs=3e-4)
-    assert push / dt == pytest.approx(-(time - 3 * dt), abs=3e-4)
-    assert speed + (time - 2 * dt) == pytest.approx(push / dt + (time - 3 * dt), abs=2e-5)
-    assert printed == pytest.approx((exact[1], exact[3], exact[5]), rel=6e-3)
-
-
 def test_task_3_has_the_papers_slopes() -> None:
     loss, slope = at_start("two-balls")
     assert loss - 0.1 * 18 == pytest.approx(0.50906**2, abs=1e-5)
@@ -80,11 +64,7 @@ def cost(touch: float) -> float:
     return float(rest - linear**2 / (4 * square))
 
 
-def test_the_best_push_of_task_3_costs_what_the_paper_says() -> None:
-    assert minimize_scalar(cost, bounds=(0.3, 0.95), method="bounded").fun == pytest.approx(1.396542, abs=1e-6)
-
-
-def test_a_best_push_in_short_pieces_costs_that_in_the_simulation() -> None:
+def test_the_best_push_of_task_3_costs_what_the_paper_says_and_in_short_pieces_that_in_the_simulation() -> None:
     from gradscape.envs.collisions import PRICE, TwoBalls
     from gradscape.envs.engines.balls.collisions import run
 
@@ -96,26 +76,25 @@ def test_a_best_push_in_short_pieces_costs_that_in_the_simulation() -> None:
     x = torch.tensor([[[-2.0, -2.0], [-1.0, -1.0]]], dtype=torch.float64)
     given = [(torch.stack([one.expand(2), torch.zeros(2, dtype=torch.float64)])[None], 1 / pieces) for one in push]
     end = run(TwoBalls.table, x, torch.zeros_like(x), given, 1 / pieces, "touch")[-1, 0, 1]
+    assert cost(s) == pytest.approx(1.396542, abs=1e-6)
     loss = float(end.square().sum() + PRICE * 2 * push.square().sum() / pieces)
     assert loss == pytest.approx(1.396542, abs=1e-4)  # of the piece in which balls touch, a part is a waste
 
 
-@pytest.mark.parametrize("name", SCENES)
-@pytest.mark.parametrize("dt", [1 / 480, 1 / 1920])
-def test_with_the_time_of_touch_losses_and_slopes_are_the_closed_forms(name: str, dt: float) -> None:
-    env = gs.make(name, fidelity=gs.Fidelity("own", dt=dt, precision="float64"))
+@pytest.mark.parametrize(
+    ("name", "dt", "horizon"),
+    [
+        *((name, dt, 1.0) for name in SCENES for dt in (1 / 480, 1 / 1920)),
+        *((name, 1 / 480, horizon) for name in ("bounce-once", "two-balls") for horizon in (0.2, 0.7, 1.2)),
+    ],
+)
+def test_with_the_time_of_touch_losses_and_slopes_are_the_closed_forms(name: str, dt: float, horizon: float) -> None:
+    """Before the touch too, at short horizons."""
+    env = gs.make(name, fidelity=gs.Fidelity("own", dt=dt, precision="float64"), horizon=horizon)
     x = rows(env)
     exact = env.closed_form(x)
     assert exact is not None
     torch.testing.assert_close(env.evaluate(x).loss, exact.loss, rtol=1e-12, atol=1e-12)
-    assert float(apart(env, x).max()) < 1e-11
-
-
-@pytest.mark.parametrize("horizon", [0.2, 0.7, 1.2])
-@pytest.mark.parametrize("name", ["bounce-once", "two-balls"])
-def test_so_they_are_at_other_horizons_before_the_touch_too(name: str, horizon: float) -> None:
-    env = gs.make(name, horizon=horizon)
-    x = rows(env)
     assert float(apart(env, x).max()) < 1e-11
 
 
@@ -165,11 +144,6 @@ def test_balls_that_miss_one_another_fly_on() -> None:
     x = torch.tensor([[[-2.0, -2.0], [-1.0, 1.0]]], dtype=torch.float64)
     end = two_balls(x, torch.zeros_like(x), torch.tensor([[3.0, 0.0]], dtype=torch.float64), 1.0)
     assert end.tolist() == [[-1.0, 1.0]]
-
-
-def test_other_scenes_have_no_closed_form() -> None:
-    env = gs.make("branin")
-    assert env.closed_form(env.space.center[None]) is None
 
 
 BY_OTHERS = ("mjx-bounce-once", "mjx-ground-wall", "mjx-two-balls", "newton-bounce-once", "newton-ground-wall")

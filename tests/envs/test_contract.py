@@ -135,20 +135,13 @@ def test_the_same_point_gives_the_same_bits(env, points, result):
         assert_same_bits(other.evaluate(points), result)
 
 
-def test_a_second_backward_adds_the_same_gradient(env, points, result):
-    x = points[:2].clone().requires_grad_()
-    total = env(x).sum()
+def test_losses_are_weighed_row_by_row_in_every_backward(env, points, result):
+    x, weight = points[:2].clone().requires_grad_(), torch.tensor([3.0, -0.5], dtype=torch.float64)
+    total = (weight * env(x)).sum()
     for _ in range(2):
         x.grad = None
         total.backward(retain_graph=True)
-        assert torch.equal(x.grad, result.grad[:2])
-
-
-def test_losses_are_weighed_row_by_row(env, points, result):
-    x = points[:2].clone().requires_grad_()
-    weight = torch.tensor([3.0, -0.5], dtype=torch.float64)
-    (weight * env(x)).sum().backward()
-    assert torch.equal(x.grad, weight[:, None] * result.grad[:2])
+        assert torch.equal(x.grad, weight[:, None] * result.grad[:2])
 
 
 def test_parameters_of_any_precision_get_gradients_of_their_own(env, points):

@@ -46,22 +46,6 @@ def test_a_ramp_is_linear_between_waypoints_whatever_the_number_of_steps(steps):
         assert torch.equal(path[:, :: steps // 5], corners)
 
 
-def test_every_waypoint_moves_its_own_two_segments_of_a_ramp():
-    """The shares of a waypoint are a hat function: over 2 x 6 steps they add up to 6; the last has only half a hat."""
-    waypoints = velocities(2, 5, 2).requires_grad_()
-    (grad,) = torch.autograd.grad(ramp(START, waypoints, 30).sum(), waypoints)
-    hats = torch.tensor([6.0, 6.0, 6.0, 6.0, 3.5], dtype=torch.float64)
-    torch.testing.assert_close(grad, hats[:, None].expand(2, 5, 2))
-
-
-def test_a_tool_travels_speed_times_time_within_its_reach():
-    path = drive(velocities(4, 30, 2))
-    assert path.shape == (4, 31, 2)
-    torch.testing.assert_close(
-        path, START + torch.nn.functional.pad(SPAN * velocities(4, 30, 2), (0, 0, 1, 0)).cumsum(1)
-    )
-
-
 def test_a_tool_stops_at_its_limits_and_turns_back_at_once():
     there, back = torch.full((1, 50, 2), 9.0, dtype=torch.float64), torch.full((1, 3, 2), -1.0, dtype=torch.float64)
     path = drive(torch.cat([there, back], dim=1))
@@ -83,19 +67,6 @@ def test_gradients_pass_while_a_tool_moves_and_stop_where_it_is_stopped():
     (grad,) = torch.autograd.grad(drive(velocity)[0, -1].sum(), velocity)
     assert grad[0, :, 0].tolist() == [0, 0, 0, SPAN, SPAN, SPAN]
     assert grad[0, :, 1].tolist() == [SPAN] * 6
-
-
-@pytest.mark.parametrize("size", [1.0, 100.0])
-def test_paths_and_gradients_have_the_bits_of_one_step_after_the_other(size):
-    velocity, weight = velocities(4, 30, 2, size=size).requires_grad_(), velocities(4, 31, 2)
-    positions = [START.expand(4, -1)]
-    for step in range(30):
-        positions.append(torch.clamp(positions[-1] + SPAN * velocity[:, step], LOWER, UPPER))
-    plain = torch.stack(positions, dim=1)
-    assert torch.equal(drive(velocity), plain)
-    found, wanted = (torch.autograd.grad((path * weight).sum(), velocity)[0] for path in (drive(velocity), plain))
-    assert torch.equal(found, wanted)
-    assert (found == 0).any() == (size > 1)
 
 
 def test_the_map_from_segments_to_path_is_differentiated():

@@ -49,17 +49,6 @@ def test_horizon_1_is_the_scene_itself_to_the_bit(scene):
         assert torch.equal(one, other)
 
 
-@pytest.mark.parametrize("scene", CONTROLLED)
-def test_horizon_1_ends_when_the_last_control_does(scene):
-    """That one has a slope, which it has not in an episode shorter by what it lasts; then tools rest."""
-    env = made(scene)
-    per = env.space.dim // env.decisions
-    shorter = made(scene, horizon=1 - 1 / env.decisions)
-    x = points(env)
-    assert bool((env.evaluate(x).grad[:, -per:] != 0).any())
-    assert bool((shorter.evaluate(x).grad[:, -per:] == 0).all())
-
-
 @pytest.mark.parametrize("horizon", [0.5, 1.5])
 def test_gradcheck(name, horizon):
     options = {"loss": "sum"} if name in SOFT else {}

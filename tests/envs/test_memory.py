@@ -5,10 +5,8 @@ import pickle
 import weakref
 from contextlib import contextmanager
 
-import jax.numpy as jnp
 import pytest
 import torch
-import warp as wp
 
 import gradscape as gs
 from gradscape.envs.base import Environment, OwnMethod
@@ -74,37 +72,6 @@ def test_so_is_a_solver_that_adds_up_by_columns_as_on_a_gpu(name, monkeypatch):
         del env
         assert solver() is None
         assert tape() is None
-
-
-@wp.kernel
-def _square(x: wp.array2d(dtype=wp.float32), loss: wp.array(dtype=wp.float32)):
-    i = wp.tid()
-    loss[i] = x[i, 0] * x[i, 0]
-
-
-def squares(x):
-    loss = wp.zeros(len(x), dtype=wp.float32, requires_grad=True)
-    wp.launch(_square, dim=len(x), inputs=[x], outputs=[loss])
-    return loss
-
-
-@pytest.mark.parametrize(
-    "make",
-    [
-        lambda: gs.from_torch(lambda x: x.square().sum(1), SPACE),
-        lambda: gs.from_jax(lambda x: jnp.square(x).sum(), SPACE),
-        lambda: gs.from_numpy(lambda x: (x**2).sum(1), SPACE, differences=1e-4),
-        lambda: gs.from_warp(squares, SPACE, device="cpu"),
-    ],
-    ids=["torch", "jax", "numpy", "warp"],
-)
-def test_so_is_a_function_of_others(make):
-    with no_collection():
-        env = make()
-        use(env)
-        held = weakref.ref(env)
-        del env
-        assert held() is None
 
 
 class Broken(Environment):

@@ -78,25 +78,6 @@ def test_a_control_that_is_held_throughout_is_called_by_its_name():
     assert held(fidelity=STEP).space.names == ("speed", "mass", "damping", "push")
 
 
-def test_precisions_take_turns_in_one_process():
-    """Each computes in its own, and again the same: what JAX has traced in one does not fit the other.
-
-    By Runge-Kutta older releases of JAX could not compile it. With 0.10.2 they can, so that here only mixed-up numbers
-    would be seen; `test_jax_functions` sees that traces are forgotten.
-    """
-
-    class Kutta(Dart):
-        mjcf = POINT.replace("<option", '<option integrator="RK4"')
-
-    x = torch.tensor([[2.0, 1.5, 0.0, 1.0, -1.0]], dtype=torch.float64)
-    turns = (STEP, replace(STEP, precision="float32"), STEP)
-    double, single, again = (Kutta(fidelity=fidelity).evaluate(x, grad=False).loss for fidelity in turns)
-    assert torch.equal(single, single.float().double())
-    assert not torch.equal(double, double.float().double())
-    assert torch.equal(again, double)
-    torch.testing.assert_close(single, double, rtol=1e-5, atol=0)
-
-
 def test_a_scene_of_ours_is_traced_once_for_all_processes():
     first, again = made_once("mjx-drop"), made("mjx-drop")
     x = first.space.uniform(2, seed=3)

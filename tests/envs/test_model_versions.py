@@ -10,13 +10,11 @@ import pytest
 import torch
 
 from gradscape.envs.base import Environment
-from gradscape.envs.bounce import Bounce
 from gradscape.envs.mjx.scene import MjxScene
 from gradscape.envs.registry import environment_class, make
 from gradscape.landscapes.objective import Evaluation
 from gradscape.landscapes.space import ParameterSpace
 
-from . import numbers
 from .numbers import moved, points_of, stored
 from .scenes import REGISTERED, TAICHI, one_of_each
 
@@ -58,35 +56,6 @@ def test_numbers_that_moved_are_named_with_both(bounce, kind):
     assert said.endswith("raise model_version or revert")
     values = kept.kinds[kind].flatten()
     assert any(f"{float(one):.6g} stored, {float(one * share):.6g} now" in said for one in values)
-
-
-def test_a_loss_that_is_no_number_any_more_has_moved(bounce):
-    found = bounce.evaluate(points_of(bounce, "draft"))
-    lost = replace(found, loss=torch.full_like(found.loss, torch.nan))
-    assert "nan now" in moved(bounce, "draft", lost)
-
-
-def test_a_raised_version_wants_numbers_of_its_own(bounce, monkeypatch):
-    monkeypatch.setattr(Bounce, "model_version", 7)
-    assert "bounce has no stored numbers of model 7" in moved(bounce, "draft")
-
-
-def test_numbers_are_written_of_a_version_that_has_none_and_never_over_those_of_one_that_has(
-    bounce, monkeypatch, tmp_path, capsys
-):
-    whole = stored()
-    monkeypatch.setattr(numbers, "STORED", tmp_path / "numbers.json")
-    monkeypatch.setattr(numbers, "stored", lambda: whole)
-    kept = whole["bounce"]["1"]["warp draft"]
-    doctored = replace(kept, loss=[2 * one for one in kept.loss])
-    monkeypatch.setitem(whole["bounce"]["1"], "warp draft", doctored)
-    numbers.write(["bounce"])
-    assert "numbers of bounce moved (loss" in capsys.readouterr().out
-    assert whole["bounce"]["1"]["warp draft"] is doctored
-    monkeypatch.setattr(Bounce, "model_version", 2)
-    monkeypatch.setitem(whole, "bounce", dict(whole["bounce"]))
-    numbers.write(["bounce"])
-    assert whole["bounce"]["2"]["warp draft"] == kept
 
 
 class Spring(Environment):

@@ -9,7 +9,7 @@ whose derivative is the time's own.
 
 from dataclasses import dataclass
 from functools import cache, partial
-from typing import Any, NamedTuple, no_type_check
+from typing import Any, no_type_check
 
 import torch
 import warp as wp
@@ -24,19 +24,11 @@ STEPS = wp.constant(200)  # towards a disc; ten are taken where the parabola doe
 ROUND = {"float32": 2e-5, "float64": 1e-12}  # squared distances, by that of touching, that rounding cannot tell from 0
 
 
-class Roots(NamedTuple):
-    """Warp functions that return a time, or NEVER."""
-
-    plane: Any
-    disc: Any
-
-
 @cache
 @no_type_check
-def roots(name: str) -> Roots:
-    """Return the functions of one precision."""
-    types = precision(name)
-    real, module = types.real, f"gradscape.roots.{name}"
+def roots(name: str) -> tuple[Any, Any]:
+    """Return the functions of a plane and of a disc, in one precision: they give a time, or NEVER."""
+    real, module = precision(name).real, f"gradscape.roots.{name}"
     vec2 = wp.types.vector(2, real)
     touching, straight = ROUND[name], -1e3 * ROUND[name]
 
@@ -102,7 +94,7 @@ def roots(name: str) -> Roots:
                 return real(NEVER)
         return real(NEVER)
 
-    return Roots(plane, disc)
+    return plane, disc
 
 
 # ---- The surfaces a ball meets in a plane, walls and bars: where they are, and what an impact does.
@@ -141,7 +133,7 @@ class Board:
 
 def constants(board: Board, *, dt: float, steps: int, name: str, device: str) -> Any:
     """Return the struct that kernels read a board from."""
-    data = surfaces(name).Data()
+    data = surfaces(name)[0]()
     data.dt, data.steps = dt, steps
     data.pivot = wp.array(board.pivots, dtype=wp.types.vector(2, precision(name).real), device=device)
     data.width, data.height, data.half_length = board.width, board.height, board.half_length
@@ -151,24 +143,10 @@ def constants(board: Board, *, dt: float, steps: int, name: str, device: str) ->
     return data
 
 
-class Surfaces(NamedTuple):
-    """What both contact rules ask of geometry and friction, and the struct `Data` of their constants."""
-
-    Data: Any
-    along: Any
-    anchor: Any
-    outward: Any
-    distance: Any
-    nearest: Any
-    coulomb: Any
-    rebound: Any
-    deflect: Any
-
-
 @cache
 @no_type_check
-def surfaces(name: str) -> Surfaces:
-    """Return the Warp functions of one precision."""
+def surfaces(name: str) -> tuple[Any, ...]:
+    """Return what both contact rules ask of geometry and friction, after the struct `Data` of their constants."""
     real = precision(name).real
     vec2 = wp.types.vector(2, real)
     Reals = wp.array2d[real]
@@ -234,13 +212,19 @@ def surfaces(name: str) -> Surfaces:
         return wp.dot(n, here - anchor(data, surface, angle, e)) - clearance
 
     @wp.func(module=module)
-    def nearest(data: Data, p: vec2) -> int:
-        """Return which surface of a bar is nearest to a point in the bar's frame."""
-        if p[0] > data.half_length:
-            return 2
-        if p[0] < -data.half_length:
-            return 3
-        return wp.where(p[1] > real(0.0), 0, 1)
+    def candidate(data: Data, k: int, angle: Reals, e: int, here: vec2) -> int:
+        """Return the surface of bar `k` that is nearest; the numbers after those of bars are walls'."""
+        bars = data.pivot.shape[0]
+        if k >= bars:
+            return 3 * bars + k
+        to = here - data.pivot[k]
+        axis = along(angle[e, k])
+        ahead = wp.dot(to, axis)
+        if ahead > data.half_length:
+            return 4 * k + 2
+        if ahead < -data.half_length:
+            return 4 * k + 3
+        return 4 * k + wp.where(axis[0] * to[1] - axis[1] * to[0] > real(0.0), 0, 1)
 
     @wp.func(module=module)
     def coulomb(stick: real, limit: real) -> real:
@@ -264,7 +248,7 @@ def surfaces(name: str) -> Surfaces:
         rub = coulomb(stick, data.friction * wp.max(push, real(0.0)))
         return v + push * n + rub * t, spin - rub / (data.inertia * data.radius)
 
-    return Surfaces(Data, along, anchor, outward, distance, nearest, coulomb, rebound, deflect)
+    return Data, along, anchor, outward, distance, candidate, rebound, deflect
 
 
 # ---- How a ball moves that a surface carries: along a face evenly accelerated, around a bar's end by Runge and Kutta.
@@ -276,31 +260,14 @@ def surfaces(name: str) -> Surfaces:
 ARC = wp.constant(1 / 240)  # the step around a round end [s]
 
 
-class Rolling(NamedTuple):
-    """Warp functions and the struct `Turn`: where a ball is on a round end, how fast, and how much it spins."""
-
-    Turn: Any
-    regime: Any
-    carry: Any
-    start: Any
-    advance: Any
-    press: Any
-    slip_rate: Any
-    press_rate: Any
-    grip: Any
-    grip_rate: Any
-
-
 @cache
 @no_type_check
-def rolling(name: str) -> Rolling:
-    """Return the functions of one precision."""
+def rolling(name: str) -> tuple[Any, ...]:
+    """Return the functions of one precision, after the struct of a ball's motion around a round end."""
     real = precision(name).real
-    vec2 = wp.types.vector(2, real)
+    vec2, Reals = wp.types.vector(2, real), wp.array2d[real]
     module = f"gradscape.rolling.{name}"
-    shared = surfaces(name)
-    Data, outward, anchor = shared.Data, shared.outward, shared.anchor
-    Reals = wp.array2d[real]
+    Data, _, anchor, outward, *_ = surfaces(name)
 
     @partial(wp.struct, module=module)
     class Turn:
@@ -406,7 +373,7 @@ def rolling(name: str) -> Rolling:
         ends = moved(moved(turn, t / real(6.0), k1), t / real(6.0), k4)
         return moved(moved(ends, t / real(3.0), k2), t / real(3.0), k3)
 
-    return Rolling(Turn, regime, carry, start, advance, press, slip_rate, press_rate, grip, grip_rate)
+    return Turn, regime, carry, start, advance, press, slip_rate, press_rate, grip, grip_rate
 
 
 # ---- The kernels that take a row through its whole episode: one launch there, and one back for derivatives.
@@ -414,11 +381,7 @@ def rolling(name: str) -> Rolling:
 # A launch costs more than an event, and rows have their events at times of their own: a thread follows its row alone.
 
 
-class Kernels(NamedTuple):
-    """`follow` takes rows from event to event until they are done; of `retrace` only the adjoint is launched."""
-
-    follow: Any
-    retrace: Any
+Kernels = tuple[Any, Any]  # one that takes rows from event to event until they are done, and one that goes back
 
 
 @cache
@@ -455,7 +418,7 @@ def episode_kernels(module: str, name: str, find: Any, move: Any) -> Kernels:
     derivatives.
     """
     real = precision(name).real
-    Data, Path, Reals = surfaces(name).Data, path_struct(name), wp.array2d[real]
+    Data, Path, Reals = surfaces(name)[0], path_struct(name), wp.array2d[real]
 
     @wp.kernel(module=module, enable_backward=False)
     def follow(last: int, taken: wp.array[int], data: Data, angle: Reals, path: Path):
@@ -479,7 +442,7 @@ def episode_kernels(module: str, name: str, find: Any, move: Any) -> Kernels:
         for i in range(taken[e]):
             move(i, e, data, angle, path)
 
-    return Kernels(follow, retrace)
+    return follow, retrace
 
 
 # ---- The kernels of the ball among walls and bars: what comes first and when, and how the ball goes there.
@@ -500,9 +463,9 @@ def impact_kernels(name: str) -> Kernels:
     vec2 = wp.types.vector(2, real)
     Reals, Path = wp.array2d[real], path_struct(name)
     module, halves = f"gradscape.impacts.{name}", HALVES[name]
-    Data, along, anchor, outward, distance, nearest, _, rebound, deflect = surfaces(name)
     plane, disc = roots(name)
     Turn, regime, carry, start, advance, press, slip_rate, press_rate, grip, grip_rate = rolling(name)
+    Data, along, anchor, outward, distance, candidate, rebound, deflect = surfaces(name)
 
     @wp.func(module=module)
     def is_round(data: Data, surface: int) -> bool:
@@ -559,13 +522,8 @@ def impact_kernels(name: str) -> Kernels:
         if side * wp.dot(n, along(angle[e, support // 4])) < real(0.0):
             return EDGE
         here = anchor(data, support, angle, e) + data.reach * n
-        bars = data.pivot.shape[0]
-        for k in range(bars + 4):
-            surface = int(3 * bars + k)
-            if k < bars:
-                axis = along(angle[e, k])
-                to = here - data.pivot[k]
-                surface = 4 * k + nearest(data, vec2(wp.dot(to, axis), axis[0] * to[1] - axis[1] * to[0]))
+        for k in range(data.pivot.shape[0] + 4):
+            surface = candidate(data, k, angle, e, here)
             approach = -wp.dot(outward(data, surface, angle, e, here), v)
             if k != support // 4 and approach > real(0.0) and distance(data, surface, angle, e, here) < real(0.0):
                 return surface
@@ -661,25 +619,16 @@ def impact_kernels(name: str) -> Kernels:
 
     @wp.func(module=module)
     def time_of_event(
-        data: Data,
-        surface: int,
-        support: int,
-        angle: Reals,
-        e: int,
-        t: real,
-        there: vec2,
-        v: vec2,
-        slip: real,
-        rate: real,
+        data: Data, surface: int, support: int, angle: Reals, e: int, t: real, x: vec2, v: vec2, slip: real, rate: real
     ) -> real:
-        """Return the corrected time of an event at which the ball is `there` at v, slipping more by `rate`."""
+        """Return the corrected time of an event at which the ball is at x with v, slipping more by `rate`."""
         least = data.graze * (wp.length(v) + data.crawl)
         if surface >= 0:
-            n = outward(data, surface, angle, e, there)
-            return correct(data, t, distance(data, surface, angle, e, there), wp.dot(n, v), least)
+            n = outward(data, surface, angle, e, x)
+            return correct(data, t, distance(data, surface, angle, e, x), wp.dot(n, v), least)
         if surface == EDGE:
             axis = along(angle[e, support // 4])
-            q = wp.dot(there - data.pivot[support // 4], axis)
+            q = wp.dot(x - data.pivot[support // 4], axis)
             return correct(data, t, q - wp.sign(q) * data.half_length, wp.dot(axis, v), least)
         if surface == SLIDES or surface == LEAVES or surface == SLIPS:  # noqa: SIM109 -- Warp has no `in`
             return correct(data, t, slip, rate, data.graze)
@@ -821,22 +770,17 @@ def step_kernels(name: str) -> Kernels:
     vec2 = wp.types.vector(2, real)
     Reals, Path = wp.array2d[real], path_struct(name)
     module = f"gradscape.overlaps.{name}"
-    Data, along, _, outward, distance, nearest, _, rebound, deflect = surfaces(name)
+    Data, _, _, outward, distance, candidate, rebound, deflect = surfaces(name)
 
     @wp.func(module=module)
     def find(i: int, e: int, data: Data, angle: Reals, path: Path):
         """Find the surface that is overlapped most, of those that are approached."""
         here = path.x[i, e]
         w = path.v[i, e] - vec2(real(0.0), data.gravity * data.dt)
-        bars = data.pivot.shape[0]
         deepest = real(0.0)
         first = int(FREE)
-        for k in range(bars + 4):
-            surface = int(3 * bars + k)
-            if k < bars:
-                to = here - data.pivot[k]
-                axis = along(angle[e, k])
-                surface = 4 * k + nearest(data, vec2(wp.dot(to, axis), axis[0] * to[1] - axis[1] * to[0]))
+        for k in range(data.pivot.shape[0] + 4):
+            surface = candidate(data, k, angle, e, here)
             gap = distance(data, surface, angle, e, here)
             if gap < deepest and wp.dot(outward(data, surface, angle, e, here), w) < real(0.0):
                 deepest = gap
@@ -921,8 +865,8 @@ class Solver:
     ) -> None:
         self.steps, self.dt, self.name, self.capacity, self.device = steps, dt, name, capacity, device
         self.types = precision(name)
-        self.kernels = {"impact": impact_kernels, "step": step_kernels}[contacts](name)
-        load(self.kernels, device)
+        self.follow, self.retrace = {"impact": impact_kernels, "step": step_kernels}[contacts](name)
+        load([self.follow, self.retrace], device)
         self.data = constants(board, dt=dt, steps=steps, name=name, device=device)
         self.angle, self.adj_angle = (
             wp.zeros((capacity, len(board.pivots)), dtype=self.types.real, device=device) for _ in range(2)
@@ -963,7 +907,7 @@ class Solver:
         inputs = self._inputs()
         adjoints = [None, type(self.data)(), self.adj_angle, type(self.flight.path)()]
         settings: dict[str, Any] = {"device": self.device, "adjoint": True, "record_tape": False}
-        wp.launch(self.kernels.retrace, batch, inputs, adj_inputs=adjoints, **settings)
+        wp.launch(self.retrace, batch, inputs, adj_inputs=adjoints, **settings)
         first = {name: self.flight.adjoint(field)[0, :batch].clone() for name, field in _SLOPES.items()}
         return Slopes(to_torch(self.adj_angle)[:batch].clone(), **first)
 
@@ -984,7 +928,7 @@ class Solver:
         taken = to_torch(self.iterations)[:batch]
         while True:
             inputs = [self.flight.length - 1, *self._inputs()]
-            wp.launch(self.kernels.follow, batch, inputs, device=self.device, record_tape=False)
+            wp.launch(self.follow, batch, inputs, device=self.device, record_tape=False)
             counts = taken.long()
             if bool((self.flight.tensor("step")[counts, self._rows(batch)] >= self.steps).all()):
                 return counts

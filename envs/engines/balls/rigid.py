@@ -7,7 +7,7 @@ here: a step that is split at the time of touch, and damping that grows with dep
 
 from dataclasses import dataclass
 from functools import cache, partial
-from typing import Any, NamedTuple, no_type_check
+from typing import Any, no_type_check
 
 import torch
 import warp as wp
@@ -84,7 +84,7 @@ class Solver:
 
 def _constants(ball: Ball, dt: float, name: str) -> Any:
     """Return the struct that kernels read a ball from; `kf` stops sliding within a step at the most."""
-    data = ground(name).Data()
+    data = ground(name)[0]()
     for field in ("radius", "gravity", "turning"):
         setattr(data, field, getattr(ball, field))
     for field in ("ke", "kd", "mu", "drag"):
@@ -94,18 +94,10 @@ def _constants(ball: Ball, dt: float, name: str) -> Any:
     return data
 
 
-class Ground(NamedTuple):
-    """What the kernels share: the struct `Data` of constants, by mass, and what pushes a ball."""
-
-    Data: Any
-    fly: Any
-    rub: Any
-
-
 @cache
 @no_type_check
-def ground(name: str) -> Ground:
-    """Return the Warp functions of one precision."""
+def ground(name: str) -> tuple[Any, Any, Any]:
+    """Return what the kernels share: the struct of constants, by mass, and what pushes a ball, by air and friction."""
     types, module = precision(name), f"gradscape.ground.{name}"
     real, vec3 = types.real, types.vec3
 
@@ -139,7 +131,7 @@ def ground(name: str) -> Ground:
             return -data.kf * slip
         return -(limit / wp.sqrt(squared)) * slip  # the root only here: at rest its derivative is infinite
 
-    return Ground(Data, fly, rub)
+    return Data, fly, rub
 
 
 @cache
@@ -174,37 +166,28 @@ def flight_kernel(name: str, contacts: str) -> Any:
         force = fly(data, speed) + vec3(f_t[0], f_n, f_t[2])
         return speed + dt * force, roll + (dt * data.turning) * f_t
 
+    if contacts == "touch":
+
+        @wp.func(module=module)
+        def time_to_touch(data: Data, c: real, v_n: real, a: real) -> real:
+            """Return when c + t (v_n + t a), where a step of length t would end, is 0; its end where it is not."""
+            if c < real(0.0):
+                return real(0.0)
+            if c + data.dt * (v_n + data.dt * a) >= real(0.0):
+                return data.dt
+            root = wp.sqrt(v_n * v_n - real(4.0) * a * c)
+            if v_n < real(0.0):
+                return real(2.0) * c / (root - v_n)
+            return (root + v_n) / (real(-2.0) * a)
+
+    else:
+
+        @wp.func(module=module)
+        def time_to_touch(data: Data, c: real, v_n: real, a: real) -> real:
+            return wp.where(c < real(0.0), real(0.0), data.dt)
+
     @wp.kernel(module=module)
     def advance(steps: int, data: Data, x: Vecs, v: Vecs, roll: Vecs):
-        e = wp.tid()
-        for step in range(steps):
-            here, speed, turn = x[step, e], v[step, e], roll[step, e]
-            c = here[1] - data.radius
-            if c < real(0.0):
-                after, turned = push(data, data.dt, c, speed, turn)
-                v[step + 1, e] = after
-                roll[step + 1, e] = turned
-                x[step + 1, e] = here + data.dt * after
-            else:
-                flown = speed + data.dt * fly(data, speed)
-                v[step + 1, e] = flown
-                roll[step + 1, e] = turn
-                x[step + 1, e] = here + data.dt * flown
-
-    @wp.func(module=module)
-    def time_to_touch(data: Data, c: real, v_n: real, a: real) -> real:
-        """Return when c + t (v_n + t a), where a step of length t would end, is 0; the step's end where it is not."""
-        if c < real(0.0):
-            return real(0.0)
-        if c + data.dt * (v_n + data.dt * a) >= real(0.0):
-            return data.dt
-        root = wp.sqrt(v_n * v_n - real(4.0) * a * c)
-        if v_n < real(0.0):
-            return real(2.0) * c / (root - v_n)
-        return (root + v_n) / (real(-2.0) * a)
-
-    @wp.kernel(module=module)
-    def advance_to_touch(steps: int, data: Data, x: Vecs, v: Vecs, roll: Vecs):
         e = wp.tid()
         for step in range(steps):
             here, speed, turn = x[step, e], v[step, e], roll[step, e]
@@ -224,4 +207,4 @@ def flight_kernel(name: str, contacts: str) -> Any:
                 roll[step + 1, e] = turn
                 x[step + 1, e] = there
 
-    return advance_to_touch if contacts == "touch" else advance
+    return advance

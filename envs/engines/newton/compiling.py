@@ -1,7 +1,7 @@
 """Import Newton, and compile of its kernels few more than run.
 
 Warp compiles a module when the first of its kernels is launched: all that are in it with their adjoints, of which a
-scene runs one in ten. What a new process compiles first takes 2 s longer: Warp reads its headers, once a thread.
+scene runs one in ten.
 """
 
 from __future__ import annotations
@@ -9,31 +9,13 @@ from __future__ import annotations
 import sys
 import threading
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from importlib import import_module
 from typing import Any
 
+import newton
 import warp as wp
 
 SOLVERS, ADJACENCY = "newton._src.solvers.", "newton._src.utils.mesh"  # modules of kernels
-
-
-@wp.kernel(enable_backward=False)
-def nothing():  # type: ignore[no-untyped-def]
-    """Do nothing: who compiles it has read the headers."""
-
-
-def import_newton() -> Any:
-    """Import Newton, which takes 2 s too, in another thread, while this one reads the headers.
-
-    Where Warp's cache has the kernel `nothing`, they are not read.
-    """
-    wp.init()
-    with ThreadPoolExecutor(1) as executor:
-        importing = executor.submit(import_module, "newton")
-        wp.force_load("cpu", [nothing.module])
-        return importing.result()
 
 
 def split_solvers() -> None:
@@ -79,6 +61,3 @@ def forward(module: str) -> Iterator[None]:
         yield
     finally:
         wp.set_module_options({"enable_backward": True}, module=module)
-
-
-newton = import_newton()

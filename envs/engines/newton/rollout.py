@@ -13,13 +13,14 @@ from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Any
 
+import newton
 import torch
 import warp as wp
 from jaxtyping import Float
 from torch import Tensor
 
 from ..runtime import to_torch
-from .compiling import finalize, newton, split_solvers
+from .compiling import finalize, split_solvers
 
 TAPE = threading.Lock()  # Warp records on one tape at a time
 SOLVERS: dict[str, tuple[str, dict[str, Any]]] = {  # of Newton, which imports those that are asked for

@@ -20,7 +20,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache, reduce
 from types import SimpleNamespace
-from typing import Any, no_type_check
+from typing import Any, NamedTuple, no_type_check
 
 import numpy as np
 import torch
@@ -66,21 +66,14 @@ def _fluid(name: str) -> tuple[Any, Any]:
     """J' = min(exp(dt tr C) J, TORN), tau = K log J' I + J' mu (C + C^T - 2/3 tr C I)."""
     real, array = types(name)
 
-    @ti.kernel
-    def update(
-        s: ti.i32, batch: ti.i32, first: ti.i32, dt: real, scale: real, bulk: real, viscosity: real,
-        mass: array(1), volume: array(1), C: array(3, 3, 3), J: array(3), A: array(3, 3, 3),
-    ):  # fmt: skip
-        for e, p in ti.ndrange(batch, J.shape[2]):
-            c = C[s, e, first + p]
-            one = ti.Matrix.identity(real, 3)
-            j = ti.min(ti.exp(dt * c.trace()) * J[s, e, p], real(TORN))
-            shear = c + c.transpose() - real(2.0 / 3.0) * c.trace() * one
-            tau = bulk * ti.log(j) * one + j * viscosity * shear
-            J[s + 1, e, p] = j
-            A[s, e, first + p] = scale * volume[first + p] * tau + mass[first + p] * c
+    @ti.func
+    def law(J, c, dt, bulk, viscosity):
+        one = ti.Matrix.identity(real, 3)
+        j = ti.min(ti.exp(dt * c.trace()) * J, real(TORN))
+        shear = c + c.transpose() - real(2.0 / 3.0) * c.trace() * one
+        return j, bulk * ti.log(j) * one + j * viscosity * shear
 
-    return update, update.grad
+    return _by_the_compiler(name, law, array(3))
 
 
 @cache
@@ -89,17 +82,29 @@ def _elastic(name: str) -> tuple[Any, Any]:
     """F' = (I + dt C) F, tau = mu (F' F'^T - I) + lam log(det F') I."""
     real, array = types(name)
 
+    @ti.func
+    def law(F, c, dt, mu, lam):
+        one = ti.Matrix.identity(real, 3)
+        f = (one + dt * c) @ F
+        return f, mu * (f @ f.transpose() - one) + lam * ti.log(f.determinant()) * one
+
+    return _by_the_compiler(name, law, array(3, 3, 3))
+
+
+@no_type_check
+def _by_the_compiler(name: str, law: Any, states: Any) -> tuple[Any, Any]:
+    """Return the kernels of a law (S, C, dt, two constants) -> (S', tau) whose adjoint is the compiler's."""
+    real, array = types(name)
+
     @ti.kernel
     def update(
-        s: ti.i32, batch: ti.i32, first: ti.i32, dt: real, scale: real, mu: real, lam: real,
-        mass: array(1), volume: array(1), C: array(3, 3, 3), F: array(3, 3, 3), A: array(3, 3, 3),
+        s: ti.i32, batch: ti.i32, first: ti.i32, dt: real, scale: real, one: real, other: real,
+        mass: array(1), volume: array(1), C: array(3, 3, 3), S: states, A: array(3, 3, 3),
     ):  # fmt: skip
-        for e, p in ti.ndrange(batch, F.shape[2]):
+        for e, p in ti.ndrange(batch, S.shape[2]):
             c = C[s, e, first + p]
-            one = ti.Matrix.identity(real, 3)
-            f = (one + dt * c) @ F[s, e, p]
-            tau = mu * (f @ f.transpose() - one) + lam * ti.log(f.determinant()) * one
-            F[s + 1, e, p] = f
+            new, tau = law(S[s, e, p], c, dt, one, other)
+            S[s + 1, e, p] = new
             A[s, e, first + p] = scale * volume[first + p] * tau + mass[first + p] * c
 
     return update, update.grad
@@ -339,8 +344,7 @@ def boundary_contact(boundary: Boundary, name: str) -> Any:
     if isinstance(boundary, Open):
         return _free()
     if isinstance(boundary, LadleInTank):
-        handle = [_handle(boundary, name)] if boundary.height else []
-        contacts = [_bowl(boundary, name), *handle, _drag(boundary, name)]
+        contacts = [*_ladle(boundary, name), _drag(boundary, name)]
         edge = boundary.half_width - ON_WALL
         lower, upper = (-edge, ON_WALL, -edge), (edge, boundary.lid, edge)
         return reduce(_apply_both, [*contacts, _walls(lower, upper, name)])
@@ -376,21 +380,24 @@ def _apply_both(first: Any, second: Any) -> Any:
 @cache
 @no_type_check
 def _shapes(name: str) -> SimpleNamespace:
-    """Return signed distances (outward normal, distance [m]) of a point in each shape's own frame."""
+    """Return signed distances (outward normal, distance [m]) of a point in each shape's own frame.
+
+    All take the point, the shape's axis and two lengths, whether or not they have so many.
+    """
     real = real_type(name)
 
     @ti.func
-    def sphere(p, radius):
+    def sphere(p, axis, radius, _):
         length = ti.sqrt(p.dot(p) + real(TINY))
         return p / length, length - radius
 
     @ti.func
     def capsule(p, axis, half_length, radius):
         along = ti.max(-half_length, ti.min(p.dot(axis), half_length))
-        return sphere(p - along * axis, radius)
+        return sphere(p - along * axis, axis, radius, radius)
 
     @ti.func
-    def torus(p, ring, tube):
+    def torus(p, axis, ring, tube):
         axial = ti.sqrt(p[0] ** 2 + p[2] ** 2 + real(TINY))
         to_ring = p - ti.Vector([p[0], real(0.0), p[2]]) * (ring / axial)
         gap = axial - ring
@@ -398,16 +405,16 @@ def _shapes(name: str) -> SimpleNamespace:
         return to_ring / length, length - tube
 
     @ti.func
-    def bowl(p, radius, half_thickness):
+    def bowl(p, axis, radius, half_thickness):
         """Return the distance to an open half-sphere shell, its rim in the plane y = 0, its opening upwards."""
-        out, gap = sphere(p, radius)
+        out, gap = sphere(p, axis, radius, radius)
         side = ti.select(gap < real(0.0), -real(1.0), real(1.0))
-        rim, to_rim = torus(p, radius, half_thickness)
+        rim, to_rim = torus(p, axis, radius, half_thickness)
         below = p[1] < real(0.0)
         return ti.select(below, side * out, rim), ti.select(below, side * gap - half_thickness, to_rim)
 
     @ti.func
-    def cylinder(p, radius, half_height):
+    def cylinder(p, axis, radius, half_height):
         axial = ti.sqrt(p[0] ** 2 + p[2] ** 2 + real(TINY))
         outward = ti.Vector([p[0], real(0.0), p[2]]) / axial
         upward = ti.Vector([real(0.0), ti.select(p[1] < real(0.0), -real(1.0), real(1.0)), real(0.0)])
@@ -452,35 +459,35 @@ def _laws(name: str) -> SimpleNamespace:
 
 
 @no_type_check
-def _bowl(ladle: LadleInTank, name: str) -> Any:
-    real, laws, bowl = real_type(name), _laws(name), _shapes(name).bowl
+def _ladle(ladle: LadleInTank, name: str) -> list[Any]:
+    """Return the contacts with its bowl and, where it has one, with its handle, an upright capsule on the rim."""
+    real, laws, shapes = real_type(name), _laws(name), _shapes(name)
     grip, held = _ladle_shares(ladle, name)
 
     @ti.func
-    def contact(p, v, e, tools: ti.template(), step, fraction, rate):
-        rim, body = laws.motion(tools, e, step, 0, fraction, rate)
-        n, d = bowl(p - rim, real(ladle.radius), real(ladle.half_thickness))
-        return laws.touch(v, body, n, grip(d), held(d), real(ladle.friction), LADLE_SLIP)
-
-    return contact
-
-
-@no_type_check
-def _handle(ladle: LadleInTank, name: str) -> Any:
-    """Return the contact with an upright capsule that stands on the bowl's rim."""
-    real, laws, capsule = real_type(name), _laws(name), _shapes(name).capsule
-    grip, held = _ladle_shares(ladle, name)
+    def up():
+        return ti.Vector([real(0.0), real(1.0), real(0.0)])
 
     @ti.func
-    def contact(p, v, e, tools: ti.template(), step, fraction, rate):
-        rim, body = laws.motion(tools, e, step, 0, fraction, rate)
+    def bowl(p, rim):
+        return shapes.bowl(p - rim, up(), real(ladle.radius), real(ladle.half_thickness))
+
+    @ti.func
+    def handle(p, rim):
         half = real(ladle.height / 2)
         middle = rim + ti.Vector([-real(ladle.radius), half, real(0.0)])
-        up = ti.Vector([real(0.0), real(1.0), real(0.0)])
-        n, d = capsule(p - middle, up, half, real(ladle.half_thickness))
-        return laws.touch(v, body, n, grip(d), held(d), real(ladle.friction), LADLE_SLIP)
+        return shapes.capsule(p - middle, up(), half, real(ladle.half_thickness))
 
-    return contact
+    def contact_with(distance):
+        @ti.func
+        def contact(p, v, e, tools: ti.template(), step, fraction, rate):
+            rim, body = laws.motion(tools, e, step, 0, fraction, rate)
+            n, d = distance(p, rim)
+            return laws.touch(v, body, n, grip(d), held(d), real(ladle.friction), LADLE_SLIP)
+
+        return contact
+
+    return [contact_with(part) for part in ((bowl, handle) if ladle.height else (bowl,))]
 
 
 @no_type_check
@@ -523,8 +530,9 @@ def _ladle_shares(ladle: LadleInTank, name: str) -> tuple[Any, Any]:
 
 @no_type_check
 def _tool(tool: Tool, slot: int, influence: Any, name: str) -> Any:
-    real, laws, distance = real_type(name), _laws(name), _distance(tool, name)
-    rolls = tool.kind is Kind.ROLLER
+    real, laws = real_type(name), _laws(name)
+    rolls, (a, b) = tool.kind is Kind.ROLLER, (*tool.size, 0.0)[:2]
+    distance = getattr(_shapes(name), {Kind.ROLLER: "capsule"}.get(tool.kind, tool.kind.name.lower()))
 
     @ti.func
     def contact(p, v, e, tools: ti.template(), step, fraction, rate):
@@ -535,7 +543,7 @@ def _tool(tool: Tool, slot: int, influence: Any, name: str) -> Any:
             angles, spin = laws.motion(tools, e, step, slot + 1, fraction, rate)
             axis = ti.Vector([ti.sin(angles[1]), real(0.0), ti.cos(angles[1])])
             body += (spin[0] * axis + spin[1] * up).cross(local)
-        n, d = distance(local, axis)
+        n, d = distance(local, axis, real(a), real(b))
         return laws.touch(v, body, n, influence(d), real(0.0), real(tool.friction), TOOL_SLIP)
 
     return contact
@@ -554,31 +562,6 @@ def _influence(room: ToolsInRoom, name: str) -> Any:
         return ti.select(inside, real(1.0), ti.max(real(1.0) - decay, real(0.0)))
 
     return influence
-
-
-@no_type_check
-def _distance(tool: Tool, name: str) -> Any:
-    """Return a tool's signed distance, as a function of (point in its frame, its axis)."""
-    real, shapes = real_type(name), _shapes(name)
-    a, b = (*tool.size, 0.0)[:2]
-
-    @ti.func
-    def sphere(p, axis):
-        return shapes.sphere(p, real(a))
-
-    @ti.func
-    def torus(p, axis):
-        return shapes.torus(p, real(a), real(b))
-
-    @ti.func
-    def cylinder(p, axis):
-        return shapes.cylinder(p, real(a), real(b))
-
-    @ti.func
-    def capsule(p, axis):
-        return shapes.capsule(p, axis, real(a), real(b))
-
-    return {Kind.SPHERE: sphere, Kind.TORUS: torus, Kind.CYLINDER: cylinder}.get(tool.kind, capsule)
 
 
 @no_type_check
@@ -628,17 +611,12 @@ class States:
         return (self.x, self.v, self.C, *self.S)
 
 
-@dataclass(frozen=True, eq=False)
-class Grid:
+class Grid(NamedTuple):
     """What nodes hold in one substep, [environment, i, j, k]: momentum, mass, velocity."""
 
     q: torch.Tensor
     m: torch.Tensor
     v: torch.Tensor
-
-    def arrays(self) -> tuple[torch.Tensor, ...]:
-        """Return every array."""
-        return (self.q, self.m, self.v)
 
 
 class Solver:
@@ -676,7 +654,7 @@ class Solver:
         shape = capacity, *model.nodes
         self.grid = Grid(self._zeros(*shape, 3), self._zeros(*shape), self._zeros(*shape, 3))
         self.tools = self._zeros(capacity, model.steps + 1, model.boundary.slots, 3)
-        self.differentiated = (*self.tape.arrays(), self.A, *self.grid.arrays(), self.tools)
+        self.differentiated = (*self.tape.arrays(), self.A, *self.grid, self.tools)
         for array in self.differentiated:
             array.requires_grad_()
             array.grad = torch.zeros_like(array)
@@ -740,53 +718,43 @@ class Solver:
             self.transfers.move(*self._move_inputs(s, batch))
 
     def _fill_grid(self, step: int, s: int, batch: int) -> None:
-        for array in self.grid.arrays():
+        for array in self.grid:
             array.detach().zero_()
         self.transfers.p2g(*self._p2g_inputs(s, batch))
-        self._fold(self.grid.q.detach(), self.grid.m.detach())
+        self._reflect(self.grid.q.detach(), self.grid.m.detach(), fold=True)
         self.grid_op(*self._grid_inputs(step, s, batch))
-        self._unfold(self.grid.v.detach())
+        self._reflect(self.grid.v.detach(), fold=False)
 
-    def _fold(self, vectors: torch.Tensor, masses: torch.Tensor | None = None) -> None:
-        """Add what nodes beyond walls that reflect hold to their images (`mirrors`); the adjoint of `_unfold`."""
-        for axis, before, beyond in self.images:
+    def _reflect(self, vectors: torch.Tensor, masses: torch.Tensor | None = None, *, fold: bool) -> None:
+        """Give nodes beyond walls that reflect the image of what those before them hold (`mirrors`).
+
+        To `fold` is the adjoint of that: what nodes beyond hold is added to their images.
+        """
+        for axis, before, beyond in self.images if fold else reversed(self.images):
             if before == beyond:
                 vectors.movedim(axis + 1, 0)[before, ..., axis] = 0.0
                 continue
             for values in (vectors,) if masses is None else (vectors, masses):
                 across = values.movedim(axis + 1, 0)
-                across[before] += self._image(across[beyond], axis)
-                across[beyond] = 0.0
-
-    def _unfold(self, vectors: torch.Tensor, masses: torch.Tensor | None = None) -> None:
-        """Give nodes beyond walls that reflect the image of what those before them hold."""
-        for axis, before, beyond in reversed(self.images):
-            if before == beyond:
-                vectors.movedim(axis + 1, 0)[before, ..., axis] = 0.0
-                continue
-            for values in (vectors,) if masses is None else (vectors, masses):
-                across = values.movedim(axis + 1, 0)
-                across[beyond] = self._image(across[before], axis)
-
-    def _image(self, values: torch.Tensor, axis: int) -> torch.Tensor:
-        """Return what a plane of nodes [environment, j, k] of vectors or masses looks like in a wall."""
-        image = values.clone()
-        if image.ndim == 4:
-            image[..., axis] *= -1.0
-        return image
+                image = across[beyond if fold else before].clone()
+                if values is vectors:
+                    image[..., axis] *= -1.0
+                if fold:
+                    across[before] += image
+                across[beyond] = 0.0 if fold else image
 
     def _retreat(self, step: int, batch: int) -> None:
         """Take gradients from the tape's last state to its first, then to the last of the step before."""
         _grad(self.A).zero_()
         for s in reversed(range(self.model.substeps)):
             self._fill_grid(step, s, batch)
-            for array in self.grid.arrays():
+            for array in self.grid:
                 _grad(array).zero_()
             self.transfers.move.grad(*self._move_inputs(s, batch))
             self.transfers.g2p.grad(*self._g2p_inputs(s, batch))
-            self._fold(_grad(self.grid.v))
+            self._reflect(_grad(self.grid.v), fold=True)
             self.grid_op.grad(*self._grid_inputs(step, s, batch))
-            self._unfold(_grad(self.grid.q), _grad(self.grid.m))
+            self._reflect(_grad(self.grid.q), _grad(self.grid.m), fold=False)
             self.transfers.p2g.grad(*self._p2g_inputs(s, batch))
             for (_, adjoint), inputs in zip(self.materials, self._material_inputs(s, batch), strict=True):
                 adjoint(*inputs)
@@ -815,20 +783,9 @@ class Solver:
     def _material_inputs(self, s: int, batch: int) -> list[tuple[Any, ...]]:
         model, tape = self.model, self.tape
         scale = -model.dt * 4.0 / model.dx**2
+        each = self.mass, self.volume, tape.C
         return [
-            (
-                s,
-                batch,
-                first,
-                model.dt,
-                scale,
-                *body.material.constants().values(),
-                self.mass,
-                self.volume,
-                tape.C,
-                S,
-                self.A,
-            )
+            (s, batch, first, model.dt, scale, *body.material.constants().values(), *each, S, self.A)
             for body, first, S in zip(model.bodies, self.first[:-1], tape.S, strict=True)
         ]
 
@@ -839,7 +796,7 @@ class Solver:
     def _grid_inputs(self, step: int, s: int, batch: int) -> tuple[Any, ...]:
         model, fall = self.model, self.model.dt * self.model.gravity
         time = step, s / model.substeps, 1.0 / (model.substeps * model.dt)
-        return batch, self.origin, model.dx, fall, self.empty, *time, self.tools, *self.grid.arrays()
+        return batch, self.origin, model.dx, fall, self.empty, *time, self.tools, *self.grid
 
     def _g2p_inputs(self, s: int, batch: int) -> tuple[Any, ...]:
         tape = self.tape

@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from ..runtime import cores
+from ..runtime import cores, precision
 
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
 with warnings.catch_warnings():
@@ -41,10 +41,7 @@ def start(device: str) -> Any:
 @cache
 def real(name: str) -> Any:
     """Return Taichi's type of `float32` or `float64`. Raises ValueError for any other name."""
-    types = {"float32": ti.f32, "float64": ti.f64}
-    if name not in types:
-        raise ValueError(f"precision must be float32 or float64; got {name!r}")
-    return types[name]
+    return ti.f32 if precision(name).name == "float32" else ti.f64
 
 
 def _init(device: str) -> None:

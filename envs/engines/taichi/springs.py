@@ -59,11 +59,14 @@ class Solver:
         self.kind: Any = {"dtype": precision(name).torch, "device": device}
         self.stop = stop or threading.Event()
         fields, tree = _fields(ti, R, sheet, frames=steps + 1, capacity=capacity)
+        given = {"pairs": sheet.pairs, "rest": sheet.rest, "weight": sheet.weight, "plate": sheet.plates}
+        given |= {"start": sheet.x, "free": ~np.isin(np.arange(self.count), sheet.held), "mass": sheet.masses}
+        for field, values in given.items():
+            getattr(fields, field).from_numpy(values.astype("int32" if field == "pairs" else name))
         weakref.finalize(self, tree.destroy).atexit = False  # Taichi keeps fields that nothing refers to
         self.borders = _borders(ti, R, fields)
         stop_by = _stops(ti, R, surface, rule, dt=dt)
         self.physics = _physics(ti, R, sheet, fields, stop_by, moves=surface.moves, dt=dt, device=device)
-        self._lay_out(sheet)
         self._compile()
 
     def run(self, velocity: torch.Tensor, stiffness: torch.Tensor, poses: torch.Tensor | None = None) -> torch.Tensor:
@@ -113,16 +116,6 @@ class Solver:
             raise ValueError(f"this solver takes {name} of shape {shape}; got {tuple(part.shape)}")
         return part.detach().to(**self.kind).contiguous()
 
-    def _lay_out(self, sheet: Sheet) -> None:
-        pairs = torch.from_numpy(sheet.pairs).to(self.kind["device"], torch.int32)
-        free = ~np.isin(np.arange(self.count), sheet.held)
-        masses = sheet.masses.copy()
-        reals = (
-            torch.from_numpy(part).to(**self.kind)
-            for part in (sheet.rest, sheet.weight, sheet.plates, sheet.x, free, masses)
-        )
-        self.borders.lay_out(pairs.contiguous(), *(part.contiguous() for part in reals))
-
     def _compile(self) -> None:
         """Compile every kernel, or fetch it from the cache, by launching it on no rows."""
         nothing = [torch.zeros(0, *shape, **self.kind) for shape in ((3,), (self.count,), (self.steps + 1, 3))]
@@ -158,6 +151,7 @@ def _fields(ti: Any, R: Any, sheet: Sheet, *, frames: int, capacity: int) -> tup
         rest=place(ti.field(R), springs),
         weight=place(ti.field(R), springs),
         plate=place(ti.field(R), springs),
+        start=place(ti.Vector.field(3, R), count),
         free=place(ti.field(R), count),
         mass=place(ti.field(R), count),
         stiffness=place(ti.field(R, needs_grad=True), capacity, count),
@@ -223,23 +217,6 @@ def _borders(ti: Any, R: Any, fields: Any) -> SimpleNamespace:
     arrays = ti.types.ndarray
 
     @ti.kernel
-    def lay_out(
-        pairs: arrays(dtype=ti.types.vector(2, ti.i32), ndim=1),
-        rest: arrays(dtype=R, ndim=1),
-        weight: arrays(dtype=R, ndim=1),
-        plate: arrays(dtype=R, ndim=1),
-        start: arrays(dtype=vec3, ndim=1),
-        moves: arrays(dtype=R, ndim=1),
-        masses: arrays(dtype=R, ndim=1),
-    ):
-        for k in rest:
-            fields.pairs[k], fields.rest[k], fields.weight[k], fields.plate[k] = pairs[k], rest[k], weight[k], plate[k]
-        for row, i in ti.ndrange(x.shape[1], x.shape[2]):
-            x[0, row, i] = start[i]
-        for i in moves:
-            free[i], fields.mass[i] = moves[i], masses[i]
-
-    @ti.kernel
     def begin(
         velocity: arrays(dtype=vec3, ndim=1, needs_grad=True),
         stiff: arrays(dtype=R, ndim=2, needs_grad=True),
@@ -247,6 +224,7 @@ def _borders(ti: Any, R: Any, fields: Any) -> SimpleNamespace:
     ):
         for row in range(velocity.shape[0]):
             for i in range(stiff.shape[1]):
+                x[0, row, i] = fields.start[i]
                 v[0, row, i] = free[i] * velocity[row]
                 stiffness[row, i] = stiff[row, i]
         for row, t in ti.ndrange(path.shape[0], path.shape[1]):
@@ -269,7 +247,7 @@ def _borders(ti: Any, R: Any, fields: Any) -> SimpleNamespace:
         for t, row in ti.ndrange(poses.shape[0], adj_x.shape[0]):
             poses.grad[t, row] = vec3(0.0)
 
-    return SimpleNamespace(lay_out=lay_out, begin=begin, read=read, seed=seed)
+    return SimpleNamespace(begin=begin, read=read, seed=seed)
 
 
 @no_type_check

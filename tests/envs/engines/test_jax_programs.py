@@ -76,13 +76,6 @@ def test_another_function_precision_mode_or_batch_is_traced(other):
     assert wave.evaluate(**{"key": "wave", **other})[1] == 1
 
 
-def test_another_setting_of_jax_is_traced():
-    wave = Wave()
-    wave.evaluate("wave")
-    with jax.default_matmul_precision("float32"):
-        assert wave.evaluate("wave")[1] == 1
-
-
 def test_with_jaxs_cache_off_nothing_is_kept(folder):
     wave = Wave()
     jax.config.update("jax_enable_compilation_cache", False)

@@ -10,7 +10,6 @@ from gradscape.envs.engines.sheets import springs
 from gradscape.envs.engines.sheets.contact import AnchoredFloor, Floor, PanOverFloor
 from gradscape.envs.engines.taichi import springs as taichi_springs
 from gradscape.envs.engines.taichi.runtime import start
-from gradscape.envs.sheets.swing import SwingVelocity
 
 from ..sheets.cloths import DT, PAN, ROWS, crumpled, drive
 
@@ -146,35 +145,10 @@ def test_fields_go_with_their_solver():
     assert counts[0] == counts[1]
 
 
-def cloth(name, steps, engines):
-    """Return solvers of a draft cloth, and four velocities and stiffnesses."""
-    env = SwingVelocity(fidelity=replace(SwingVelocity.fidelities["draft"], precision=name), device="cpu")
-    unit = torch.rand(4, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    given = dict(dt=env.fidelity.dt, steps=steps, name=name, capacity=4, device="cpu")
-    solvers = [engine.Solver(env.sheet, env.surface, **given) for engine in engines]
-    return *solvers, env._drive(env.space.from_unit(unit)).detach()[:2]
-
-
-@pytest.mark.parametrize(
-    ("name", "steps", "distance", "tolerance"),
-    [("float32", 150, 1e-5, 2e-3), ("float64", 400, 1e-11, 1e-8)],  # float32 agrees until contacts amplify rounding
-)
-def test_a_draft_cloth_swings_as_warps_does(name, steps, distance, tolerance):
-    ours, theirs, inputs = cloth(name, steps, (taichi_springs, springs))
-    x, target = ours.run(*inputs), theirs.run(*inputs)
-    assert target[-1, :, :, 1].min() < 0.001  # on the floor
-    torch.testing.assert_close(x, target, rtol=0, atol=distance)
-    adj_x = torch.ones(4, ours.count, 3)
-    for mine, hand in zip(ours.gradient(adj_x)[:2], theirs.gradient(adj_x)[:2], strict=True):
-        gap = (mine - hand).flatten(1).norm(dim=1) / hand.flatten(1).norm(dim=1)
-        assert gap.max() < tolerance
-
-
-def test_a_row_is_the_same_bit_for_bit_alone_and_among_others():
-    solver, inputs = cloth("float32", 150, [taichi_springs])
-    adj_x = torch.ones(4, solver.count, 3)
-    x, gradient = solver.run(*inputs), solver.gradient(adj_x)
-    for row in range(4):
+def test_a_row_is_the_same_bit_for_bit_alone_and_among_others(solver, driven):
+    inputs, adj_x = driven
+    x, gradient = solver.run(*inputs).clone(), solver.gradient(adj_x)
+    for row in range(ROWS):
         one = slice(row, row + 1)
         assert torch.equal(solver.run(*(part[one] for part in inputs)), x[:, one])
         for alone, among in zip(solver.gradient(adj_x[one]), gradient, strict=True):
