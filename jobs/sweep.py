@@ -138,11 +138,10 @@ class SweepJob(SummaryJob[SweepSummary]):
     ) -> SweepJob:
         """Continue the sweep of an environment in `out`, by default a folder named after it, or begin it there.
 
-        Gradients are at every so many samples along each axis, `gradients`, 0 for none; of smoothed losses there are
-        none. With a `cut`, how it was cut along directions, it is boxed, and one that was begun continues along its own
-        directions: on a GPU they come out a little different each time. `force` begins again where another sweep is.
-        Raises ValueError for what cannot be swept, where gradients cannot be so far apart and where the folder holds
-        something else, StoreMismatchError where it holds another sweep, and TooLargeError for what has no room here.
+        Gradients are at every so many samples along each axis, 0 for none; of smoothed losses there are none. With a
+        `cut`, how it was cut along directions, it is boxed, and one that was begun continues along its own directions:
+        on a GPU they come out a little different each time. Raises ValueError for what cannot be swept or has no room,
+        and where the folder holds something else or another sweep.
         """
         if plane.rank != 2 or frames < 2:
             dims = ", ".join(plane.names)

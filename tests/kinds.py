@@ -108,6 +108,7 @@ KINDS = {
         f"compare cut ackley --set dim=3 --out {MADE} --json", needs=(f"{CUT} cut",)
     ),
     "replay": Kind(f"replay {BOUNCE} --no-film --out {MADE}"),
+    "surface": Kind(f"surface cut run --out {MADE}", needs=(f"{CUT} cut", f"{SEARCH} run")),
     "gallery": Kind(
         f"{GALLERY} --only pinball-2-0-1 --part slices --part sweeps --part episodes --part searches --part reports",
         (f"gallery list --json --data {MADE}", f"gallery build --data {MADE} --out {READ}",

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 import gradscape as gs
-from gradscape.landscapes.identity import StoreError, StoreMismatchError
+from gradscape.landscapes.identity import StoreError
 
 from ..command import Run
 
@@ -32,15 +32,6 @@ def test_a_run_of_python_is_the_command_s(run: Run, tmp_path: Path) -> None:
     run.ok("export again")
 
 
-def test_a_larger_budget_goes_on_and_another_run_is_refused_but_by_force(tmp_path: Path) -> None:
-    first = gs.optimize("branin", "random", budget=8, out=tmp_path / "run")
-    more = gs.optimize("branin", "random", budget=24, out=tmp_path / "run")
-    np.testing.assert_array_equal(more.data["loss"][:8], first.data["loss"])
-    with pytest.raises(StoreMismatchError, match="seed: wanted 1, found 0"):
-        gs.optimize("branin", "random", budget=8, seed=1, out=tmp_path / "run")
-    assert gs.optimize("branin", "random", budget=8, seed=1, out=tmp_path / "run", force=True).seed == 1
-
-
 def test_the_best_episode_is_the_one_of_least_loss(tmp_path: Path) -> None:
     found = gs.optimize("branin", "random", budget=16, out=tmp_path / "run")
     best = found.best
@@ -57,13 +48,6 @@ def test_a_table_has_a_row_for_each_episode_and_names_units(tmp_path: Path) -> N
         assert name in table.columns
     assert any(name.startswith("gradient by velocity x") for name in table.columns)
     assert (table["status"] == "ok").all()
-
-
-@pytest.mark.drawn
-def test_a_run_is_drawn_for_a_notebook(tmp_path: Path) -> None:
-    found = gs.optimize("branin", "random", budget=8, out=tmp_path / "run")
-    assert found.plot()._repr_png_().startswith(b"\x89PNG")
-    assert gs.slice("branin", (0, 1), resolution=4, out=tmp_path / "cut").plot(runs=[found])
 
 
 def test_a_function_is_searched_in_memory_unless_it_is_given_a_folder(tmp_path: Path) -> None:

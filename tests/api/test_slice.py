@@ -12,7 +12,7 @@ import torch
 import gradscape as gs
 from gradscape.jobs.slice import SliceSummary
 from gradscape.landscapes.convert import from_json
-from gradscape.landscapes.identity import StoreMismatchError, stored_identity
+from gradscape.landscapes.identity import stored_identity
 from gradscape.landscapes.objective import Objective
 
 from ..command import Run
@@ -38,13 +38,6 @@ def test_a_slice_of_python_is_the_command_s(run: Run, tmp_path: Path) -> None:
     for name in ("loss", "grad", "status"):
         np.testing.assert_array_equal(again.data[name], theirs.data[name])
     run.ok("export again")
-
-
-def test_another_slice_is_refused_and_replaced_by_force(tmp_path: Path) -> None:
-    gs.slice("branin", (0, 1), resolution=4, out=tmp_path / "cut")
-    with pytest.raises(StoreMismatchError, match="made by other settings"):
-        gs.slice("branin", (0, 1), resolution=5, out=tmp_path / "cut")
-    assert gs.slice("branin", (0, 1), resolution=5, out=tmp_path / "cut", force=True).data.sizes["u"] == 5
 
 
 def test_slope_and_minima_are_those_of_a_closed_form() -> None:

@@ -89,16 +89,6 @@ def test_nothing_is_computed_twice(run: Run, monkeypatch: pytest.MonkeyPatch) ->
     assert rows == [POINTS] * 3  # those that are verified, of each slice
 
 
-def test_force_begins_anew_and_another_sweep_is_not_overwritten(run: Run) -> None:
-    run(SWEEP)
-    before = {path: path.read_bytes() for path in Path("moved").rglob("*") if path.is_file()}
-    run.refuse(SWEEP.replace("--frames 3", "--frames 4"), said="plane")
-    assert before == {path: path.read_bytes() for path in Path("moved").rglob("*") if path.is_file()}
-    done = run(SWEEP.replace("--frames 3", "--frames 2") + " --force --json")
-    assert done.json["episodes"] == 50
-    assert names(Path("moved/frames")) == ["000.zarr.zip", "001.zarr.zip"]
-
-
 @pytest.mark.drawn
 def test_smoothing_averages_one_slice(run: Run) -> None:
     found = run.json("sweep branin --dims 0 1 --over smoothing --frames 3 --resolution 9 --out soft")
