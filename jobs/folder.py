@@ -45,13 +45,15 @@ class Results:
 
     def refuse_another(self, folder: Path, identity: dict[str, Any]) -> None:
         """Raise StoreMismatchError where the record in a folder has another identity."""
+        from ..landscapes.identity import check_identity
+        from ..landscapes.storage.records import read_json, reading
+
         path = folder / self.files[0]
         if path.exists():
             with reading(path, f"write elsewhere with --out, or delete {path}"):
                 found = read_json(path)[IDENTITY]
-            check_identity(
-                folder, wanted=plain_json(identity, f"a {self.kind}'s identity"), found=found, what=self.kind
-            )
+            wanted = plain_json(identity, f"a {self.kind}'s identity")
+            check_identity(folder, wanted=wanted, found=found, what=self.kind)
 
 
 SUMMARY = "summary.json"
