@@ -51,13 +51,6 @@ def test_a_method_with_gradients_says_what_they_cost(run: Run, monkeypatch: pyte
     assert "8 episodes to compute: one by one 8.0 s without gradients, 24 s with" in done.stderr
 
 
-def test_every_different_run_has_a_folder_of_its_own(run: Run, tmp_path: Path) -> None:
-    for change in ([], ["--seed", "1"], ["--method", "random"], ["--option", "sigma=0.1"]):
-        run.ok(*QUICK, *change)
-    folders = sorted(path.name.rsplit("-", 1)[0] for path in (tmp_path / "out").iterdir())
-    assert folders == ["branin-cma-es-exact-s0"] * 2 + ["branin-cma-es-exact-s1", "branin-random-exact-s0"]
-
-
 def test_methods_lists_them_all_and_shows_one_in_full(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "200")
     listed = run("methods").stdout

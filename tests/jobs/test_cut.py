@@ -1,7 +1,6 @@
 """Slices along named directions: what they cover, that they continue, and how other names are refused."""
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -108,14 +107,6 @@ def test_a_slice_that_was_begun_goes_on_along_its_own_directions(tmp_path, monke
     assert json.loads((tmp_path / "cut/summary.json").read_text())["episodes"] == 0
     with pytest.raises(ValueError, match=r"another slice|differ|other"):
         gs.slice("bounce", along="hessian", resolution=5, out=tmp_path / "cut", device="cpu")
-
-
-def test_the_command_and_python_go_on_with_the_same_slice(run, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    words = ["--along", "random:1", "--window", "0.5", "--resolution", "2", "--device", "cpu", "--json"]
-    said = json.loads(run("slice", "bounce", *words, cwd=tmp_path).stdout)
-    found = gs.slice("bounce", along="random:1", window=0.5, resolution=2, device="cpu")
-    assert found.folder == Path(said["folder"])
 
 
 def test_verbs_take_such_slices(run, tmp_path):
