@@ -20,7 +20,6 @@ from ..landscapes.checks.usefulness import Usefulness
 from ..landscapes.convert import to_json
 from ..landscapes.cost import duration, episode_cost, start_seconds
 from ..landscapes.options import record_options
-from ..landscapes.plain import jsonable
 from ..landscapes.storage.files import until_full
 from .folder import CHECK, IDENTITY
 from .job import Job
@@ -92,10 +91,8 @@ class CheckReport:
 
     def record(self) -> dict[str, Any]:
         """Return it as plain JSON, which knows no infinity; findings are its `checks`."""
-        left = ("findings", "command", "diagnoses", "share", "parameters", "usefulness", "kinds")
-        found = {name: getattr(self, name) for name in self.__dataclass_fields__ if name not in left}
-        measured = {name: to_json(getattr(self, name)) for name in left[2:]}
-        return {**found, **measured, "checks": list(map(_record, self.findings)), "command": self.command}
+        found = to_json(vars(self))
+        return found | {"checks": [one | {"numbers": one["numbers"] or {}} for one in found.pop("findings")]}
 
     def table(self) -> pd.DataFrame:
         """Return a row for each check, indexed by `check`: its `outcome`, its `figure` and `why`."""
@@ -422,8 +419,3 @@ def _other_mode(job: CheckJob) -> Callable[[], Environment] | None:
 
 def _refuse_forward(dim: int) -> Environment:
     raise ValueError(f"forward differentiation takes as many tangents as parameters; {dim} are too many to try")
-
-
-def _record(finding: Finding) -> dict[str, Any]:
-    record = {name: getattr(finding, name) for name in ("check", "outcome", "figure", "why")}
-    return {**record, "numbers": jsonable(finding.numbers or {}), "table": jsonable(finding.table)}

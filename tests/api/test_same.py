@@ -1,4 +1,4 @@
-"""A call of Python is the command's: it finds what that has left, by its folder's name, and makes the same elsewhere."""
+"""A call of Python is the command's: it finds what that left, by its folder's name, and makes the same elsewhere."""
 
 from collections.abc import Callable
 from pathlib import Path
