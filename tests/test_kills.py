@@ -121,9 +121,7 @@ def test_ctrl_c_says_what_is_kept_and_how_to_go_on_and_changes_no_bit(job: str, 
     [
         (["slice", *BOUNCE], ".landscape-85mm.pdf"),
         (["sweep", *BOUNCE, "--over", "2", "--frames", "2"], "frames/.0.zarr"),
-        (["optimize", "bounce", "--method", "random", *SEARCH], ".run.zarr"),
         (["race", "bounce", "--methods", "random", "--seeds", "2", *SEARCH], "random-0/.run.zarr"),
-        (["study", "fidelity", "bounce", "--points", "2", "--settings", "engine"], ".settings.json"),
         (["pairs", "bounce", "--samples", "2"], ".pairs.json"),
         (["replay", "bounce", "--no-film"], ".episode.mp4"),
     ],
@@ -136,9 +134,6 @@ def test_what_a_kill_left_in_a_folder_is_no_other_file_and_goes(
     place.mkdir(parents=True)
     (place / "zarr.json").write_text("{}")
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("gradscape.studies.own_folder.user_data_path", lambda name: tmp_path / "data" / name)
-    for name in ("REPETITION", "LARGEST"):
-        monkeypatch.setattr(f"gradscape.studies.samples.{name}", 0.002)
     with pytest.raises(SystemExit) as ended:
         main([*command, "--device", "cpu", "--out", "made"])
     assert not ended.value.code

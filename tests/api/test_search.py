@@ -12,15 +12,6 @@ import torch
 import gradscape as gs
 
 
-def test_a_table_has_a_row_for_each_episode_and_names_units(tmp_path: Path) -> None:
-    table = gs.optimize("bounce", "descents", budget=8, fidelity="draft", device="cpu", out=tmp_path / "run").table()
-    assert len(table) == 8
-    for name in ("episode", "velocity x [m/s]", "loss [m²]", "status", "kind", "forward equivalents", "seconds [s]"):
-        assert name in table.columns
-    assert any(name.startswith("gradient by velocity x") for name in table.columns)
-    assert (table["status"] == "ok").all()
-
-
 def test_a_function_is_searched_in_memory_unless_it_is_given_a_folder(tmp_path: Path) -> None:
     bowl = gs.from_torch(lambda x: (x**2).sum(dim=1), gs.ParameterSpace.box(["a", "b"], -1.0, 1.0))
     found = gs.optimize(bowl, "cma-es", budget=60)

@@ -26,11 +26,6 @@ def own_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
 
 
-def test_without_a_folder_nothing_is_written(tmp_path: Path) -> None:
-    gs.check("branin", power="20%")
-    assert not list(tmp_path.iterdir())
-
-
 @pytest.mark.drawn
 def test_the_folder_holds_the_report_and_its_picture(tmp_path: Path) -> None:
     found = gs.check(gs.from_numpy(bowl, SPACE, name="halved"), power="20%", out=tmp_path / "made", figure_width_mm=85)
@@ -46,18 +41,6 @@ def test_the_folder_holds_the_report_and_its_picture(tmp_path: Path) -> None:
     assert picture.startswith(b"\x89PNG")
     assert found.plot()._repr_png_() == picture
     assert "check" in found._repr_html_()
-
-
-def test_a_folder_of_something_else_is_refused_before_anything_is_computed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(CheckJob, "run", None)
-    (tmp_path / "notes.txt").touch()
-    for force in (False, True):
-        with pytest.raises(ValueError, match="holds other files and no check: notes"):
-            gs.check("branin", out=tmp_path, force=force)
-    with pytest.raises(ValueError, match="--figure-width-mm is of a figure in a folder; give --out, too"):
-        gs.check("branin", figure_width_mm=85)
 
 
 def test_a_check_that_is_stopped_leaves_no_file_and_says_that_nothing_is_kept(

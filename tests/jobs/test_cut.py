@@ -116,13 +116,9 @@ def test_verbs_take_such_slices(run, tmp_path):
         ["slice", "bounce", "--along", "pca:run", "--resolution", "3", "--out", "principal"],
         ["slice", "bounce", "--along", "hessian", "--through", "best:run", "--resolution", "3", "--out", "hessian"],
         ["slice", "bounce", "--along", "center:best:run:random:1", "--resolution", "3", "--out", "plane"],
-        ["overlay", "cut", "run", "--out", "over"],
         ["report", "cut", "--out", "report"],
-        ["surface", "cut"],
-        ["export", "cut", "--to", "csv", "--out", "cut.csv"],
     ):
-        done = run(*command, cwd=tmp_path)
-        assert done.returncode == 0, (command, done.stderr)
+        run.ok(*command)
 
 
 def test_the_best_point_known_is_of_the_same_options(tmp_path, monkeypatch):
