@@ -7,7 +7,7 @@ import sys
 from typing import Any
 
 from rich.box import SIMPLE as SIMPLE
-from rich.table import Table
+from rich.table import Table as Table
 from rich.text import Text as Text
 
 from ..api.progress import Bars as Bars

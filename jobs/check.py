@@ -91,7 +91,7 @@ class CheckReport:
 
     def record(self) -> dict[str, Any]:
         """Return it as plain JSON, which knows no infinity; findings are its `checks`."""
-        found = to_json(vars(self))
+        found: dict[str, Any] = to_json(vars(self))
         return found | {"checks": [one | {"numbers": one["numbers"] or {}} for one in found.pop("findings")]}
 
     def table(self) -> pd.DataFrame:

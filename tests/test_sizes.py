@@ -96,7 +96,7 @@ def said(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[int, str]]
 
 
 def test_sizes_beyond_the_machine_are_refused_in_a_line(said: dict[str, tuple[int, str]]) -> None:
-    assert len(sizes()) > 30
+    assert len(sizes()) > 20
     for line in map(" ".join, sizes()):
         code, text = said[line]
         assert (code, text.count("\n")) == (2, 1), (line, text)
