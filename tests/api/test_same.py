@@ -30,7 +30,7 @@ SAME: dict[str, Callable[..., Any]] = {
     "league branin beale --methods random --budget 6 --seeds 2": lambda **out: gs.league(
         ["branin", "beale"], "random", budget=6, seeds=2, **out
     ),
-    "pairs ackley --set dim=3 --samples 2": lambda **out: gs.pairs("ackley", samples=2, options={"dim": 3}, **out),
+    "pairs ackley --set dim=3 --samples 2": lambda **out: gs.pairs("ackley", samples=2, options=["dim=3"], **out),
     "hessian branin --through random:1": lambda **out: gs.hessian("branin", "random:1", **out),
 }
 
