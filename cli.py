@@ -162,6 +162,7 @@ class Verb:
     def run(self, given: Sequence[Any], named: dict[str, Any]) -> int:
         """Call the function, show what it returns, and return the exit code."""
         from .api.call import Call, calling
+        from .api.plan import plan
         from .commands.terminal import Bars, Console, command_line
 
         shown = {name: named.pop(name) for name in self.displayed.keys() & named.keys()}
@@ -172,7 +173,8 @@ class Verb:
         for one in calls:
             bars = Bars()
             with calling(Call(command_line(), bars, on_disk=True)):
-                result = _plan(self.function, given, one) if self.planned else self.function(*given, **one)
+                words = (self.function, *given) if self.planned else given
+                result = (plan if self.planned else self.function)(*words, **one)
                 show = shower(kind_of(result))
                 if show is not None:
                     code = max(code, show(result, Console(stderr=as_object), **shown) or 0)
@@ -193,12 +195,6 @@ def _refuse(function: Callable[..., Any], given: Sequence[Any], named: dict[str,
 
     with calling(Call("", Watch(), on_disk=True)):
         work_of(function, given, named)
-
-
-def _plan(function: Callable[..., Any], given: Sequence[Any], named: dict[str, Any]) -> Any:
-    from .api.plan import plan
-
-    return plan(function, *given, **named)
 
 
 def _slots(function: Callable[..., Any] | None, kinds: Sequence[Any] = ALL_KINDS) -> list[Slot]:

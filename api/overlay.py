@@ -12,33 +12,13 @@ from .slice import as_slice
 from .values import as_path, as_widths
 
 if TYPE_CHECKING:
-    from typing import Protocol, TypeAlias
-
-    import pandas as pd
+    from typing import TypeAlias
 
     from ..jobs.overlay import Overlay
     from ..landscapes.slice import Slice
-    from ..optim.runs.run import Run
-
-    class Study(Protocol):
-        """An Optuna study, as far as an overlay knows it."""
-
-        study_name: str
-
-        def trials_dataframe(self, attrs: tuple[str, ...]) -> pd.DataFrame:
-            """Return its trials as a table."""
-
-    class Experiment(Protocol):
-        """An experiment of Ax, or a client that holds one, as far as an overlay knows it."""
-
-        name: str
-
-        def lookup_data(self) -> Any:
-            """Return what its metrics measured."""
 
     SliceFolder: TypeAlias = str | Path | Slice
-    RunFolder: TypeAlias = str | Path | Run | pd.DataFrame | Study | Experiment
-    RunFolders: TypeAlias = RunFolder | Sequence[RunFolder]
+    RunFolders: TypeAlias = Any  # folders, runs, tables of pandas, studies of Optuna, experiments of Ax, one or several
 else:
     SliceFolder, RunFolders = str, list[str]
 

@@ -5,11 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from .terminal import Console, table
+from .terminal import Console, Table, table
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
     from ..jobs.bench import BatchRate, Bench, KernelTable
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from .terminal import Console, table
+from .terminal import SIMPLE, Console, number, table
 
 if TYPE_CHECKING:
     from ..landscapes.measures.census import Census
@@ -14,8 +14,6 @@ if TYPE_CHECKING:
 
 def show(found: Census, console: Console) -> None:
     """Print the words by how often they fit, and a row for each measure."""
-    from rich.box import SIMPLE
-
     many = f"{len(found.slices)} slices, {found.episodes} episodes"
     console.print(f"{found.env} · {found.fidelity}: {many}")
     if found.floor:
@@ -33,7 +31,7 @@ def show(found: Census, console: Console) -> None:
     for name, spread in found.spreads.items():
         parts, (least, _, middle, _, most) = found.parts[name], spread.quantiles
         shares = [parts.base, parts.cut, parts.both, parts.resolution, *([parts.fidelity] if other else [])]
-        rows.add_row(name, *map(_number, (least, middle, most)), *map(_share, shares))
+        rows.add_row(name, *map(number, (least, middle, most)), *(number(share, ".0%") for share in shares))
     console.print(rows)
     at = f", {found.other}: at that fidelity" if found.other else ""
     console.print(
@@ -45,11 +43,3 @@ def show(found: Census, console: Console) -> None:
 def _format(share: Estimate) -> str:
     ends = f" ({share.low:.0%} to {share.high:.0%})" if math.isfinite(share.low) else ", of all that there are"
     return f"{share.value:.0%}{ends}"
-
-
-def _number(value: float) -> str:
-    return "" if value != value else f"{value:.3g}"
-
-
-def _share(value: float) -> str:
-    return "" if value != value else f"{value:.0%}"

@@ -6,11 +6,9 @@ import textwrap
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from .terminal import Console, table
+from .terminal import SIMPLE, Console, Table, Text, table
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
     from ..jobs.check import CheckReport
     from ..landscapes.checks.diagnosis import Diagnosis
     from ..landscapes.checks.finding import Finding
@@ -52,8 +50,6 @@ def show(found: CheckReport, console: Console) -> int:
 
 
 def _show_diagnosis(one: Diagnosis, console: Console) -> None:
-    from rich.text import Text
-
     line = Text(f"{one.outcome:10}", STYLES[one.outcome])
     line.append(f"{one.cause or 'no known cause'}", "bold")
     line.append(f" ({one.certainty}): {one.what}", "")
@@ -68,8 +64,6 @@ def _interesting(rows: Sequence[ParameterRow]) -> Sequence[ParameterRow]:
 
 
 def _parameters(rows: Sequence[ParameterRow]) -> Table:
-    from rich.box import SIMPLE
-
     found = table("parameter", "share exactly 0", "gradient / slope over 1e-2", "verdict", box=SIMPLE)
     for row in rows:
         ratio = "-" if row.ratio != row.ratio else f"{row.ratio:.4g}"
@@ -78,8 +72,6 @@ def _parameters(rows: Sequence[ParameterRow]) -> Table:
 
 
 def _show(finding: Finding, console: Console) -> None:
-    from rich.text import Text
-
     line = Text(f"{finding.outcome:10}", STYLES[finding.outcome])
     line.append(f"{finding.check:25} {finding.figure}", "")
     if finding.why:
@@ -88,8 +80,6 @@ def _show(finding: Finding, console: Console) -> None:
 
 
 def _show_skipped(findings: Sequence[Finding], console: Console) -> None:
-    from rich.text import Text
-
     left = [f"{one.check} ({one.why or one.figure})" for one in findings if one.outcome == "skip"]
     if left:
         lines = textwrap.wrap(", ".join(left), WIDTH)
@@ -98,8 +88,6 @@ def _show_skipped(findings: Sequence[Finding], console: Console) -> None:
 
 
 def _ladder(finding: Finding) -> Table:
-    from rich.box import SIMPLE
-
     headings = ("compared", "failed", "cosine", "sign right", "relative error, median")
     found = table("step [of the box]", *headings, box=SIMPLE)
     for column in found.columns[1:]:
@@ -112,8 +100,6 @@ def _ladder(finding: Finding) -> Table:
 
 
 def _conclude(found: CheckReport, console: Console) -> None:
-    from rich.text import Text
-
     counts = {kind: sum(finding.outcome == kind for finding in found.findings) for kind in STYLES}
     said = ", ".join(f"{count} {kind}" for kind, count in counts.items() if count)
     console.print(Text(f"{'passes' if found.passed else 'fails'}: {said}", STYLES["pass" if found.passed else "fail"]))

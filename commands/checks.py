@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from .check import STYLES
-from .terminal import Console
+from .terminal import Console, Text
 
 if TYPE_CHECKING:
     from ..jobs.checks import CheckReports
@@ -13,8 +13,6 @@ if TYPE_CHECKING:
 
 def show(found: CheckReports, console: Console) -> int:
     """Print a line and a verdict for each environment; the exit code is 1 where one fails or could not be checked."""
-    from rich.text import Text
-
     from ..jobs.checks import sum_up
 
     console.soft_wrap = True

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from .terminal import Console, table
+from .terminal import SIMPLE, Console, table
 
 if TYPE_CHECKING:
     from ..landscapes.measures.slice_comparison import SliceComparison
@@ -14,8 +14,6 @@ LISTED = 12  # settings that differ, in the terminal
 
 def show(found: SliceComparison, console: Console) -> None:
     """Print a row for each number, where losses part, and the settings that differ."""
-    from rich.box import SIMPLE
-
     console.print(f"A: {found.a}\nB: {found.b}")
     rows = table("measure", "value, 95 % interval", box=SIMPLE, padding=(0, 1))
     for name, one in found.table().iterrows():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from .terminal import Console, table
+from .terminal import SIMPLE, Console, number, table
 
 if TYPE_CHECKING:
     from ..landscapes.measures.hessian import Hessian
@@ -13,15 +13,13 @@ if TYPE_CHECKING:
 
 def show(found: Hessian, console: Console) -> None:
     """Print the eigenvalues with errors and directions, then what all of them say, and what makes it doubtful."""
-    from rich.box import SIMPLE
-
     unit = f" [{found.loss_unit}]" if found.loss_unit else ""
     console.print(f"{found.env} · {found.fidelity} · at {found.through}: {found.kind}; {found.episodes} episodes")
     console.print(f"In {found.units}. Differences of {found.source} over {found.step:.2g} of the box.")
     rows = table("no.", f"eigenvalue{unit}", "error", "sign", "by losses", "direction", box=SIMPLE)
     rows.columns[0].no_wrap = True
     for pair in found.pairs:
-        numbers = (f"{pair.value:.6g}", f"{pair.error:.2g}", pair.sign, _number(pair.by_losses))
+        numbers = (f"{pair.value:.6g}", f"{pair.error:.2g}", pair.sign, number(pair.by_losses, ".6g"))
         rows.add_row(str(pair.place), *numbers, pair.direction())
     console.print(rows)
     console.print(f"trace: {_estimate(found.trace)}{'' if found.whole else f', of {len(found.nodes)} random probes'}")
@@ -33,10 +31,6 @@ def show(found: Hessian, console: Console) -> None:
     console.print(f"asymmetry: {found.asymmetry:.1g}, of which differences explain {found.asymmetry_explained:.1g}")
     for warning in found.warnings:
         console.print(f"warning: {warning}")
-
-
-def _number(value: float) -> str:
-    return "" if value != value else f"{value:.6g}"
 
 
 def _estimate(one: Estimate) -> str:

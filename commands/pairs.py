@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Annotated
 
 from ..api.options import at_least
-from .terminal import Console, table
+from .terminal import SIMPLE, Console, table
 
 if TYPE_CHECKING:
     from ..jobs.pairs import PairRanking
@@ -22,8 +22,6 @@ def show(ranking: PairRanking, console: Console, *, top: Annotated[int, at_least
     top
         Number of pairs to show.
     """
-    from rich.box import SIMPLE
-
     found = table("no.", "pair", *COLUMNS, box=SIMPLE)
     found.columns[0].no_wrap = True
     for pair in ranking.pairs[:top]:

@@ -6,11 +6,9 @@ from collections.abc import Iterator
 from math import isfinite
 from typing import TYPE_CHECKING
 
-from .terminal import Console, table
+from .terminal import Console, Table, table
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
     from ..optim.race import Race
     from ..optim.statistics import Superiority
 

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from .terminal import Console, table
+from .terminal import Console, Table, table
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
     from ..jobs.report import Report, Reports
     from ..landscapes.measures.features import Features
 

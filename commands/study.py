@@ -6,9 +6,9 @@ import math
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
-if TYPE_CHECKING:
-    from rich.table import Table
+from .terminal import SIMPLE, Console, Table, table
 
+if TYPE_CHECKING:
     from ..studies.convergence import ConvergenceRecord
     from ..studies.divergence import Distributions
     from ..studies.extremes import ExtremesRecord
@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from ..studies.samples import Bootstrap, Comparison
     from ..studies.symmetry import SymmetryRecord
     from ..studies.variants import StudyRecord
-    from .terminal import Console
 
 MEANING = (
     "median, 95 %: how far losses are off, as a share of the spread, at half and at 95 % of points (95 % interval); "
@@ -195,10 +194,6 @@ SHOWN: dict[str, Any] = {
 
 
 def _table(*headings: str, title: str | None = None) -> Table:
-    from rich.box import SIMPLE
-
-    from .terminal import table
-
     return table(*headings, title=title, box=SIMPLE, padding=(0, 1), collapse_padding=True)
 
 

@@ -6,7 +6,9 @@ import shlex
 import sys
 from typing import Any
 
-from rich.table import Table
+from rich.box import SIMPLE as SIMPLE
+from rich.table import Table as Table
+from rich.text import Text as Text
 
 from ..api.progress import Bars as Bars
 from ..api.progress import Console as Console
@@ -16,6 +18,11 @@ from ..api.progress import Described as Described
 def command_line() -> str:
     """Return the command that this process runs, as one types it."""
     return shlex.join(["landscape", *sys.argv[1:]])
+
+
+def number(value: float, form: str = ".3g") -> str:
+    """Write a number, nothing where it is NaN."""
+    return "" if value != value else format(value, form)
 
 
 def table(*headings: str, title: str | None = None, **look: Any) -> Table:

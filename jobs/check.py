@@ -19,12 +19,9 @@ from ..landscapes.checks.suite import POWER, Results, Settings, check, count_oth
 from ..landscapes.checks.usefulness import Usefulness
 from ..landscapes.convert import to_json
 from ..landscapes.cost import duration, episode_cost, start_seconds
-from ..landscapes.identity import check_identity
 from ..landscapes.options import record_options
-from ..landscapes.plain import jsonable, plain_json
 from ..landscapes.storage.files import until_full
-from ..landscapes.storage.records import read_json, reading
-from .folder import CHECK
+from .folder import CHECK, IDENTITY
 from .job import Job
 from .scene import SceneSpec
 from .watch import PREPARING, Say, Stopped, Watch, Work
@@ -47,7 +44,6 @@ LENGTHS = 32  # of episodes, among which the first whose gradient is wrong is lo
 COMPILED_ROWS = 12  # of the batch by which it is measured what another environment compiles: as many as it will get
 OWN_SECONDS = 1.0  # that checks take themselves, such as whether memory grows
 MODES = ("forward", "reverse")  # of automatic differentiation
-IDENTITY = "identity"  # in the record in a folder: what was checked, and how
 
 
 def _materials(job: CheckJob) -> list[ExtremeCase]:
@@ -95,10 +91,8 @@ class CheckReport:
 
     def record(self) -> dict[str, Any]:
         """Return it as plain JSON, which knows no infinity; findings are its `checks`."""
-        left = ("findings", "command", "diagnoses", "share", "parameters", "usefulness", "kinds")
-        found = {name: getattr(self, name) for name in self.__dataclass_fields__ if name not in left}
-        measured = {name: to_json(getattr(self, name)) for name in left[2:]}
-        return {**found, **measured, "checks": list(map(_record, self.findings)), "command": self.command}
+        found: dict[str, Any] = to_json(vars(self))
+        return found | {"checks": [one | {"numbers": one["numbers"] or {}} for one in found.pop("findings")]}
 
     def table(self) -> pd.DataFrame:
         """Return a row for each check, indexed by `check`: its `outcome`, its `figure` and `why`."""
@@ -210,16 +204,12 @@ class CheckJob:
     def into(self, folder: Path, *, force: bool = False, prints: Sequence[float] = ()) -> CheckFolder:
         """Return the job that also leaves the report in a folder, as JSON and as a picture.
 
-        Raises ValueError where the folder holds something else, StoreMismatchError where it holds another check, which
-        `force` replaces.
+        Raises ValueError where the folder holds something else, or another check, which `force` replaces.
         """
         identity = {**self.env.identity(), "power": self.power, "seed": self.seed}
         CHECK.check(folder)
-        path = folder / CHECK.files[0]
-        if path.exists() and not force:
-            with reading(path, f"write elsewhere with --out, or delete {path}"):
-                found = read_json(path)[IDENTITY]
-            check_identity(folder, wanted=plain_json(identity, "a check's identity"), found=found, what="check")
+        if not force:
+            CHECK.refuse_another(folder, identity)
         return CheckFolder(check=self, identity=identity, folder=folder, command=self.command, prints=prints)
 
     def _run(self, follow: Callable[[str], None]) -> Iterator[Finding]:
@@ -429,8 +419,3 @@ def _other_mode(job: CheckJob) -> Callable[[], Environment] | None:
 
 def _refuse_forward(dim: int) -> Environment:
     raise ValueError(f"forward differentiation takes as many tangents as parameters; {dim} are too many to try")
-
-
-def _record(finding: Finding) -> dict[str, Any]:
-    record = {name: getattr(finding, name) for name in ("check", "outcome", "figure", "why")}
-    return {**record, "numbers": jsonable(finding.numbers or {}), "table": jsonable(finding.table)}

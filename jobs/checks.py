@@ -5,7 +5,7 @@ from __future__ import annotations
 import multiprocessing
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
@@ -104,7 +104,8 @@ class ChecksJob:
             return
         count, others = min(self.processes, len(self.specs)), set(multiprocessing.active_children())
         with ProcessPoolExecutor(count, multiprocessing.get_context("spawn"), prepare_process) as pool:
-            waiting = {pool.submit(_check_there, self._sent(spec)): n for n, spec in enumerate(self.specs)}
+            work = [partial(_check, replace(self, specs=(spec,), processes=1), spec, Watch()) for spec in self.specs]
+            waiting = {pool.submit(_work, cloudpickle.dumps(one)): n for n, one in enumerate(work)}
             try:
                 with watch.progress(len(waiting), "environments") as advance:
                     advance(0)
@@ -116,14 +117,6 @@ class ChecksJob:
                     process.terminate()
                 raise
 
-    def _sent(self, spec: SceneSpec) -> bytes:
-        """Return what checks one environment in another process."""
-        sent: bytes = cloudpickle.dumps(partial(_check, self._alone(spec), spec, Watch()))
-        return sent
-
-    def _alone(self, spec: SceneSpec) -> ChecksJob:
-        return ChecksJob((spec,), self.power, self.seed, 1, self.command)
-
 
 def _check(job: ChecksJob, spec: SceneSpec, watch: Watch) -> CheckReport:
     with watch.busy(f"{_name(spec)}: {PREPARING}"):
@@ -131,9 +124,10 @@ def _check(job: ChecksJob, spec: SceneSpec, watch: Watch) -> CheckReport:
     return opened.run(watch)
 
 
-def _check_there(sent: bytes) -> CheckReport:
-    work: Callable[[], CheckReport] = cloudpickle.loads(sent)
-    return work()
+def _work(sent: bytes) -> CheckReport:
+    """Do what another process has sent."""
+    found: CheckReport = cloudpickle.loads(sent)()
+    return found
 
 
 def _outcome(check: Callable[[], CheckReport]) -> CheckReport | str:

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..landscapes.identity import check_identity
 from ..landscapes.measures.slice_comparison import (
     SliceComparison,
     check_finished,
@@ -18,14 +17,12 @@ from ..landscapes.measures.slice_comparison import (
     parameters,
 )
 from ..landscapes.objective import Objective
-from ..landscapes.plain import plain_json
 from ..landscapes.slice import Slice
 from ..landscapes.space import scaled_labels
 from ..landscapes.storage.files import visible_files
 from ..landscapes.storage.paths import slice_exists
-from ..landscapes.storage.records import read_json, reading
 from ..landscapes.storage.store import open_slice
-from .folder import COMPARISON, SLICE_STORE, folder_named
+from .folder import COMPARISON, IDENTITY, SLICE_STORE, folder_named
 from .job import Job
 from .slice import SliceJob, slice_work
 from .watch import Watch, Work
@@ -34,7 +31,6 @@ if TYPE_CHECKING:
     import xarray as xr
 
 RECORD = COMPARISON.files[0]
-IDENTITY = "identity"  # in the record: that of both slices
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,9 +59,8 @@ class CompareJob(Job[SliceComparison]):
     ) -> CompareJob:
         """Refuse what cannot be compared, before anything is computed.
 
-        The folder is by default one under out/ named after both. Raises ValueError for slices that do not lie on one
-        plane, are not finished, or are of other parameters or units, and where the folder holds something else;
-        StoreMismatchError where it holds another comparison, which `force` replaces.
+        Raises ValueError for slices that do not lie on one plane, are not finished, or are of other parameters or
+        units, and where the folder holds something else or another comparison, which `force` replaces.
         """
         ours = slice.data
         if isinstance(other, Slice):
@@ -83,7 +78,7 @@ class CompareJob(Job[SliceComparison]):
         folder = out or folder_named(["compare", *dict.fromkeys(named)], identity)
         COMPARISON.check(folder, allowed=[file for file in visible_files(folder) if slice_exists(file / SLICE_STORE)])
         if not force:
-            _refuse_another(folder / RECORD, identity)
+            COMPARISON.refuse_another(folder, identity)
         return cls(
             slice=slice, other=other, identity=identity, folder=folder, command=command, force=force, prints=prints
         )
@@ -110,12 +105,3 @@ class CompareJob(Job[SliceComparison]):
         job = SliceJob.of(objective, self.slice.plane, command=self.command, root=self.folder, **how)
         job.run(watch)
         return open_slice(job.folder / SLICE_STORE)
-
-
-def _refuse_another(path: Path, identity: dict[str, Any]) -> None:
-    """Raise StoreMismatchError where there is the record of another comparison."""
-    if not path.exists():
-        return
-    with reading(path, f"write elsewhere with --out, or delete {path}"):
-        found = read_json(path)[IDENTITY]
-    check_identity(path.parent, wanted=plain_json(identity, "a comparison's identity"), found=found, what="comparison")

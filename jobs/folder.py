@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..landscapes.plain import digest
+from ..landscapes.plain import digest, plain_json
 from ..landscapes.storage import paths
 from ..landscapes.storage.files import other_files, refuse_others, visible_files
 from ..landscapes.storage.paths import slice_exists
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 SLICE_STORE, RUN_STORE = paths.SLICE, runs.RUN
 SLICE_FILE = paths.SLICE + paths.ARCHIVE  # what a slice's store is once it is finished
+IDENTITY = "identity"  # in a record: what was checked or compared, and how
 ROOT = Path("out")  # where results go that are given no folder
 
 
@@ -41,6 +42,18 @@ class Results:
             return
         held = visible_files(folder) if self.store else other_files(folder, self.files, self.picture)
         refuse_others(folder, set(held) - set(allowed), self.kind)
+
+    def refuse_another(self, folder: Path, identity: dict[str, Any]) -> None:
+        """Raise StoreMismatchError where the record in a folder has another identity."""
+        from ..landscapes.identity import check_identity
+        from ..landscapes.storage.records import read_json, reading
+
+        path = folder / self.files[0]
+        if path.exists():
+            with reading(path, f"write elsewhere with --out, or delete {path}"):
+                found = read_json(path)[IDENTITY]
+            wanted = plain_json(identity, f"a {self.kind}'s identity")
+            check_identity(folder, wanted=wanted, found=found, what=self.kind)
 
 
 SUMMARY = "summary.json"

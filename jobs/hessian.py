@@ -31,7 +31,7 @@ from ..landscapes.objective import Evaluation, Objective, ObjectiveWrapper, chec
 from ..landscapes.space import as_tensor
 from ..landscapes.storage.checkpoint import Checkpoint
 from ..landscapes.storage.files import replacing
-from .folder import HESSIAN, ROOT, folder_named
+from .folder import HESSIAN, folder_named
 from .job import CheckpointedJob
 from .plan import simulation_seconds
 from .scene import SceneSpec, named_point, provenance
@@ -72,22 +72,21 @@ class HessianJob(CheckpointedJob[Hessian]):
         probes: int = PROBES,
         seed: int = 0,
         out: Path | None = None,
-        root: Path = ROOT,
         force: bool = False,
         prints: Sequence[float] = (),
         command: str = "",
     ) -> HessianJob:
-        """Continue the Hessian in its folder, by default one named after it under `root`, or begin it there.
+        """Continue the Hessian in its folder, by default one named after it, or begin it there.
 
-        `through` names a point, or is one. Raises ValueError for what the scene does not have, TooLargeError for more
-        probes or pairs than there is memory for, StoreMismatchError where the folder holds another study.
+        `through` names a point, or is one. Raises ValueError for what the scene does not have or memory does not hold,
+        and where the folder holds another Hessian.
         """
         env = scene.make()
         x, dim = _point(env, through), env.space.dim
         require("eigenpairs", pairs, lambda count: Need(8.0 * COPIES * dim * 2 * count))
         require("probes", probes, lambda count: Need(8.0 * COPIES * dim * (LANCZOS + 2) * count))
         identity = {**env.identity(), "point": x.tolist(), "eigenpairs": pairs, "probes": probes, "seed": seed}
-        folder = out or folder_named(["hessian", env.name, env.fidelity.name], identity, root)
+        folder = out or folder_named(["hessian", env.name, env.fidelity.name], identity)
         checkpoint = Checkpoint.open(folder, identity, what="Hessian", force=force)
         said = through if isinstance(through, str) else "a point"
         return cls(
@@ -144,10 +143,6 @@ class HessianJob(CheckpointedJob[Hessian]):
     def verified(self) -> Objective:
         """Return the environment, without the gradients that it does not have."""
         return self.env if self.has_gradients else _WithoutGradients(self.env)
-
-    def kept(self) -> str:
-        """Say how much of it is on disk."""
-        return f"{self.checkpoint.count()} batches are kept in {self.folder}"
 
     def _episodes(self) -> int:
         """Return how many episodes it takes at most."""

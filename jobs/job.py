@@ -129,35 +129,27 @@ class CheckpointedJob(Job[Found]):
 
     checkpoint: Checkpoint
 
+    def kept(self) -> str:
+        """Say how much of it is on disk."""
+        return f"{self.checkpoint.count()} batches are kept in {self.folder}"
+
     def holding(self, watch: Watch) -> AbstractContextManager[None]:
         """Hold the folder, and verify what simulates against what the checkpoint began with."""
-        return going_on(self.checkpoint, self.verified, self.kept, watch)
+        return self._going_on(watch)
+
+    @contextmanager
+    def _going_on(self, watch: Watch) -> Iterator[None]:
+        with resumable(self.kept), holding(self.checkpoint.folder, watch.note):
+            if (env := self.verified()) is not None:
+                with watch.busy(PREPARING):
+                    self.checkpoint.verify(env)
+                    del env
+                    free_memory()
+            yield
 
     def verified(self) -> Objective | None:
         """Return the objective that the checkpoint is verified with; None verifies parts as they are read."""
         return None
-
-
-@contextmanager
-def going_on(
-    pieces: Checkpoint, make: Callable[[], Objective | None], kept: Callable[[], str], watch: Watch
-) -> Iterator[None]:
-    """Hold a study's folder, after another process that fills it, and verify the objective that `make` returns.
-
-    Raises StoreMismatchError where it gives other numbers than when the study began, and as `resumable` does.
-    """
-    with resumable(kept), holding(pieces.folder, watch.note):
-        _verify(pieces, make, watch)
-        yield
-
-
-def _verify(pieces: Checkpoint, make: Callable[[], Objective | None], watch: Watch) -> None:
-    """Verify the objective that `make` returns, which is gone afterwards with the memory it has taken."""
-    if (env := make()) is not None:
-        with watch.busy(PREPARING):
-            pieces.verify(env)
-            del env
-            free_memory()
 
 
 @contextmanager

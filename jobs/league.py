@@ -109,10 +109,9 @@ class LeagueJob(Job[League]):
     ) -> LeagueJob:
         """Continue the league in `out`, by default a folder for its device, or begin it there.
 
-        `methods` are by default all; those that cannot search a scene are left out there. The same folder takes more
-        scenes, methods, seeds or episodes. Raises ValueError for scenes, fidelities and methods that there are not, for
-        a scene that is named twice, and where the folder holds something else; TooLargeError for more seeds or episodes
-        than fit this machine.
+        `methods` are by default all; those that cannot search a scene are left out there. Raises ValueError for scenes,
+        fidelities and methods that there are not, a scene that is named twice, more than fits here, and where the
+        folder holds something else.
         """
         budget, seeds = as_whole(budget, "a budget", least=1), as_whole(seeds, "a number of seeds", least=1)
         folder = out or league_folder(scenes)

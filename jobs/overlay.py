@@ -20,7 +20,7 @@ from ..landscapes.storage.files import tidy, visible_files
 from ..landscapes.storage.paths import slice_exists
 from ..landscapes.storage.store import open_slice
 from ..landscapes.verification import RESAMPLE, verify_dataset
-from .folder import OVERLAY, ROOT, SLICE_STORE, folder_named, run_tables
+from .folder import OVERLAY, SLICE_STORE, folder_named, run_tables
 from .job import Job
 from .scene import environment_of, named_point
 from .slice import SliceJob, slice_work
@@ -176,7 +176,10 @@ class OverlayJob(Job[Overlay]):
         for run in runs:
             check_run(slice.data, run, watch or Watch())
         overlay(slice.data, runs)
-        folder = out or overlay_folder(slice.data, runs, plane)
+        ours = stored_identity(slice.data)
+        how = [plane.through, PCA if plane.principal else None, plane.resolution] if plane else [None, None, None]
+        identity = [ours, [stored_identity(run) for run in runs], how]
+        folder = out or folder_named(["overlay", ours["objective"]], identity)
         OVERLAY.check(folder, allowed=[file for file in visible_files(folder) if slice_exists(file / SLICE_STORE)])
         return cls(slice=slice, runs=runs, folder=folder, command=command, plane=plane, device=device, prints=prints)
 
@@ -253,12 +256,3 @@ def refuse_other_landscape(dataset: xr.Dataset, run: xr.Dataset) -> None:
 def _name(run: xr.Dataset) -> str:
     known = stored_identity(run)
     return f"{known.get('objective')}, {known.get('method')}, seed {known.get('seed')}"
-
-
-def overlay_folder(
-    dataset: xr.Dataset, runs: Sequence[xr.Dataset], plane: OverlayPlane | None, root: Path = ROOT
-) -> Path:
-    """Return a folder of its own for every different overlay, the same for the same one."""
-    ours = stored_identity(dataset)
-    how = [plane.through, PCA if plane.principal else None, plane.resolution] if plane else [None, None, None]
-    return folder_named(["overlay", ours["objective"]], [ours, [stored_identity(run) for run in runs], how], root)

@@ -11,7 +11,7 @@ from ..landscapes.capacity import Need, require
 from ..landscapes.cost import duration, seconds_per_episode
 from ..landscapes.measures.sensitivity import Design, Pair, default_samples, explore, rank
 from ..landscapes.storage.checkpoint import Checkpoint
-from .folder import PAIRS, ROOT, folder_named
+from .folder import PAIRS, folder_named
 from .job import CheckpointedJob
 from .scene import SceneSpec, provenance
 from .watch import PREPARING, Watch, Work
@@ -96,15 +96,13 @@ class PairsJob(CheckpointedJob[PairRanking]):
         samples: int | None = None,
         seed: int = 0,
         out: Path | None = None,
-        root: Path = ROOT,
         force: bool = False,
         command: str = "",
     ) -> PairsJob:
-        """Continue the study in its folder, by default one named after it under `root`, or begin it there.
+        """Continue the study in its folder, by default one named after it, or begin it there.
 
         `samples` base points are taken, by default as many as their episodes are worth. Raises ValueError where the
-        scene has one parameter, TooLargeError for more samples than there is memory for, StoreMismatchError where the
-        folder holds another study.
+        scene has one parameter or there is no room, and where the folder holds another study.
         """
         env = scene.make()
         dim = env.space.dim
@@ -113,7 +111,7 @@ class PairsJob(CheckpointedJob[PairRanking]):
         samples = samples or default_samples(dim)
         require("samples", samples, lambda count: Need(8.0 * NUMBERS * dim * count))
         identity = {**env.identity(), "samples": samples, "seed": seed}
-        folder = out or folder_named(["pairs", identity["objective"], identity["fidelity"], samples], identity, root)
+        folder = out or folder_named(["pairs", identity["objective"], identity["fidelity"], samples], identity)
         checkpoint = Checkpoint.open(folder, identity, what="pairs", force=force)
         return cls(
             env=env, design=Design.sobol(env.space, samples, seed=seed), identity=identity, checkpoint=checkpoint,
@@ -146,10 +144,6 @@ class PairsJob(CheckpointedJob[PairRanking]):
     def verified(self) -> Environment:
         """Return the environment."""
         return self.env
-
-    def kept(self) -> str:
-        """Say how much of it is on disk."""
-        return f"{self.checkpoint.count()} batches are kept in {self.folder}"
 
     def _announce(self, watch: Watch) -> None:
         env, design = self.env, self.design

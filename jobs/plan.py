@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 from ..landscapes.capacity import peak_memory
 from ..landscapes.cost import seconds_per_episode, start_seconds
@@ -53,44 +53,31 @@ class Plan:
     What search methods and pictures take themselves is not in it.
     """
 
-    derived: ClassVar = ("episodes", "gradients", "seconds", "device_hours", "memory", "gpu_memory", "disk")
     command: str
     parts: tuple[PlannedWork, ...]
+    episodes: int
+    gradients: int
+    seconds: float
+    device_hours: float
+    memory: int
+    gpu_memory: int
+    disk: int
 
-    @property
-    def gradients(self) -> int:
-        """How many of the episodes have gradients."""
-        return sum(part.gradients for part in self.parts)
-
-    @property
-    def episodes(self) -> int:
-        """How many episodes are simulated."""
-        return sum(part.losses for part in self.parts) + self.gradients
-
-    @property
-    def seconds(self) -> float:
-        """What it takes to compile and to simulate [s]."""
-        return sum(part.seconds for part in self.parts)
-
-    @property
-    def device_hours(self) -> float:
-        """The same [h]."""
-        return self.seconds / 3600
-
-    @property
-    def memory(self) -> int:
-        """What the host holds at most [bytes]."""
-        return max((part.memory for part in self.parts), default=0)
-
-    @property
-    def gpu_memory(self) -> int:
-        """What a GPU holds at most [bytes]."""
-        return max((part.gpu_memory for part in self.parts), default=0)
-
-    @property
-    def disk(self) -> int:
-        """What all results take on the disk [bytes]."""
-        return sum(part.disk for part in self.parts)
+    @classmethod
+    def of(cls, command: str, parts: tuple[PlannedWork, ...]) -> Plan:
+        """Add up what the parts take; of memory the largest counts."""
+        gradients, seconds = sum(part.gradients for part in parts), sum(part.seconds for part in parts)
+        return cls(
+            command,
+            parts,
+            episodes=sum(part.losses for part in parts) + gradients,
+            gradients=gradients,
+            seconds=seconds,
+            device_hours=seconds / 3600,
+            memory=max((part.memory for part in parts), default=0),
+            gpu_memory=max((part.gpu_memory for part in parts), default=0),
+            disk=sum(part.disk for part in parts),
+        )
 
 
 def plan_work(works: Sequence[Work], command: str, watch: Watch, *, device: str | None = None) -> Plan:
@@ -113,7 +100,7 @@ def plan_work(works: Sequence[Work], command: str, watch: Watch, *, device: str 
         )
         with watch.busy(f"{same.name}: {PREPARING}"):
             parts.append(_plan_part(whole, device))
-    return Plan(command, tuple(parts))
+    return Plan.of(command, tuple(parts))
 
 
 def simulation_seconds(objective: Objective, losses: int, gradients: int, rows: int) -> float:

@@ -24,7 +24,7 @@ from ..optim.race import Competitor, Race, name_seeds, race
 from ..optim.registry import check_methods, optimizer_class
 from ..optim.runs.store import RunStore
 from ..optim.search import SearchProgress
-from .folder import RACE, ROOT, RUN_STORE, folder_named
+from .folder import RACE, RUN_STORE, folder_named
 from .job import Job, filling
 from .plan import simulation_seconds
 from .scene import provenance
@@ -78,20 +78,26 @@ class RaceJob(Job[Race]):
     ) -> RaceJob:
         """Continue the race in `out`, by default a folder named after it, or begin it there; `force` replaces it.
 
-        `methods` are by default all that can search the environment here. Raises ValueError where the folder holds
-        something else, and for methods and options that are not there, StoreMismatchError where it holds a run of other
-        settings, StoreError where another process fills the race that is to be replaced, and TooLargeError where the
-        race would not fit this machine.
+        `methods` are by default all that can search the environment here. Raises ValueError for methods and options
+        that are not there, where the folder holds something else or other runs, and where the race would not fit here.
         """
         watch, options = watch or Watch(), options or {}
         budget, seeds = as_whole(budget, "a budget", least=1), as_whole(seeds, "a number of seeds", least=1)
         workers = as_whole(workers, "a number of workers", least=1)
-        methods = check_methods(methods) or _able_methods(env, watch)
-        folder = out or race_folder(env, options)
+        if not (methods := check_methods(methods)):
+            methods, unable = divide_methods(env)
+            for method, why in unable.items():
+                watch.note(f"without {method}: {why}")
+        # More methods, seeds or episodes continue in the same folder.
+        texts = {method: {name: str(value) for name, value in chosen.items()} for method, chosen in options.items()}
+        folder = out or folder_named(["race", env.name, env.fidelity.name], [env.identity(), texts])
         refuse_other_folder(folder, RACE.kind, f"*-*/{RUN_STORE}")
         if force:
             check_free(folder)
-        _require_memory(env, methods, options, seeds=seeds, budget=budget, folder=folder)
+        require_runs(env.space.dim, budget, seeds, folder, abreast=len(methods))
+        for method in methods:
+            optimizer = make_optimizer(method, env, options=options.get(method))
+            optimizer.require_memory(optimizer.options, SearchSize(env.space.dim, env.decisions, budget))
         competitors = []
         with watch.busy(f"opening {len(methods) * seeds} runs"):
             for seed in range(seeds):
@@ -168,15 +174,25 @@ class RaceJob(Job[Race]):
         return [Work(self.env, losses, gradients, need.disk, need.memory)]
 
     def _search(self, watch: Watch) -> None:
-        ratio, lines = self._announce(watch), Lines(self)
+        ratio, runs = self._announce(watch), dict[tuple[str, int], tuple[int, int, float]]()  # done, failed, best
+        for one in self.competitors:
+            loss = one.run.dataset()["loss"].to_numpy()[: self.budget].tolist()
+            runs[one.method, one.seed] = (len(loss), sum(map(math.isnan, loss)), _least(loss))
         with watch.progress_of(dict.fromkeys(self.methods, self.budget * self.seeds)) as advance:
-            for method in self.methods:
-                advance(method, lines.done(method), lines.text(method))
+
+            def show(method: str) -> None:
+                mine = [run for (name, _), run in runs.items() if name == method]
+                least, lost = _least([best for _, _, best in mine]), sum(count for _, count, _ in mine)
+                best = "no loss yet" if math.isnan(least) else f"best loss {least:.4g}"
+                failed = f", {lost} failed" if lost else ""
+                advance(method, sum(done for done, _, _ in mine), f"{method}: {best}{failed}")
 
             def follow(one: Competitor, now: SearchProgress) -> None:
-                lines.take(one, now)
-                advance(one.method, lines.done(one.method), lines.text(one.method))
+                runs[one.method, one.seed] = (min(now.done, now.total), now.failed, now.best)
+                show(one.method)
 
+            for method in self.methods:
+                show(method)
             if self.executor:
                 self._distribute(self.executor, ratio, follow)
                 return
@@ -239,60 +255,10 @@ class RaceJob(Job[Race]):
         return max(0, self.budget - one.run.count)
 
 
-class Lines:
-    """Say of each method how many episodes are done and the best loss so far, over its seeds."""
-
-    def __init__(self, job: RaceJob) -> None:
-        self._runs: dict[tuple[str, int], tuple[int, int, float]] = {}
-        for one in job.competitors:
-            loss = one.run.dataset()["loss"].to_numpy()[: job.budget].tolist()
-            self._runs[one.method, one.seed] = (len(loss), sum(map(math.isnan, loss)), _least(loss))
-
-    def take(self, one: Competitor, now: SearchProgress) -> None:
-        """Take in how far a run is."""
-        self._runs[one.method, one.seed] = (min(now.done, now.total), now.failed, now.best)
-
-    def done(self, method: str) -> int:
-        """Return the episodes a method has done."""
-        return sum(done for (name, _), (done, _, _) in self._runs.items() if name == method)
-
-    def text(self, method: str) -> str:
-        """Return a method's line."""
-        mine = [run for (name, _), run in self._runs.items() if name == method]
-        least = _least([best for _, _, best in mine])
-        failed = sum(count for _, count, _ in mine)
-        best = "no loss yet" if math.isnan(least) else f"best loss {least:.4g}"
-        return f"{method}: {best}{f', {failed} failed' if failed else ''}"
-
-
-def race_folder(env: Environment, options: Options, root: Path = ROOT) -> Path:
-    """Return a folder of its own for every different race; more methods, seeds or episodes continue in the same one."""
-    texts = {method: {name: str(value) for name, value in chosen.items()} for method, chosen in options.items()}
-    return folder_named(["race", env.name, env.fidelity.name], [env.identity(), texts], root)
-
-
 def refuse_other_folder(folder: Path, kind: str, *marks: str) -> None:
     """Raise ValueError for a folder with files, none of which matches the `marks` of such a `kind` of results."""
     if not any(any(folder.glob(mark)) for mark in marks):
         refuse_others(folder, (one for one in visible_files(folder) if not one.is_dir() or visible_files(one)), kind)
-
-
-def _able_methods(env: Environment, watch: Watch) -> list[str]:
-    """Return the methods that can search an environment here, and say of the others why they cannot."""
-    able, unable = divide_methods(env)
-    for method, why in unable.items():
-        watch.note(f"without {method}: {why}")
-    return able
-
-
-def _require_memory(
-    env: Environment, methods: Sequence[str], options: Options, *, seeds: int, budget: int, folder: Path
-) -> None:
-    """Raise TooLargeError where a race of these methods is larger than this machine."""
-    require_runs(env.space.dim, budget, seeds, folder, abreast=len(methods))
-    for method in methods:
-        optimizer = make_optimizer(method, env, options=options.get(method))
-        optimizer.require_memory(optimizer.options, SearchSize(env.space.dim, env.decisions, budget))
 
 
 def _competitor(env: Environment, method: str, seed: int, options: Mapping[str, Any], run: RunStore) -> Competitor:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
 from functools import cache
 from importlib import resources
@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING, Any
 
 from .. import __version__
 from ..envs.engines import installed_version
-from ..envs.registry import find_environment, make, registered_environment
-from ..landscapes.identity import MODEL_VERSION, PACKAGE, VERSIONS
+from ..envs.registry import find_environment, make, registered_environment, source_of
+from ..landscapes.identity import MODEL_VERSION, PACKAGE, VERSIONS, stored_identity
 from ..landscapes.options import record_options
-from ..landscapes.plain import digest, plain_json, read_share
-from ..landscapes.storage.files import moved_by
+from ..landscapes.plain import digest, number, plain_json, read_share
+from ..landscapes.storage.files import moved_by, write_json
 from ..landscapes.storage.records import read_json, reading
 from .watch import Watch
 
@@ -36,6 +36,7 @@ PACKAGES = (
 )
 AT = "@"  # between a scene and its fidelity
 ABSENT = "not installed"  # instead of a version
+MAX_WORK_RATIO = 2.0  # times the least expected work, beyond which a variant is no candidate
 
 
 @dataclass(frozen=True)
@@ -59,10 +60,6 @@ class SceneSpec:
     @classmethod
     def of(cls, env: Environment) -> SceneSpec:
         """Return what makes an environment such as this one again."""
-        from dataclasses import asdict
-
-        from ..envs.registry import source_of
-
         return cls(source_of(env), env.fidelity, None, env.device, env.engine, env.deterministic, asdict(env.options))
 
     @property
@@ -122,7 +119,6 @@ def environment_of(dataset: xr.Dataset, device: str, env: Any = None) -> Environ
     Raises ValueError where there is none, where it has other settings, and where the slice is none of an environment.
     """
     from ..envs.base import Fidelity
-    from ..landscapes.identity import stored_identity
 
     identity = stored_identity(dataset)
     if "policy" in identity:
@@ -151,10 +147,11 @@ def environment_of(dataset: xr.Dataset, device: str, env: Any = None) -> Environ
 def point_of(env: Environment, text: str) -> Tensor:
     """Return the parameters that `text` names: a point, as `envs.points` has it, or best:RUN, the best of a run.
 
-    Without a run it is the best of all that are known of an environment of the same options: those under out/, and the
-    one that the gallery's league found. Raises ValueError where there is no such point, or where the run searched
-    another environment.
+    Without a run it is the best of all that are known of the same options: those under out/, and the gallery league's.
+    Raises ValueError where there is no such point, or where the run searched another environment.
     """
+    from ..landscapes.overlay import best_point
+
     kind, colon, run = text.partition(":")
     if kind != "best":
         from ..envs.points import point
@@ -162,8 +159,6 @@ def point_of(env: Environment, text: str) -> Tensor:
         return point(env, text)
     if colon and not run:
         raise ValueError("best:RUN takes the folder of a run, and best alone the best of all; got 'best:'")
-    from ..landscapes.overlay import best_point
-
     if run:
         return best_point(runs_in(env, run))[0]
     kept = best_of_league(env)
@@ -175,11 +170,7 @@ def point_of(env: Environment, text: str) -> Tensor:
 
 
 def _known_runs(env: Environment, *, needed: bool) -> list[xr.Dataset]:
-    """Return all runs of an environment with these options under the default folder.
-
-    Raises ValueError for none, if it is `needed`.
-    """
-    from ..landscapes.identity import stored_identity
+    """Return all runs of an environment with these options under the default folder."""
     from .folder import LEAGUE, ROOT
 
     found = list[Any]()
@@ -217,7 +208,6 @@ def plane_through(
 
 def runs_in(objective: Objective, run: str) -> list[xr.Dataset]:
     """Return the runs in a folder. Raises ValueError where they searched another environment."""
-    from ..landscapes.identity import stored_identity
     from .folder import run_tables
 
     tables, name = run_tables([run]), objective.name
@@ -251,9 +241,6 @@ def read_scene(text: str, scene: SceneSpec) -> SceneSpec:
     if not at or "/" in fidelity or ":" in fidelity:
         return replace(scene, name=text)
     return replace(scene, name=name, fidelity=fidelity)
-
-
-MAX_WORK_RATIO = 2.0  # times the least expected work, beyond which a variant is no candidate
 
 
 def choose_fidelity(spec: SceneSpec, watch: Watch) -> Fidelity:
@@ -323,9 +310,6 @@ def _time(env: Environment, variants: Sequence[Environment]) -> dict[str, float]
 
     It is kept so that the same command chooses the same variant, and continues what it began.
     """
-    from ..landscapes.plain import number
-    from ..landscapes.storage.files import write_json
-    from ..landscapes.storage.records import read_json, reading
     from ..studies import variants as timing
     from ..studies.own_folder import own_folder
 

@@ -21,7 +21,7 @@ from ..optim.registry import methods, optimizer_class
 from ..optim.runs.run import Run
 from ..optim.runs.store import RunStore
 from ..optim.search import SearchProgress, search
-from .folder import ROOT, RUN, SUMMARY, folder_named
+from .folder import RUN, SUMMARY, folder_named
 from .job import SummaryJob, filling
 from .scene import provenance
 from .watch import PREPARING, Watch, Work
@@ -107,12 +107,11 @@ class SearchJob(SummaryJob[SearchSummary]):
     ) -> SearchJob:
         """Continue the run in `out`, by default a folder named after it, or begin it there; `force` replaces it.
 
-        Raises ValueError where the folder holds something else, StoreMismatchError where it holds another run,
-        StoreError where another process fills the run that is to be replaced, and TooLargeError where the run would
-        not fit this machine.
+        Raises ValueError where the folder holds something else or another run, and where the run would not fit here.
         """
         budget, identity = as_whole(budget, "a budget", least=1), run_identity(env, optimizer)
-        folder = out or run_folder(identity)
+        parts = [identity["objective"], identity["method"], identity["fidelity"], f"s{identity['seed']}"]
+        folder = out or folder_named(parts, identity)
         require_runs(env.space.dim, budget, 1, folder)
         optimizer.require_memory(optimizer.options, SearchSize(env.space.dim, env.decisions, budget))
         RUN.check(folder)
@@ -271,9 +270,3 @@ def run_identity(env: Environment, optimizer: Optimizer) -> dict[str, Any]:
         METHOD_VERSION: optimizer.method_version,
         "seed": optimizer.seed,
     }
-
-
-def run_folder(identity: dict[str, Any], root: Path = ROOT) -> Path:
-    """Return a folder of its own for every different run, the same for the same one."""
-    parts = [identity["objective"], identity["method"], identity["fidelity"], f"s{identity['seed']}"]
-    return folder_named(parts, identity, root)

@@ -199,12 +199,9 @@ class SliceJob(SummaryJob[SliceSummary]):
     ) -> SliceJob:
         """Continue the slice in `out`, by default a folder under `root` named after it, or begin it there.
 
-        Losses are at all samples, gradients at every so many along each axis, `gradients`, 0 for none. `boxed` leaves
-        out what lies beyond the parameters' bounds. With a `cut`, how it was cut along directions, it is boxed; of one
-        that was begun, `kept_plane` has the plane. With an `executor` its workers compute. `force` begins again where
-        another slice is. `floor` also maps the numerical floor, which is no setting of the slice. Without `picture`
-        nothing is drawn but for `prints`. Raises ValueError where gradients cannot be so far apart, where there is no
-        floor to map, and where the folder holds something else, StoreMismatchError where it holds another slice.
+        Gradients are at every so many samples along each axis, `gradients`, 0 for none. `boxed` leaves out what lies
+        beyond the bounds; so does a `cut`, how it was cut along directions. `floor` is no setting of the slice.
+        Raises ValueError for what cannot be, and where the folder holds something else or another slice.
         """
         if floor:
             refuse_without_replicas(objective, refined=refinement is not None)
@@ -320,7 +317,7 @@ class SliceJob(SummaryJob[SliceSummary]):
                 if now.level_complete and now.done < now.total and (began := time.monotonic()) - drawn > pause:
                     self.picture()
                     drawn = time.monotonic()
-                    pause = pause_after(drawn - began)
+                    pause = max(MIN_PAUSE_SECONDS, (drawn - began) / MAX_DRAWING_SHARE)
 
             def conclude(dataset: xr.Dataset) -> dict[str, Any]:
                 advance(dataset["status"].size, "checks between samples")
@@ -431,11 +428,6 @@ def _gpu_memory(objective: Objective) -> str:
     return f", {size(objective.memory() * objective.preferred_batch)} of it on the GPU at a time"
 
 
-def pause_after(seconds: float) -> float:
-    """Return how long no picture of an unfinished slice follows one that took so many seconds."""
-    return max(MIN_PAUSE_SECONDS, seconds / MAX_DRAWING_SHARE)
-
-
 def estimate_cost(
     objective: Objective,
     store: SliceStore,
@@ -453,27 +445,22 @@ def estimate_cost(
     batch = first_points(store, pending, objective.preferred_batch)
     sloped = sum(int(tiling.sloped(tile).sum()) for tile in pending)
     counts = {grad: count for grad, count in ((True, sloped), (False, left - sloped)) if count}
+    sent = PortableObjective.of(objective, None if executor is None else remake)
     if executor is None:
-        timed = [_time(objective, batch, counts)]
+        timed = [_time(sent, batch, counts)]
     else:
-        sent = PortableObjective.of(objective, remake)
-        timed = list(run_tasks(executor, _time_there, [(sent, batch, counts)] * workers_of(executor)))
+        timed = list(run_tasks(executor, _time, [(sent, batch, counts)] * workers_of(executor)))
     shares = [1 / seconds for seconds, _ in timed if seconds]
     arrays = need_of(store.shape, store.plane.dim, grad=store.grad)
     return SliceCost(left, 1 / sum(shares) if shares else 0.0, timed[0][1] + round(arrays.memory))
 
 
-def _time(objective: Objective, batch: Float[Tensor, "point dim"], counts: Mapping[bool, int]) -> tuple[float, int]:
+def _time(sent: PortableObjective, batch: Float[Tensor, "point dim"], counts: Mapping[bool, int]) -> tuple[float, int]:
     """Return what so many episodes with a gradient, True, and without take [s], and this process's memory [bytes]."""
+    objective = sent.objective.objective
     objective.prepare()
     each = {grad: seconds_per_episode(objective, batch, grad=grad, count=n) for grad, n in counts.items()}
     return sum(counts[grad] * one for grad, one in each.items()), peak_memory()
-
-
-def _time_there(
-    sent: PortableObjective, batch: Float[Tensor, "point dim"], counts: Mapping[bool, int]
-) -> tuple[float, int]:
-    return _time(sent.objective.objective, batch, counts)
 
 
 def first_points(store: SliceStore, tiles: Sequence[Tile], count: int) -> Float[Tensor, "point dim"]:
@@ -546,20 +533,11 @@ def conclude_slice(
 
     With an `executor` its workers evaluate.
     """
-    floor = look_at_replicas(objective, dataset, executor)
-    least = counted_from(floor)
-    hidden = look_between(evaluator(objective, executor, remake), dataset, floor=least)
-    return {**(floor_attribute(floor) if floor else {}), **hidden}
-
-
-def look_at_replicas(objective: Objective, dataset: xr.Dataset, executor: Executor | None = None) -> Floor | None:
-    """Measure the numerical floor of a slice, None where there are no replicas.
-
-    Replicas that raise are warned of, and nothing is said.
-    """
+    floor = None
     with _sampled_all_the_same(f"{objective.name}'s replicas raised, so its numerical floor is not known"):
-        return find_floor(objective, dataset, through=lambda one: evaluator(one, executor, recipe(one)))
-    return None
+        floor = find_floor(objective, dataset, through=lambda one: evaluator(one, executor, recipe(one)))
+    hidden = look_between(evaluator(objective, executor, remake), dataset, floor=counted_from(floor))
+    return {**(floor_attribute(floor) if floor else {}), **hidden}
 
 
 def look_between(objective: Objective, dataset: xr.Dataset, *, floor: float = 0.0) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from ..landscapes.cost import PICTURE_SECONDS, duration, seconds_per_episode, start_seconds
 from ..studies import study_class
 from ..studies.variants import Study, StudyOptions, StudyRecord, expected_work
-from .folder import ROOT, STUDIES, Results, folder_named
+from .folder import STUDIES, Results, folder_named
 from .job import CheckpointedJob
 from .scene import SceneSpec, provenance
 from .watch import PREPARING, Watch, Work
@@ -34,22 +34,20 @@ class StudyJob(CheckpointedJob[StudyRecord]):
         options: StudyOptions | None = None,
         *,
         out: Path | None = None,
-        root: Path = ROOT,
         force: bool = False,
         prints: Sequence[float] = (),
         command: str = "",
     ) -> StudyJob:
-        """Continue the study in its folder, by default one named after it under `root`, or begin it there.
+        """Continue the study in its folder, by default one named after it, or begin it there.
 
-        Raises ValueError for a kind, options and a fidelity that are not to be had, and where the scene has nothing to
-        compare; TooLargeError for more points than there is memory for; StoreMismatchError where the folder holds
-        another study.
+        Raises ValueError for a kind, options and a fidelity that are not to be had, where the scene has nothing to
+        compare, and where the folder holds another study.
         """
         found = study_class(kind)
         fidelity = found.choose_fidelity(scene.kind, scene.fidelity)
         env = replace(scene, fidelity=fidelity, tolerance=None).make()
         study = found(env, options or StudyOptions())
-        folder = out or folder_named(study.folder_parts(), study.identity(), root)
+        folder = out or folder_named(study.folder_parts(), study.identity())
         study.open(folder, force=force)
         return cls(study=study, checkpoint=study.checkpoint, folder=folder, prints=prints, command=command)
 

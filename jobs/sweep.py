@@ -42,7 +42,7 @@ from .slice import (
     say_range,
     slice_work,
 )
-from .watch import PREPARING, Advance, Watch, Work
+from .watch import PREPARING, Watch, Work
 from .workers import recipe
 
 if TYPE_CHECKING:
@@ -138,11 +138,10 @@ class SweepJob(SummaryJob[SweepSummary]):
     ) -> SweepJob:
         """Continue the sweep of an environment in `out`, by default a folder named after it, or begin it there.
 
-        Gradients are at every so many samples along each axis, `gradients`, 0 for none; of smoothed losses there are
-        none. With a `cut`, how it was cut along directions, it is boxed, and one that was begun continues along its own
-        directions: on a GPU they come out a little different each time. `force` begins again where another sweep is.
-        Raises ValueError for what cannot be swept, where gradients cannot be so far apart and where the folder holds
-        something else, StoreMismatchError where it holds another sweep, and TooLargeError for what has no room here.
+        Gradients are at every so many samples along each axis, 0 for none; of smoothed losses there are none. With a
+        `cut`, how it was cut along directions, it is boxed, and one that was begun continues along its own directions:
+        on a GPU they come out a little different each time. Raises ValueError for what cannot be swept or has no room,
+        and where the folder holds something else or another sweep.
         """
         if plane.rank != 2 or frames < 2:
             dims = ", ".join(plane.names)
@@ -207,9 +206,18 @@ class SweepJob(SummaryJob[SweepSummary]):
 
         Raises StoreMismatchError where the scene gives other numbers than a slice holds.
         """
+        slices, finished, lost, whole = list[xr.Dataset](), 0, 0, len(self.stores)
         with (watch or Watch()).progress(self.total) as advance:
-            count = _Count(advance, len(self.stores))
-            slices = [self._sample(number, count) for number in range(len(self.stores))]
+            for number in range(whole):
+
+                def follow(now: Progress, number: int = number + 1, finished: int = finished, lost: int = lost) -> None:
+                    lost += sum(count for status, count in now.statuses.items() if failed(status))
+                    said = f", {lost} failed" if lost else ""
+                    advance(finished + now.done, f"slice {number} of {whole}{said}")
+
+                slices.append(dataset := self._sample(number, follow))
+                finished += dataset["status"].size
+                lost += int(failed(dataset["status"]).sum())
         from ..landscapes.draw.figures.sweep import Sweep
 
         moved = self.motion
@@ -234,12 +242,12 @@ class SweepJob(SummaryJob[SweepSummary]):
         takes = f"about {duration(seconds)} with the film, {size(cost.memory)} of memory"
         watch.announce(f"{left} {kind} of {slices} to compute{kept}: {takes}", seconds)
 
-    def _sample(self, number: int, count: _Count) -> xr.Dataset:
+    def _sample(self, number: int, follow: Callable[[Progress], None]) -> xr.Dataset:
         (objective, made), store = self._sampled(number), self.stores[number]
-        how: dict[str, Any] = {"gradients": int(store.grad), "executor": self.executor, "made": made}
-        dataset = sample(objective, self.motion.planes[number], store, progress=count.follow, **how)
-        count.add(dataset)
-        return dataset
+        return sample(
+            objective, self.motion.planes[number], store, progress=follow, gradients=int(store.grad),
+            executor=self.executor, made=made,
+        )  # fmt: skip
 
     def _sampled(self, number: int) -> tuple[Objective, Callable[[], Objective] | None]:
         """Return what is sampled on a plane, and how workers make it, None where they are sent it."""
@@ -275,29 +283,6 @@ class SweepJob(SummaryJob[SweepSummary]):
             command=self.command,
             files=[*sorted({name.split("/")[0] for name in self.motion.stores}), FILM, GIF, STREAM, SUMMARY],
         )
-
-
-@dataclass
-class _Count:
-    """Hold how much of a sweep is sampled, over all of its slices, and show it."""
-
-    advance: Advance
-    slices: int
-    number: int = 1
-    finished: int = 0
-    failed: int = 0
-
-    def follow(self, now: Progress) -> None:
-        """Show how far the slice under way is."""
-        lost = self.failed + sum(count for status, count in now.statuses.items() if failed(status))
-        said = f"slice {self.number} of {self.slices}" + (f", {lost} failed" if lost else "")
-        self.advance(self.finished + now.done, said)
-
-    def add(self, dataset: xr.Dataset) -> None:
-        """Count a slice that is finished."""
-        self.number += 1
-        self.finished += dataset["status"].size
-        self.failed += int(failed(dataset["status"]).sum())
 
 
 def _identity(env: Environment, gradients: int, cut: Mapping[str, Any] | None) -> dict[str, Any]:

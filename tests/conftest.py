@@ -60,18 +60,11 @@ def forgotten() -> Iterator[None]:
 
 
 @pytest.hookimpl(wrapper=True, tryfirst=True)
-def pytest_sessionfinish(session: pytest.Session) -> Generator[None]:
-    """Let Taichi keep what it has compiled, and say last of all what was left out for want of a browser.
-
-    Taichi keeps it as its program is taken down, which never happens where what holds the program is frozen.
-    """
+def pytest_sessionfinish() -> Generator[None]:
+    """Let Taichi keep what it has compiled: it does as its program is taken down, which a frozen one never is."""
     yield
     if taichi := sys.modules.get("taichi"):
         taichi.reset()
-    if reporter := session.config.pluginmanager.get_plugin("terminalreporter"):
-        skipped = sum(NO_BROWSER in str(report.longrepr) for report in reporter.stats.get("skipped", []))
-        if skipped:
-            reporter.write_line(f"{skipped} browser tests were skipped; {NO_BROWSER}")
 
 
 @pytest.fixture(autouse=True)

@@ -108,6 +108,7 @@ KINDS = {
         f"compare cut ackley --set dim=3 --out {MADE} --json", needs=(f"{CUT} cut",)
     ),
     "replay": Kind(f"replay {BOUNCE} --no-film --out {MADE}"),
+    "surface": Kind(f"surface cut run --out {MADE}", needs=(f"{CUT} cut", f"{SEARCH} run")),
     "gallery": Kind(
         f"{GALLERY} --only pinball-2-0-1 --part slices --part sweeps --part episodes --part searches --part reports",
         (f"gallery list --json --data {MADE}", f"gallery build --data {MADE} --out {READ}",
@@ -133,7 +134,7 @@ def quicken(put: Callable[[object, str, Any], object]) -> None:
     for place, values in (
         # Which fidelity is the quickest is no matter of chance: each evaluation takes one tick, exact in binary.
         (samples, {"REPETITION": 0.002, "LARGEST": 0.002, "time": Clock(tick=2**-10)}),
-        (cost, {"MOMENT": 0.0, "ENOUGH": 0.0, "WARM_UP": 0.0}),
+        (cost, {"MOMENT": 0.0, "ENOUGH": 0.0, "WARM_UP": 0.0, "time": Clock(tick=2**-10)}),  # so does a gradient
         (store, {"PAUSE": 0.0, "SHARE": math.inf}),  # writes after every proposal
         (gallery_parts, {"METHODS": ("random",), "BUDGET": 8, "SWEEP_FRAMES": 2, "SWEEP_RESOLUTION": 5}),
         (gallery_parts, {"EPISODE_FRAMES": 2, "EPISODE_HEIGHT": 48}),

@@ -50,23 +50,6 @@ def test_slice_says_where_the_gradient_is_exactly_zero(run: Run, tmp_path: Path)
     assert f"gradient exactly zero at {flat / 81:.1%} of points" in done.stderr
 
 
-def test_same_command_computes_nothing_twice_and_force_begins_anew(run: Run) -> None:
-    command = ["slice", "branin", "--dims", "0", "1", "--resolution", "5", "--json"]
-    assert run.json(*command)["episodes"] == 25
-    again = run(*command)
-    assert again.json["episodes"] == 0
-    assert "there already" in again.stderr
-    assert run.json(*command, "--force")["episodes"] == 25
-
-
-def test_another_slice_is_not_overwritten(run: Run, tmp_path: Path) -> None:
-    first = ["slice", "branin", "--dims", "0", "1", "--resolution", "5", "--out", "cut"]
-    run(*first)
-    before = (tmp_path / "cut/summary.json").read_bytes()
-    run.refuse("slice beale --dims 0 1 --resolution 5 --out cut", said="wanted 'beale', found 'branin'")
-    assert (tmp_path / "cut/summary.json").read_bytes() == before
-
-
 @pytest.mark.parametrize("verb", [("slice",), ("study", "convergence"), ("check",)])
 def test_a_device_without_memory_for_a_point_is_one_line_and_exit_code_1(
     run: Run, monkeypatch: pytest.MonkeyPatch, verb: tuple[str, ...]

@@ -247,12 +247,6 @@ def test_what_pip_is_told_to_install_is_there() -> None:
     }  # fmt: skip
 
 
-def test_the_paper_is_named_with_its_address_before_it_is_called_the_paper() -> None:
-    first = README.index("the paper")
-    assert README.index("https://arxiv.org/abs/2207.00167") < first
-    assert README[first:].startswith("the paper from here on")
-
-
 def test_the_example_package_registers_an_environment(tmp_path: Path) -> None:
     package = ROOT / "docs/example_package"
     entry = re.search(r'gradscape.environments"\]\n(.*?)\n\n', (package / "pyproject.toml").read_text(), re.DOTALL)

@@ -1,7 +1,7 @@
 """Results of every kind under full disks, ends of their process and damaged files, in any order.
 
 What is read is right, or the command ends in a line that names what is wrong; what was interrupted ends in the numbers
-of an undisturbed run. Kinds that take minutes are nightly.
+of an undisturbed run.
 """
 
 import gc
@@ -22,7 +22,6 @@ from .kinds import KINDS, before, copy, files, missing, numbers, printed, say, u
 
 pytestmark = [pytest.mark.e2e, pytest.mark.nightly]  # cases are drawn at random, and take seconds each
 
-QUICK = ("slice", "run", "pairs")  # kinds of the default lane
 FULL = re.compile(r"no space|no room|disk is full|of disk, and .* free here", re.IGNORECASE)
 ADVICE = re.compile(r"make room|same command|run it again")
 EXAMPLES = settings(
@@ -113,9 +112,7 @@ class Disturbed(RuleBasedStateMachine):
             shutil.rmtree(self.folder)
 
 
-@pytest.mark.parametrize(
-    "kind", [one if one in QUICK else pytest.param(one, marks=pytest.mark.nightly) for one in KINDS]
-)
+@pytest.mark.parametrize("kind", KINDS)
 def test_whatever_befalls_a_result_it_is_right_or_names_what_is_wrong(kind: str) -> None:
     machine = type(f"Disturbed {kind}", (Disturbed,), {"kind": kind})
     run_state_machine_as_test(machine, settings=EXAMPLES)  # type: ignore[no-untyped-call]

@@ -15,11 +15,6 @@ LONGEST = 40  # lines of a function, but for its signature, its docstring and fu
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 
 
-def test_the_package_s_own_folder_is_the_door_only() -> None:
-    held = {path.name for path in (ROOT / "src/gradscape").iterdir() if path.name != "__pycache__"}
-    assert held == {*FOLDERS, "cli.py", "__init__.py", "__main__.py", "testing.py", "py.typed"}
-
-
 def test_no_function_is_longer_than_one_reads_at_once() -> None:
     long = {
         f"{file.relative_to(ROOT)} {node.name}": length
@@ -29,12 +24,6 @@ def test_no_function_is_longer_than_one_reads_at_once() -> None:
     }
     # One step of a flight with all that it may meet: a Warp function, whose parts would be as many arguments.
     assert long.keys() == {"envs/engines/balls/impacts.py move"}
-
-
-def test_tests_stand_in_folders_that_there_are() -> None:
-    folders = {path.parent.relative_to(ROOT / "tests") for path in (ROOT / "tests").rglob("test_*.py")}
-    folders.discard(Path("nightly"))
-    assert [folder for folder in folders if not (ROOT / folder).is_dir()] == []
 
 
 @pytest.mark.parametrize("folder", [*FOLDERS, "cli.py"])

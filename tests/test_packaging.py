@@ -51,11 +51,6 @@ def test_every_dependency_states_its_reason() -> None:
     assert all("#" in line for line in lines)
 
 
-def test_the_version_is_said_in_one_place() -> None:
-    assert "version" in PROJECT["project"]["dynamic"]
-    assert PROJECT["tool"]["setuptools"]["dynamic"]["version"] == {"attr": "gradscape.__version__"}
-
-
 def test_classifiers_are_of_the_versions_and_the_extras_that_are_tested() -> None:
     project = PROJECT["project"]
     low, high = re.fullmatch(r">=3\.(\d+),<3\.(\d+)", project["requires-python"]).groups()  # type: ignore[union-attr]

@@ -273,11 +273,29 @@ def test_the_gallerys_slices_go_over_an_address(tmp_path, run, address):
     assert list((tmp_path / "data").glob(f"*/{SLICE.files[0]}"))
 
 
-@pytest.mark.parametrize("wrong", ["local:0", "local:two"])
-def test_a_number_of_workers_that_is_none_is_refused(run, wrong):
-    run.refuse(
-        "slice", "bounce", "--dims", "0", "1", "--device", "cpu", "--scheduler", wrong, said="local:N for N workers"
-    )
+DEAD, CLOSED = "tcp://127.0.0.1:9", "tls://127.0.0.1:9"
+
+
+@pytest.mark.parametrize(
+    ("scheduler", "code", "said", "keys", "lacking"),
+    [
+        ("local:0", 2, "local:N for N workers", {}, ""),
+        ("local:two", 2, "local:N for N workers", {}, ""),
+        (CLOSED, 2, f"{CLOSED} takes certificates; docs/clusters.md says where they are named", {}, ""),
+        (CLOSED, 2, "configuration names cannot be read", {"ca-file": "/none", "client.cert": "/none"}, ""),
+        (DEAD, 1, f"no Dask scheduler answers at {DEAD}", {}, ""),
+        (DEAD, 2, "pip install '.[distributed]'", {}, "distributed"),
+        ("local:1", 2, "--scheduler local needs cryptography: pip install '.[distributed]'", {}, "cryptography"),
+    ],
+)
+def test_what_is_no_scheduler_is_refused_in_a_line(run, monkeypatch, scheduler, code, said, keys, lacking):
+    monkeypatch.setattr("gradscape.jobs.workers.ANSWER", 1.0)
+    if lacking:
+        monkeypatch.setitem(sys.modules, lacking, None)
+    with dask.config.set({f"distributed.comm.tls.{name}": value for name, value in keys.items()}):
+        done = run(f"slice branin --dims 0 1 --scheduler {scheduler}")
+    assert (done.returncode, done.stderr.count("\n")) == (code, 1)
+    assert said in done.stderr
 
 
 def test_what_listens_at_an_address_and_is_no_scheduler_is_not_waited_for(run, monkeypatch):
@@ -287,35 +305,3 @@ def test_what_listens_at_an_address_and_is_no_scheduler_is_not_waited_for(run, m
         said = run("slice", "branin", "--dims", "0", "1", "--scheduler", address)
     assert (said.returncode, said.stderr.count("\n")) == (1, 1)
     assert f"no Dask scheduler answers at {address}: nothing is said there in 0.1 s" in said.stderr
-
-
-@pytest.mark.parametrize(
-    ("named", "said"),
-    [
-        ({}, "tls://127.0.0.1:9 takes certificates; docs/clusters.md says where they are named"),
-        ({"ca-file": "/none", "client.cert": "/none"}, "configuration names cannot be read"),
-    ],
-    ids=["none", "gone"],
-)
-def test_an_address_of_tls_takes_certificates(run, named, said):
-    with dask.config.set({f"distributed.comm.tls.{name}": value for name, value in named.items()}):
-        done = run("slice branin --dims 0 1 --scheduler tls://127.0.0.1:9")
-    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
-    assert said in done.stderr
-
-
-def test_an_address_where_nothing_answers_and_a_missing_dask_are_said(run, monkeypatch):
-    monkeypatch.setattr("gradscape.jobs.workers.ANSWER", 1.0)
-    how = ["slice", "bounce", "--dims", "0", "1", "--device", "cpu", "--scheduler", "tcp://127.0.0.1:9"]
-    said = run(*how)
-    assert said.returncode == 1
-    assert "no Dask scheduler answers at tcp://127.0.0.1:9" in said.stderr
-    monkeypatch.setitem(sys.modules, "distributed", None)
-    said = run.refuse(*how, said="pip install '.[distributed]'")
-
-
-def test_missing_cryptography_is_said_before_anything_listens(run, monkeypatch):
-    monkeypatch.setitem(sys.modules, "cryptography", None)
-    said = run("slice branin --dims 0 1 --scheduler local:1")
-    assert (said.returncode, said.stderr.count("\n")) == (2, 1)
-    assert "--scheduler local needs cryptography: pip install '.[distributed]'" in said.stderr

@@ -1,26 +1,31 @@
 """Sizes beyond the machine: each verb refuses them in a line, before it allocates what they take."""
 
+import io
+import json
+import os
 import resource
 import tracemalloc
+from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import asdict
-from functools import partial
+from functools import cache
 from pathlib import Path
 from typing import get_args
 
 import pytest
 
-from gradscape.cli import verbs
+from gradscape.cli import main, verbs
 from gradscape.envs.registry import make
 from gradscape.landscapes.capacity import TooLargeError
 from gradscape.optim.memory import SearchSize
 from gradscape.optim.registry import methods, optimizer_class
 
-from .processes import Ended, alone, landscape
+from .command import leave_blank
+from .processes import FORK
 
 pytestmark = pytest.mark.e2e
 
 HUGE = 10**15
-ROOM = 2 << 30  # bytes that a command may take beyond what it is loaded with
+ROOM = 6 << 30  # bytes that a command may take beyond what it is loaded with
 COUNTS = {"--seed", "--top", "--workers", "--port", "--jobs"}  # whole numbers that allocate nothing
 OF_A_GRID = {("slice", "--budget"), ("census", "--gradients")}  # nor does one that is held to the points of a grid
 OF_A_GRID |= {("slice", "--gradients"), ("sweep", "--gradients"), ("study", "--grid")}
@@ -28,6 +33,13 @@ SUBJECTS = {"env": "ackley", "SLICE": "cut", "RUNS": "run", "WHAT": "cut", "KIND
 NEEDED = {"--dims": "0 1", "--over": "smoothing", "--method": "random", "--axis": "x", "--plane": "pca"}
 
 
+DIMS = ("1000000", "0", "-1")
+LARGE = "optimize ackley --set dim=100000 --method cma-es"
+RACE = "race ackley --set dim=100000 --seeds 1 --budget 1000000 --out race"
+WRONG = [*(["slice", "ackley", "--dims", "0", "--set", f"dim={dim}"] for dim in DIMS), LARGE.split(), RACE.split()]
+
+
+@cache
 def sizes() -> list[list[str]]:
     """Return a command for every option that is a whole number without an end, and that alone is huge."""
     found = []
@@ -46,40 +58,63 @@ def _said(name: str, words: str) -> list[str]:
     return ["bounce" if (words, name) == ("study", "env") else SUBJECTS[name]] if name in SUBJECTS else []
 
 
-def limited(*arguments: str) -> None:
-    """Run the command with little room, so that what it allocates for a size ends it."""
+def walk(folder: Path) -> None:
+    """Run all commands one after the other with little room, and write down what each said."""
+    patch = pytest.MonkeyPatch()
+    leave_blank(patch.setattr)
+    os.chdir(folder)
+    for line in (
+        "slice branin --dims 0 1 --resolution 4 --out cut",
+        "optimize branin --method random --budget 5 --out run",
+    ):
+        say(line.split())
     taken = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (taken + ROOM, taken + ROOM))
-    landscape(*arguments)
+    Path("said.json").write_text(json.dumps([say(words) for words in (*sizes(), *WRONG)]))
+
+
+def say(words: list[str]) -> tuple[int, str]:
+    """Run a command in this process; return its exit code and what it said on standard error."""
+    out = io.StringIO()
+    with redirect_stderr(out), redirect_stdout(io.StringIO()):
+        try:
+            main(words)
+        except SystemExit as left:
+            return int(left.code or 0), out.getvalue()
+    return 0, out.getvalue()
 
 
 @pytest.fixture(scope="module")
-def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a slice and a run."""
-    folder, cut = tmp_path_factory.mktemp("desk"), "slice branin --dims 0 1 --resolution 4 --out cut"
-    for said in (cut, "optimize branin --method random --budget 5 --out run"):
-        assert alone(partial(landscape, *said.split()), folder).returncode == 0
-    return folder
+def said(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[int, str]]:
+    """Return what a process with little room said of each command."""
+    folder = tmp_path_factory.mktemp("sizes")
+    process = FORK.Process(target=walk, args=(folder,))
+    process.start()
+    process.join()
+    found = json.loads((folder / "said.json").read_text())
+    return {" ".join(words): tuple(one) for words, one in zip((*sizes(), *WRONG), found, strict=True)}
 
 
-def refused(done: Ended) -> bool:
-    return done.returncode == 2 and len(done.stderr.splitlines()) == 1 and "would fit" in done.stderr
+def test_sizes_beyond_the_machine_are_refused_in_a_line(said: dict[str, tuple[int, str]]) -> None:
+    assert len(sizes()) > 20
+    for line in map(" ".join, sizes()):
+        code, text = said[line]
+        assert (code, text.count("\n")) == (2, 1), (line, text)
+        assert "would fit" in text, line
+        assert str(HUGE) in text, line
 
 
-@pytest.mark.parametrize("said", sizes(), ids=" ".join)
-def test_a_size_beyond_the_machine_is_refused_in_a_line(desk: Path, said: list[str]) -> None:
-    done = alone(partial(limited, *said), desk)
-    assert refused(done), done.stderr
-    assert str(HUGE) in done.stderr
-
-
-@pytest.mark.parametrize("dim", ["1000000", "0", "-1"])
-def test_a_dimension_that_cannot_be_is_refused(desk: Path, dim: str) -> None:
-    done = alone(partial(limited, "slice", "ackley", "--dims", "0", "--set", f"dim={dim}"), desk)
-    assert done.returncode == 2
-    assert done.stderr.splitlines() == [
-        f"landscape: ackley option dim takes a whole number above 0, at most 100000; got '{dim}'"
-    ]
+def test_dimensions_and_methods_that_cannot_be_are_refused(said: dict[str, tuple[int, str]]) -> None:
+    for dim in DIMS:
+        assert said[f"slice ackley --dims 0 --set dim={dim}"] == (
+            2, f"landscape: ackley option dim takes a whole number above 0, at most 100000; got '{dim}'\n"
+        )  # fmt: skip
+    code, text = said[LARGE]
+    assert (code, text.count("\n"), "would fit" in text) == (2, 1, True)  # before it is made
+    code, text = said[RACE]
+    assert code == 2
+    assert "without cma-es: cma-es: number of parameters 100000 takes" in text
+    assert "budget 1000000 takes" in text
 
 
 @pytest.mark.parametrize("name", methods())
@@ -108,11 +143,6 @@ def test_an_option_that_takes_too_much_is_refused_by_name(name: str, option: str
         optimizer_class(name).require_memory(options, SearchSize(2, budget=10**9))
 
 
-def test_a_method_is_refused_before_it_is_made(desk: Path) -> None:
-    done = alone(partial(limited, *["optimize", "ackley", "--set", "dim=100000", "--method", "cma-es"]), desk)
-    assert refused(done), done.stderr
-
-
 @pytest.mark.parametrize(("name", "dim"), [("cma-es", 300), ("bo-leap", 300)])
 def test_matrices_take_no_more_than_is_foretold(name: str, dim: int) -> None:
     env = make("ackley", dim=dim)
@@ -126,11 +156,3 @@ def test_matrices_take_no_more_than_is_foretold(name: str, dim: int) -> None:
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < kind.memory(asdict(optimizer.options), SearchSize(dim)) + 2e6
-
-
-def test_a_race_leaves_out_the_methods_that_do_not_fit(desk: Path) -> None:
-    said = "race ackley --set dim=100000 --seeds 1 --budget 1000000 --out race"
-    done = alone(partial(limited, *said.split()), desk)
-    assert "without cma-es: cma-es: number of parameters 100000 takes" in done.stderr
-    assert done.returncode == 2
-    assert "budget 1000000 takes" in done.stderr

@@ -17,44 +17,12 @@ from gradscape.cli import main, verbs
 from gradscape.jobs import workers as cluster
 from gradscape.landscapes.draw.recordings import viewer
 
-from .command import leave_blank, options
+from .command import SMALL, leave_blank, options
 from .processes import FORK
 from .sockets import beyond_loopback, listening
 
 pytestmark = pytest.mark.e2e
 
-SMALL = """
-envs
-info
-slice bounce --dims 0 1 --resolution 4 --fidelity draft --device cpu --out cut
-sweep bounce --dims 0 1 --over 2 --frames 2 --resolution 2 --fidelity draft --device cpu
-methods
-optimize bounce --method random --budget 4 --fidelity draft --device cpu --out run
-race bounce --methods random --seeds 1 --budget 2 --fidelity draft --device cpu
-league branin --methods random --seeds 1 --budget 2 --device cpu
-overlay cut run --out over
-surface cut run
-compare cut bounce --fidelity draft --device cpu
-replay bounce --fidelity draft --device cpu --no-film
-export cut
-view over/overlay.rrd
-bounce --axis y --resolution 3 --fidelity draft --device cpu
-plan slice bounce --dims 0 1 --resolution 2 --fidelity draft --device cpu
-bench bounce --batch 2 --seconds 0 --fidelity draft --device cpu
-check branin --power 20%
-study fidelity cartpole --set horizon=0.02 --points 2 --settings precision --device cpu
-study mixed cartpole --set horizon=0.02 --points 2 --chaotic --time-limit 0.01 --device cpu
-study extremes bounce --set horizon=0.05 --points 4 --settings dt --precisions float64 --fidelity draft --device cpu
-pairs bounce --samples 2 --fidelity draft --device cpu
-report cut --points-per-axis 2 --device cpu
-hessian branin --device cpu
-census branin --slices 1 --resolution 6
-card --scene control --resolution 3
-gallery compute --only bounce-y --part slices --resolution 4 --fidelity draft --device cpu --data data
-gallery list --data data
-gallery build --data data --out site
-gallery serve --out site --port 0
-""".strip().splitlines()
 # Flags of what results are like, and not of what is started.
 RESULTS = {"--json", "--force", "--no-gradients", "--deterministic", "--film", "--no-film", "--claims", "--all"}
 RESULTS |= {"--chaotic"}

@@ -17,44 +17,14 @@ from gradscape.commands.terminal import Console, Described
 from gradscape.envs.registry import make
 from gradscape.landscapes.storage.files import make_folder, resolve
 
-from .command import Run
+from .command import SMALL, Run
 
 DEEP = "/".join(["d"] * 2000)
 HOSTILE = ["[/b]", "loop", "caf\udce9"]
 ROOT = Path(gradscape.__path__[0])
 SOURCES = [*ROOT.glob("*.py"), *ROOT.glob("*/*.py"), *ROOT.glob("*/*/*.py")]
-BASE = """
-envs
-methods
-slice branin --dims 0 1 --resolution 3
-sweep ackley --dims 0 1 --over 2 --set dim=3 --frames 2 --resolution 3
-optimize branin --method random --budget 5
-race branin --methods random --budget 5 --seeds 2
-league branin --methods random --budget 5 --seeds 2
-overlay cut run
-compare cut branin
-surface cut
-replay bounce --no-film
-export cut
-view cut
-bounce --axis y --resolution 3
-bench branin --batch 2 --seconds 0
-check branin --power 20%
-study fidelity bounce --points 2 --settings dt
-pairs ackley --samples 2 --top 3
-hessian branin
-census ackley --slices 1 --resolution 6
-card --scene control --resolution 3
-report cut --points-per-axis 2
-gallery compute --only bounce --part reports
-gallery list
-gallery build
-gallery serve
-""".strip().splitlines()
-
-
 VERBS = {tuple(words.split()): verb for words, verb in verbs().items() if words not in ("info", "plan")}
-WORDS = {verb: next(words for line in BASE if (words := line.split())[: len(verb)] == [*verb]) for verb in VERBS}
+WORDS = {verb: next(words for line in SMALL if (words := line.split())[: len(verb)] == [*verb]) for verb in VERBS}
 PATHS = [  # of what a verb says that it is a file or a folder
     (verb, option)
     for verb, one in VERBS.items()
@@ -84,7 +54,8 @@ def said_with(verb: tuple[str, ...], option: Option, value: str) -> list[str]:
         return [*words, option.names[0], value]
     places = [other.names[0] for other in VERBS[verb].options if not other.names[0].startswith("-")]
     at = len(verb) + places.index(option.names[0])
-    return [*words[:at], value, *words[at + 1 :]]
+    end = next((place for place, word in enumerate(words) if word.startswith("-")), len(words))
+    return [*words[:at], value, *words[at + (at < end) :]]
 
 
 def test_a_path_nobody_meant_ends_with_a_message(run: Run, desk: Path) -> None:
@@ -105,18 +76,6 @@ def test_an_option_of_a_scene_is_not_called_as_what_every_scene_has(run: Run, de
         assert len(done.stderr.splitlines()) == 1, words
         assert words[-1].removesuffix("=1") in done.stderr, words
     assert [one.name for one in desk.iterdir()] == ["loop"]
-
-
-def test_every_verb_is_tried() -> None:
-    assert len(VERBS) == len(BASE)
-    assert len(PATHS) > 25
-
-
-def test_what_is_said_of_a_name_is_the_name(run: Run, desk: Path) -> None:
-    for name, shown in (("[/b]", "[/b]"), (":warning:", ":warning:"), ("caf\udce9", "caf\\udce9")):
-        done = run("gallery", "list", "--data", name)
-        assert (done.returncode, done.stderr) == (0, "")
-        assert f"figures in {shown}" in done.stdout
 
 
 def test_a_console_prints_what_it_is_given(capsys: pytest.CaptureFixture[str]) -> None:

@@ -69,27 +69,6 @@ def test_a_class_is_checked_and_its_findings_are_a_table() -> None:
     assert [one["check"] for one in failed.record()["checks"]] == list(table.index)
 
 
-@pytest.mark.drawn
-def test_a_study_has_a_front_a_table_and_a_picture(tmp_path: Path) -> None:
-    how = {"points": 2, "settings": ("precision",), "device": "cpu", "options": {"horizon": 0.05}}
-    found = gs.study("fidelity", "bounce", **how, out=tmp_path / "trade")  # type: ignore[arg-type]
-    table = found.table()
-    assert table.index[table["front"]].tolist() == found.front
-    assert table["with_gradient"].is_monotonic_increasing
-    assert {"draft", "standard", "reference", "draft-float64"} <= set(table.index)
-    assert to_json(found) == read_json(tmp_path / "trade/fidelity.json")
-    assert gs.study("fidelity", "bounce", **how, out=tmp_path / "trade") == found  # type: ignore[arg-type]
-    assert found.plot()._repr_png_().startswith(b"\x89PNG")
-
-
-def test_pairs_are_ranked(tmp_path: Path) -> None:
-    ranked = gs.pairs("rastrigin", samples=4, out=tmp_path / "pairs", options={"dim": 3})
-    scores = ranked.table()["score"]
-    assert len(scores) == 3
-    assert scores.is_monotonic_decreasing
-    assert ranked.record() == read_json(tmp_path / "pairs/pairs.json")
-
-
 def test_keywords_beside_an_environment_are_its_settings() -> None:
     assert gs.check(Bowl(), device="cpu").device == "cpu"
     with pytest.raises(ValueError, match="runs on cpu; got device 'cuda'"):

@@ -33,29 +33,6 @@ def cut(sampled: Path, tmp_path: Path) -> gs.Slice:
     return gs.open_slice(shutil.copytree(sampled / "cut", tmp_path / "cut"))
 
 
-@pytest.mark.drawn
-def test_runs_are_laid_over_a_slice_as_they_are_or_from_their_folders(cut: gs.Slice, tmp_path: Path) -> None:
-    found = gs.optimize("branin", "random", budget=8, out=tmp_path / "run")
-    laid = gs.overlay(cut, [found], out=tmp_path / "over")
-    assert sorted(file.name for file in (tmp_path / "over").iterdir()) == ["overlay.png", "overlay.rrd"]
-    assert (laid.summary.runs, laid.summary.points, laid.summary.outside) == (1, 8, 0)
-    assert laid.plot()._repr_png_().startswith(b"\x89PNG")
-    assert "8 points" in repr(laid)
-    again = gs.overlay(tmp_path / "cut", tmp_path / "run", out=tmp_path / "again")
-    np.testing.assert_array_equal(again.runs[0]["beneath"], laid.runs[0]["beneath"])
-
-
-def test_a_slice_is_cut_anew_through_the_best_point(tmp_path: Path) -> None:
-    env = gs.make("ackley", dim=3)
-    cut = gs.slice(env, (0, 1), resolution=4, out=tmp_path / "cut")
-    found = gs.optimize(env, "random", budget=8, out=tmp_path / "run")
-    laid = gs.overlay(cut, found, through="best", resolution=5, out=tmp_path / "over")
-    assert float(laid.slice.plane.distance(found.best.x)) < 1e-12
-    assert laid.slice.plane.resolution == (5, 5)
-    assert laid.slice.folder is not None
-    assert laid.slice.folder.parent == tmp_path / "over"
-
-
 def test_points_of_other_programs_lie_where_a_run_lies(cut: gs.Slice, tmp_path: Path) -> None:
     run = gs.optimize("branin", "random", budget=8, out=tmp_path / "run")
     expected = gs.overlay(cut, run, out=tmp_path / "over").runs[0]

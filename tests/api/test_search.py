@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -11,59 +10,6 @@ import pytest
 import torch
 
 import gradscape as gs
-from gradscape.landscapes.identity import StoreError, StoreMismatchError
-
-from ..command import Run
-
-
-def test_a_run_of_python_is_the_command_s(run: Run, tmp_path: Path) -> None:
-    command = "optimize branin --method cma-es --budget 20 --seed 3 --option population=5 --json"
-    done = run(command)
-    folder = tmp_path / done.json["folder"]
-    theirs = gs.open_run(folder)
-    ours = gs.optimize("branin", "cma-es", budget=20, seed=3, method_options={"population": 5})
-    assert ours.folder is not None
-    assert ours.folder.resolve() == folder.resolve()  # as the folder's name is the same
-    assert json.loads((folder / "summary.json").read_text())["resumed"] == 20
-    again = gs.optimize("branin", "cma-es", budget=20, seed=3, method_options={"population": 5}, out=tmp_path / "again")
-    assert again.identity == theirs.identity
-    for name in ("x", "loss", "status", "kind"):
-        np.testing.assert_array_equal(again.data[name], theirs.data[name])
-    run.ok("export again")
-
-
-def test_a_larger_budget_goes_on_and_another_run_is_refused_but_by_force(tmp_path: Path) -> None:
-    first = gs.optimize("branin", "random", budget=8, out=tmp_path / "run")
-    more = gs.optimize("branin", "random", budget=24, out=tmp_path / "run")
-    np.testing.assert_array_equal(more.data["loss"][:8], first.data["loss"])
-    with pytest.raises(StoreMismatchError, match="seed: wanted 1, found 0"):
-        gs.optimize("branin", "random", budget=8, seed=1, out=tmp_path / "run")
-    assert gs.optimize("branin", "random", budget=8, seed=1, out=tmp_path / "run", force=True).seed == 1
-
-
-def test_the_best_episode_is_the_one_of_least_loss(tmp_path: Path) -> None:
-    found = gs.optimize("branin", "random", budget=16, out=tmp_path / "run")
-    best = found.best
-    assert best.loss == float(found.data["loss"].min()) == float(found.data["loss"][best.episode - 1])
-    assert float(gs.make("branin").evaluate(best.x[None], grad=False).loss) == best.loss
-    assert "best loss" in repr(found)
-    assert str(tmp_path / "run") in repr(found)
-
-
-def test_a_table_has_a_row_for_each_episode_and_names_units(tmp_path: Path) -> None:
-    table = gs.optimize("bounce", "descents", budget=8, fidelity="draft", device="cpu", out=tmp_path / "run").table()
-    assert len(table) == 8
-    for name in ("episode", "velocity x [m/s]", "loss [m²]", "status", "kind", "forward equivalents", "seconds [s]"):
-        assert name in table.columns
-    assert any(name.startswith("gradient by velocity x") for name in table.columns)
-    assert (table["status"] == "ok").all()
-
-
-@pytest.mark.drawn
-def test_a_run_is_drawn_for_a_notebook(tmp_path: Path) -> None:
-    found = gs.optimize("branin", "random", budget=8, out=tmp_path / "run")
-    assert found.plot()._repr_png_().startswith(b"\x89PNG")
-    assert gs.slice("branin", (0, 1), resolution=4, out=tmp_path / "cut").plot(runs=[found])
 
 
 def test_a_function_is_searched_in_memory_unless_it_is_given_a_folder(tmp_path: Path) -> None:
@@ -83,11 +29,6 @@ def test_where_nothing_succeeded_there_is_no_best_and_it_is_said() -> None:
         _ = found.best
 
 
-def test_what_is_no_run_is_not_opened(tmp_path: Path) -> None:
-    with pytest.raises(StoreError, match="there is no run at"):
-        gs.open_run(tmp_path / "nothing")
-
-
 def test_a_number_of_threads_is_left_as_it_was(tmp_path: Path) -> None:
     before = torch.get_num_threads()
     torch.set_num_threads(2)
@@ -96,23 +37,6 @@ def test_a_number_of_threads_is_left_as_it_was(tmp_path: Path) -> None:
         assert torch.get_num_threads() == 2
     finally:
         torch.set_num_threads(before)
-
-
-def test_a_race_of_python_is_the_command_s(run: Run, tmp_path: Path) -> None:
-    command = "race branin --methods random,cma-es --budget 12 --seeds 2 --option cma-es.population=5 --json"
-    kept = run.json(command)
-    options = {"cma-es": {"population": 5}}
-    ours = gs.race("branin", ["random", "cma-es"], budget=12, seeds=2, method_options=options)
-    assert ours.folder is not None
-    assert ours.folder.resolve() == (tmp_path / kept["folder"]).resolve()
-    assert [rank.method for rank in ours.statistics.ranks] == [rank["method"] for rank in kept["ranks"]]
-    assert {method: [one.seed for one in runs] for method, runs in ours.runs.items()} == {
-        "random": [0, 1],
-        "cma-es": [0, 1],
-    }
-    np.testing.assert_array_equal(
-        ours.runs["random"][1].data["loss"], gs.open_run(ours.folder / "random-1").data["loss"]
-    )
 
 
 @pytest.mark.drawn

@@ -12,39 +12,13 @@ import torch
 import gradscape as gs
 from gradscape.jobs.slice import SliceSummary
 from gradscape.landscapes.convert import from_json
-from gradscape.landscapes.identity import StoreMismatchError, stored_identity
 from gradscape.landscapes.objective import Objective
-
-from ..command import Run
 
 BOX = gs.ParameterSpace.box(["a", "b"], -1.0, 1.0)
 
 
 def bowl() -> gs.Objective:
     return gs.from_torch(lambda x: (x**2).sum(dim=1), BOX)
-
-
-def test_a_slice_of_python_is_the_command_s(run: Run, tmp_path: Path) -> None:
-    done = run("slice branin --dims 0 1 --resolution 6 --json")
-    folder = tmp_path / done.json["folder"]
-    theirs = gs.open_slice(folder)
-    ours = gs.slice("branin", (0, 1), resolution=6)  # finds it there, as the folder's name is the same
-    assert ours.folder is not None
-    assert ours.folder.resolve() == folder.resolve()
-    assert json.loads((folder / "summary.json").read_text())["episodes"] == 0
-    assert ours.identity == theirs.identity
-    again = gs.slice("branin", ("x0", "x1"), resolution=6, out=tmp_path / "again")
-    assert again.identity == theirs.identity
-    for name in ("loss", "grad", "status"):
-        np.testing.assert_array_equal(again.data[name], theirs.data[name])
-    run.ok("export again")
-
-
-def test_another_slice_is_refused_and_replaced_by_force(tmp_path: Path) -> None:
-    gs.slice("branin", (0, 1), resolution=4, out=tmp_path / "cut")
-    with pytest.raises(StoreMismatchError, match="made by other settings"):
-        gs.slice("branin", (0, 1), resolution=5, out=tmp_path / "cut")
-    assert gs.slice("branin", (0, 1), resolution=5, out=tmp_path / "cut", force=True).data.sizes["u"] == 5
 
 
 def test_slope_and_minima_are_those_of_a_closed_form() -> None:
@@ -90,13 +64,6 @@ def test_a_point_and_an_extent_cut_what_they_say() -> None:
         gs.slice(bowl(), (0,), through="example:aim")
 
 
-def test_a_report_has_words_and_needs_gradients() -> None:
-    cut = gs.slice(bowl(), (0, 1), resolution=16)
-    assert cut.report(points=2).verdict.words[0] == "very smooth"
-    with pytest.raises(ValueError, match="gradients"):
-        gs.slice(bowl(), (0, 1), resolution=8, gradients=False).report()
-
-
 @pytest.mark.drawn
 def test_a_picture_shows_in_a_notebook_with_events_along_a_line(tmp_path: Path) -> None:
     cut = gs.slice("branin", (0, 1), resolution=4, out=tmp_path / "cut")
@@ -105,26 +72,12 @@ def test_a_picture_shows_in_a_notebook_with_events_along_a_line(tmp_path: Path) 
     assert any("bounces" in text.get_text() for ax in line.plot().axes for text in [*ax.texts, ax.yaxis.label])
 
 
-def test_a_stored_slice_knows_its_environment(tmp_path: Path) -> None:
-    made = gs.slice("branin", (0, 1), resolution=8, out=tmp_path / "cut")
-    opened = gs.open_slice(tmp_path / "cut")
-    assert opened.report(points=2).verdict == made.report(points=2).verdict
-    assert stored_identity(opened.data) == opened.identity
-    assert str(tmp_path / "cut") in repr(opened)
-
-
 def test_what_is_made_already_takes_other_settings() -> None:
     ball = gs.make("bounce")
     assert gs.slice(ball, (0, 1), resolution=2, fidelity="standard").identity["fidelity"] == "standard"
     assert ball.fidelity.name == "draft"
     with pytest.raises(ValueError, match="no environment is called 'brannin'; did you mean branin"):
         gs.slice("brannin", (0, 1))
-
-
-def test_environments_are_listed() -> None:
-    listed = gs.list_envs()
-    assert listed.loc["fluid", "dim"] == "10"
-    assert "draft" in listed.loc["fluid", "fidelities"]
 
 
 def test_a_slice_says_the_call_that_makes_it_again(tmp_path: Path) -> None:

@@ -4,34 +4,16 @@ from pathlib import Path
 
 import pytest
 import torch
-import xarray as xr
 
 import gradscape
 from gradscape.api.sweep import sweep
 from gradscape.landscapes.directions import random_directions
-from gradscape.landscapes.identity import plane_of, stored_provenance
+from gradscape.landscapes.identity import plane_of
 from gradscape.landscapes.objective import Status
-from gradscape.landscapes.verification import POINTS
 
 from ..command import Run
 
 SMALL = ["--frames", "2", "--resolution", "3", "--through", "example:aim", "--device", "cpu"]
-
-
-def test_a_sweep_from_python_is_the_commands_and_goes_on_in_its_folder(
-    run: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    run.ok("sweep", "bounce", "--dims", "0", "1", "--over", "2", *SMALL)
-    (folder,) = Path("out").iterdir()
-    kind = type(gradscape.make("bounce", device="cpu"))
-    evaluate, rows = kind.evaluate, list[int]()
-    monkeypatch.setattr(kind, "evaluate", lambda env, x, *, grad: rows.append(len(x)) or evaluate(env, x, grad=grad))
-    found = sweep("bounce", (0, 1), 2, frames=2, resolution=3, through="example:aim", device="cpu")
-    assert [path.name for path in Path("out").iterdir()] == [folder.name]
-    assert (found.label, len(found.values)) == ("velocity z [m/s]", 2)
-    assert rows == [POINTS] * 2  # those that are verified, of each slice
-    for number, dataset in enumerate(found.slices):
-        xr.testing.assert_identical(dataset, gradscape.open_slice(folder / f"frames/{number:03d}.zarr").data)
 
 
 def test_a_sweep_along_directions_is_the_slices_at_its_points(
@@ -55,16 +37,6 @@ def test_a_sweep_along_directions_is_the_slices_at_its_points(
         inside = ((points >= env.space.lower) & (points <= env.space.upper)).all(dim=-1)
         assert 0 < int(inside.sum()) < 9
         assert ((dataset["status"].transpose("u", "v").to_numpy() == Status.OK) == inside.numpy()).all()
-
-
-def test_a_sweep_says_how_it_is_made_again(tmp_path: Path) -> None:
-    how = {"through": "random:1", "window": 0.5, "gradients": False, "frames": 2, "resolution": 3}
-    found = sweep("bounce", (0, 1), 2, out=tmp_path / "far", device="cpu", **how)
-    command = stored_provenance(found.slices[0])["command"]
-    again = eval(command.replace(str(tmp_path / "far"), str(tmp_path / "again")))
-    for one, other in zip(found.slices, again.slices, strict=True):
-        xr.testing.assert_equal(one, other)
-    assert "grad" not in again.slices[0]
 
 
 @pytest.mark.drawn

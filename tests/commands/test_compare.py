@@ -56,12 +56,6 @@ def test_an_environment_is_sampled_on_the_slices_own_plane_as_it_would_be_by_its
     assert again.json == done.json
 
 
-def test_options_are_those_of_b(run: Run, desk: Path) -> None:
-    done = run.ok("compare a bounce --set drag=0.1 --device cpu --out made")
-    assert "options.drag: 0.0 in A, 0.1 in B" in done.stdout
-    assert "settings.dt" not in done.stdout
-
-
 def test_what_lies_off_the_box_is_left_out_of_b_where_it_is_of_a(run: Run) -> None:
     cut = "slice bounce --along random:3 --through random:1 --resolution 5 --window 1.5 --device cpu --out a"
     run.ok(cut)

@@ -15,7 +15,7 @@ from gradscape.landscapes.space import ParameterSpace
 from gradscape.landscapes.storage.records import read_json, write_record
 from gradscape.studies.extremes import ExtremesRecord
 
-from ..command import Run, modules
+from ..command import Run
 
 TURN = ["study", "extremes", "stepping", "--points", "4", "--device", "cpu", "--out", "turned"]
 
@@ -116,8 +116,3 @@ def test_a_map_shows_each_outcome_the_boundary_and_the_base(run: Run, tmp_path: 
         assert sorted(line.get_ydata()) == sorted(y for y, _, _ in one.boundary)
         (star,) = (line for line in ax.lines if line.get_gid() == "base")
         assert (star.get_xdata()[0], star.get_ydata()[0]) == (0.1, 1.0)
-
-
-def test_envs_loads_nothing_that_measures_or_draws() -> None:
-    loaded = modules(["envs", "bounce"])
-    assert not loaded & {"matplotlib", "gradscape.jobs.study"}

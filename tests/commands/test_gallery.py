@@ -30,28 +30,12 @@ from ..command import leave_blank
 
 pytestmark = pytest.mark.e2e
 
+AIM = Figure("bounce-y", "bounce", (1,), PaperCaption("It jumps.", 8), "example:aim", resolution=12, fidelity="draft")
+BRANIN = PaperCaption("Three minima <b>&</b> no network.")
 FIGURES = [
-    Figure(
-        "bounce-y", "bounce", (1,), PaperCaption("It jumps.", 8), through="example:aim", resolution=12, fidelity="draft"
-    ),
-    Figure(
-        "bounce-x-y",
-        "bounce",
-        (0, 1),
-        PaperCaption("A plane of it."),
-        through="example:aim",
-        resolution=12,
-        fidelity="draft",
-    ),
-    Figure(
-        "branin",
-        "branin",
-        (0, 1),
-        PaperCaption("Three minima <b>&</b> no network."),
-        resolution=12,
-        fidelity="exact",
-        over="",
-    ),
+    AIM,
+    replace(AIM, id="bounce-x-y", dims=(0, 1), caption=PaperCaption("A plane of it.")),
+    Figure("branin", "branin", (0, 1), BRANIN, resolution=12, fidelity="exact", over=""),
 ]
 READ_FIGURES = "gradscape.gallery.figures.read_figures"
 

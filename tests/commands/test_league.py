@@ -7,24 +7,10 @@ import pytest
 import torch
 
 import gradscape as gs
-from gradscape.landscapes.convert import to_json
 
 from ..command import Run
 
 LEAGUE = ["league", "branin", "bounce@draft", "--methods", "random,cma-es", "--budget", "6", "--seeds", "2"]
-
-
-def test_a_league_of_the_command_is_that_of_python(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    done = run.ok(*LEAGUE, "--device", "cpu", "--json", "--out", "l")
-    said, kept = done.json, json.loads((tmp_path / "l/league.json").read_text())
-    del kept["checksum"]
-    assert said == kept | {"folder": "l"}
-    assert "branin@exact · cpu: 0 of 24 episodes are there" in done.stderr
-    assert (tmp_path / "l/bounce-draft/race.png").exists()
-    monkeypatch.chdir(tmp_path)
-    ours = gs.league(["branin", "bounce@draft"], ["random", "cma-es"], budget=6, seeds=2, device="cpu", out="l")
-    assert to_json(ours)["rows"] == kept["rows"]
-    assert ours.plot()._repr_png_().startswith(b"\x89PNG")
 
 
 def test_it_prints_ranks_and_the_papers_claims(run: Run) -> None:

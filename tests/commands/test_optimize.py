@@ -51,39 +51,6 @@ def test_a_method_with_gradients_says_what_they_cost(run: Run, monkeypatch: pyte
     assert "8 episodes to compute: one by one 8.0 s without gradients, 24 s with" in done.stderr
 
 
-def test_same_command_computes_nothing_twice_a_larger_budget_goes_on_and_force_begins_anew(
-    run: Run,
-) -> None:
-    first = run.json(*QUICK)
-    again = run(*QUICK, "--json")
-    assert (again.json["episodes"], again.json["resumed"]) == (0, 50)
-    assert "all 50 episodes are there already" in again.stderr
-    more = run.json(*QUICK, "--budget", "80")
-    assert (more["folder"], more["budget"]) == (first["folder"], 80)
-    assert more["episodes"] + more["resumed"] == 80
-    again = run.json(*QUICK, "--force")
-    assert (again["episodes"], again["resumed"], again["best"]) == (50, 0, first["best"])
-
-
-def test_another_run_is_not_overwritten(run: Run, tmp_path: Path) -> None:
-    run(*QUICK, "--out", "run")
-    before = (tmp_path / "run/summary.json").read_bytes()
-    for change, said in (
-        (["--seed", "1"], "seed: wanted 1, found 0"),
-        (["--method", "random"], "method: wanted 'random', found 'cma-es'"),
-        (["--option", "sigma=0.1"], "method_options.sigma: wanted 0.1, found 0.5"),
-    ):
-        run.refuse(*QUICK, *change, "--out", "run", said=said)
-    assert (tmp_path / "run/summary.json").read_bytes() == before
-
-
-def test_every_different_run_has_a_folder_of_its_own(run: Run, tmp_path: Path) -> None:
-    for change in ([], ["--seed", "1"], ["--method", "random"], ["--option", "sigma=0.1"]):
-        run.ok(*QUICK, *change)
-    folders = sorted(path.name.rsplit("-", 1)[0] for path in (tmp_path / "out").iterdir())
-    assert folders == ["branin-cma-es-exact-s0"] * 2 + ["branin-cma-es-exact-s1", "branin-random-exact-s0"]
-
-
 def test_methods_lists_them_all_and_shows_one_in_full(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "200")
     listed = run("methods").stdout

@@ -63,7 +63,7 @@ def test_a_slice_cut_through_the_best_point_shows_its_loss(run: Run) -> None:
     assert "all 36 episodes with gradients are there already" in again.stderr
 
 
-@pytest.mark.parametrize("point", ["random:2", "center", "best:race/descents-0", "race/descents-0", "example:aim"])
+@pytest.mark.parametrize("point", ["random:2", "best:race/descents-0", "race/descents-0"])
 def test_a_slice_is_cut_anew_through_any_point_that_has_a_name(run: Run, point: str) -> None:
     run.ok(f"overlay cut race --through {point} --resolution 3 --out over --device cpu")
     (folder,) = (path for path in Path("over").iterdir() if path.is_dir())

@@ -50,17 +50,6 @@ def test_more_seeds_methods_and_episodes_go_on_where_the_race_ended(run: Run, tm
     assert "40 episodes to compute:" in again.stderr
 
 
-def test_race_prints_ranks_and_what_the_paper_claims(run: Run) -> None:
-    done = run.ok(*RACE, "--claims")
-    for shown in (
-        "branin · exact · 40 episodes · 3 seeds",
-        "mean rank",
-        "3 seeds: too few",
-        "it claims nothing about it",
-    ):
-        assert shown in done.stdout
-
-
 def test_report_holds_the_papers_claims_against_the_race(run: Run) -> None:
     command = ["race", "cartpole", "--methods", "random,descents", "--budget", "8", "--seeds", "2"]
     done = run.ok(*command, "--claims")

@@ -21,13 +21,3 @@ def test_the_best_episode_of_a_run_is_replayed(run: Run) -> None:
     assert record["status"] == "OK"
     assert f"{record['loss']:.6g}" in json.dumps(best) or record["loss"] == pytest.approx(best["best"]["loss"])
     assert record["provenance"]["command"].startswith("landscape replay bounce --params best:r")
-
-
-@pytest.mark.drawn
-def test_a_slice_with_a_run_becomes_a_surface(run: Run) -> None:
-    run.ok("slice bounce --dims 0 1 --resolution 5 --out cut --device cpu")
-    run.ok("optimize bounce --method random --budget 4 --out r --device cpu")
-    run.ok("surface cut r --out s")
-    assert names(Path("s")) == ["surface.gltf", "surface.png"]
-    run.ok("surface cut")
-    assert len(list(Path("out").glob("surface-bounce-*"))) == 1

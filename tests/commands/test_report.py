@@ -19,7 +19,7 @@ from gradscape.landscapes.measures.discontinuities import Jump, Jumps
 from gradscape.landscapes.measures.following import Following, ScaleCosine
 from gradscape.landscapes.measures.slice_comparison import exactly
 from gradscape.landscapes.statistics import Estimate
-from gradscape.landscapes.storage.records import read_json, write_record
+from gradscape.landscapes.storage.records import read_json
 
 from ..command import Run, make
 
@@ -129,14 +129,6 @@ def test_one_slice_that_fails_does_not_lose_the_others(run: Run, monkeypatch: py
     assert "bounce-x" in again.stdout
 
 
-def test_a_report_measured_on_another_device_is_taken_and_named(run: Run, cut: Path, tmp_path: Path) -> None:
-    run("report cut --points-per-axis 2 --out told")
-    file = tmp_path / "told/report.json"
-    write_record(file, {**read_json(file), "device": "cuda"})
-    done = run.ok("report cut --points-per-axis 2 --out told")
-    assert "told is there already, measured on cuda" in done.stderr
-
-
 def test_a_report_beside_its_slice_is_copied_unless_it_is_another(run: Run, cut: Path, tmp_path: Path) -> None:
     run("report cut --points-per-axis 2 --out told")
     for file in (tmp_path / "told").iterdir():
@@ -177,16 +169,6 @@ def test_a_row_of_an_environment_spans_its_slices_and_says_whether_the_paper_agr
     )
     assert environments_markdown(two[1:]).endswith("| yes |\n")
     assert environments_markdown([judged(known, 0, 0.0, 0.0, None)]).endswith("| no |\n")
-
-
-def test_a_stopped_report_says_what_is_kept(run: Run, cut: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def stop(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(job, "measure", stop)
-    done = run("report cut --out told")
-    assert done.returncode == 130
-    assert "stopped: 0 of 1 reports are kept" in done.stderr
 
 
 def test_a_slice_of_another_model_is_reported_with_a_warning(

@@ -7,10 +7,8 @@ import pytest
 import gradscape as gs
 from gradscape.envs import registry
 from gradscape.landscapes import cost
-from gradscape.landscapes.convert import to_json
 from gradscape.landscapes.storage.records import read_json
 from gradscape.studies import samples
-from gradscape.studies.model import ModelRecord
 
 from ..command import Run
 from ..parted import CLOCK, Parted
@@ -48,15 +46,6 @@ def test_the_parts_of_a_model_are_printed_drawn_and_kept(run: Run, tmp_path: Pat
     again = run(*TRADE)
     assert "0 models" not in again.stderr
     assert "8 are there already" in again.stderr  # those that are refused are tried again
-
-
-def test_the_front_door_has_the_same_study(tmp_path: Path) -> None:
-    found = gs.study("model", Parted, points=16, out=tmp_path / "parts")
-    assert isinstance(found, ModelRecord)
-    assert to_json(found) == read_json(tmp_path / "parts/model.json")
-    assert found.command.startswith("gradscape.study('model', Parted, points=16")
-    with pytest.raises(ValueError, match="study model takes points, seed; got settings"):
-        gs.study("model", Parted, settings=("dt",))
 
 
 @pytest.mark.parametrize(("name", "kind"), [("tradeoff", "fidelity"), ("extremes", "extremes")])

@@ -37,6 +37,7 @@ def desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         ("view empty", "empty holds none of index.html, overlay.rrd, race.png"),
         ("view cut --serve", "--serve shows recordings (.rrd)"),
         ("view site --serve", "a site is served by: landscape gallery serve --out site"),
+        ("view site", "serve it to a browser: landscape gallery serve --out site"),
     ],
 )
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems always have a display")
@@ -45,12 +46,6 @@ def test_what_cannot_be_shown_is_refused_in_one_line(run: Run, desk: Path, comma
     assert done.returncode == 2
     assert len(done.stderr.splitlines()) == 1
     assert said in done.stderr
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="other systems always have a display")
-@pytest.mark.parametrize("serve", [(), ("--serve",)])
-def test_a_site_says_how_it_is_served(run: Run, desk: Path, serve: tuple[str, ...]) -> None:
-    run.refuse("view", "my site", *serve, said="landscape gallery serve --out 'my site'")
 
 
 @pytest.mark.parametrize(("command", "opened"), [("view cut", "cut/landscape.png"), ("view site", "site/index.html")])

@@ -9,10 +9,7 @@ import gradscape as gs
 from gradscape.jobs.check import CheckJob
 from gradscape.jobs.watch import Stopped, Watch
 from gradscape.landscapes.checks.slopes import Kind
-from gradscape.landscapes.identity import StoreMismatchError
 from gradscape.landscapes.storage.records import read_json
-
-from ..command import Run
 
 SPACE = gs.ParameterSpace({"a": (-1, 1), "b": (-1, 1)})
 HALVED = 0.3  # of the box, where the gradient is half of the slope
@@ -27,11 +24,6 @@ def bowl(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 @pytest.fixture(autouse=True)
 def own_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-
-
-def test_without_a_folder_nothing_is_written(tmp_path: Path) -> None:
-    gs.check("branin", power="20%")
-    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.drawn
@@ -51,31 +43,6 @@ def test_the_folder_holds_the_report_and_its_picture(tmp_path: Path) -> None:
     assert "check" in found._repr_html_()
 
 
-def test_another_check_is_replaced_by_force_alone_and_the_same_one_without(tmp_path: Path) -> None:
-    gs.check("branin", power="20%", out="made")
-    first = (tmp_path / "made/check.json").read_bytes()
-    with pytest.raises(StoreMismatchError, match="holds a check made by other settings"):
-        gs.check("branin", power="20%", seed=1, out="made")
-    with pytest.raises(StoreMismatchError, match=r"objective: wanted .*ackley.*, found .*branin"):
-        gs.check("ackley", power="20%", out="made")
-    assert (tmp_path / "made/check.json").read_bytes() == first
-    gs.check("branin", power="20%", out="made")
-    gs.check("branin", power="20%", seed=1, out="made", force=True)
-    assert read_json(tmp_path / "made/check.json")["seed"] == 1
-
-
-def test_a_folder_of_something_else_is_refused_before_anything_is_computed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(CheckJob, "run", None)
-    (tmp_path / "notes.txt").touch()
-    for force in (False, True):
-        with pytest.raises(ValueError, match="holds other files and no check: notes"):
-            gs.check("branin", out=tmp_path, force=force)
-    with pytest.raises(ValueError, match="--figure-width-mm is of a figure in a folder; give --out, too"):
-        gs.check("branin", figure_width_mm=85)
-
-
 def test_a_check_that_is_stopped_leaves_no_file_and_says_that_nothing_is_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -87,13 +54,3 @@ def test_a_check_that_is_stopped_leaves_no_file_and_says_that_nothing_is_kept(
         gs.check("branin", out="made")
     assert not stopped.value.kept
     assert not list(tmp_path.iterdir())
-
-
-def test_the_command_names_what_it_left_and_as_json_the_folder(run: Run, tmp_path: Path) -> None:
-    done = run.ok("check branin --power 20% --out made --json")
-    assert "made: check.json, check.png" in done.stderr
-    assert Path(done.json["folder"]).name == "made"
-    assert done.json["checks"] == read_json(tmp_path / "made/check.json")["checks"]
-    planned = run.ok("plan check branin --power 20% --out other")
-    assert "branin" in planned.stdout
-    assert not (tmp_path / "other").exists()

@@ -13,7 +13,6 @@ from gradscape.jobs.hessian import HessianJob
 from gradscape.jobs.scene import SceneSpec
 from gradscape.landscapes.convert import from_json, to_json
 from gradscape.landscapes.curvature import Curvature
-from gradscape.landscapes.identity import StoreMismatchError
 from gradscape.landscapes.measures.hessian import Hessian
 from gradscape.landscapes.storage.records import read_json
 
@@ -199,10 +198,3 @@ def test_refusals(here: Path, run: Run, words: str, said: str) -> None:
 def test_a_point_of_another_size_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="saddle takes 3 parameters"):
         gs.hessian(saddle(), [1.0, 2.0], out=tmp_path / "made")
-
-
-def test_another_point_is_another_hessian(tmp_path: Path) -> None:
-    gs.hessian(saddle(), "random:1", out=tmp_path / "made")
-    with pytest.raises(StoreMismatchError):
-        gs.hessian(saddle(), "random:2", out=tmp_path / "made")
-    gs.hessian(saddle(), "random:2", out=tmp_path / "made", force=True)
