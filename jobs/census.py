@@ -19,6 +19,7 @@ from ..landscapes.sampling.distribution import PortableObjective, run_tasks, wor
 from ..landscapes.sampling.memory import MemoryBound
 from ..landscapes.storage.files import replacing
 from ..landscapes.storage.records import read_json, reading
+from ..landscapes.verification import LAST_PLACE
 from .folder import CENSUS, ROOT, folder_named
 from .job import CheckpointedJob
 from .plan import simulation_seconds
@@ -193,14 +194,13 @@ class CensusJob(CheckpointedJob["Census"]):
     def _scales(self, watch: Watch) -> tuple[float, float]:
         """Return the deviation of the losses' noise and their range, at random points of the box [loss unit]."""
         from ..landscapes.measures.noise import noise
-        from ..landscapes.measures.profile import PRECISION
         from ..landscapes.measures.verdict import measure_range
 
         if (kept := self.checkpoint.load("noise")) is None:
             with watch.busy(f"{self.env.name}: {PREPARING}, then its noise"):
                 self.env.prepare()
                 x = self.env.space.uniform(NOISE_POINTS, seed=self.seed)
-                rounding = PRECISION[self.env.fidelity.precision]
+                rounding = LAST_PLACE[self.env.fidelity.precision]
                 found = noise(self.env, x, rounding=rounding, repeats=REPEATS, seed=self.seed)
                 whole = measure_range(self.env, seed=self.seed)
             kept = {"deviation": np.array(found.deviation), "range": np.array(whole)}

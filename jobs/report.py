@@ -30,7 +30,7 @@ from ..landscapes.objective import BoxedObjective, Evaluation, ObjectiveWrapper,
 from ..landscapes.plain import digest
 from ..landscapes.storage.files import is_full, make_folder, other_files, replacing, tidy, write_json
 from ..landscapes.storage.records import read_json, reading, write_record
-from ..landscapes.verification import RESAMPLE, verify_dataset
+from ..landscapes.verification import LAST_PLACE, RESAMPLE, verify_dataset
 from .features import features_of, features_work
 from .folder import REPORT, REPORTS, ROOT, SLICE_FILE, SLICE_STORE, folder_named, store_in
 from .plan import simulation_seconds
@@ -273,14 +273,14 @@ def report_work(env: Environment, shape: tuple[int, ...], points: int) -> Work:
 
 def measure(env: Environment, dataset: xr.Dataset, points: int, seed: int, watch: Watch) -> Profile:
     """Announce what measuring a slice of an environment costs, and measure it."""
-    from ..landscapes.measures.profile import PRECISION, effort, measure_profile
+    from ..landscapes.measures.profile import effort, measure_profile
 
     total = sum(effort(dataset["loss"].ndim, points, dataset["loss"].shape))
     _announce(env, dataset, points, watch)
     objective = BoxedObjective(env) if stored_identity(dataset).get("boxed") else env
     with watch.progress(total) as advance:
         counted = _Counted(objective, env.preferred_batch, advance)
-        rounding = PRECISION[env.fidelity.precision]
+        rounding = LAST_PLACE[env.fidelity.precision]
         found = measure_profile(counted, dataset, rounding=rounding, points=points, seed=seed, events=env.events)
         advance(total)
     return found

@@ -23,7 +23,7 @@ from ..lattice import count_gradients
 from ..objective import Evaluation, Objective, ObjectiveWrapper, evaluate
 from ..plane import Plane
 from ..space import ParameterSpace
-from ..statistics import CONFIDENCE, Estimate, clustered_share
+from ..statistics import UNKNOWN, Estimate, clustered_share, exactly, middle_95
 from .discontinuities import EVALUATIONS_PER_PAIR
 from .floor import Floor
 from .following import CHIEF, SCALES
@@ -267,7 +267,7 @@ def _dataset(plane: Plane, loss: Array, grad: Array, status: Array) -> xr.Datase
 
 def _alone(statistic: Any, samples: Array, **bounds: float) -> Estimate:
     """Return a measure without an interval, which the other slices give."""
-    return Estimate(statistic(samples), math.nan, math.nan)
+    return exactly(statistic(samples))
 
 
 def _measure(dataset: xr.Dataset, verdict: Verdict, surface: Surface) -> Array:
@@ -518,8 +518,8 @@ def spread(values: Array, drawn: NDArray[np.int64]) -> Spread:
     """Return how the values of a measure are distributed, NaN left out."""
     known = np.isfinite(values)
     if not known.any():
-        return Spread((np.nan,) * len(QUANTILES), Estimate(np.nan, np.nan, np.nan))
-    middle = Estimate(float(np.median(values[known])), *_interval(_medians(values[known], drawn[:, known])))
+        return Spread((np.nan,) * len(QUANTILES), UNKNOWN)
+    middle = middle_95(float(np.median(values[known])), _medians(values[known], drawn[:, known]))
     return Spread(tuple(float(one) for one in np.quantile(values[known], QUANTILES)), middle)
 
 
@@ -531,12 +531,6 @@ def _medians(values: Array, drawn: NDArray[np.int64]) -> Array:
     last = upto[:, -1:] - 1
     below, above = (values[order][(upto <= at).sum(axis=1)] for at in (last // 2, (last + 1) // 2))
     return np.asarray((below + above) / 2)
-
-
-def _interval(found: Array) -> tuple[float, float]:
-    tail = (1 - CONFIDENCE) / 2
-    low, high = np.quantile(found, [tail, 1 - tail])
-    return float(low), float(high)
 
 
 def divide(

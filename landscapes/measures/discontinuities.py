@@ -31,8 +31,8 @@ from torch import Tensor
 from ..identity import plane_of
 from ..objective import Objective, evaluate
 from ..plane import Plane
-from ..statistics import Estimate, Values, share, upper_bound
-from .ruggedness import box_slopes, span
+from ..statistics import UNKNOWN, Estimate, Values, share, upper_bound
+from .ruggedness import lines_along, losses_of, span, step_slopes
 
 LEAST = 0.01  # of the slice's range, from which on a difference is a jump
 HALVINGS = 12  # a gap between samples is looked into down to 1/4096 of it
@@ -87,7 +87,7 @@ class Jumps:
     def share(self) -> Estimate:
         """Share of the lines that cross a jump; drawn lines that are neither hit nor clear may or may not."""
         if not self.lines:
-            return Estimate(math.nan, math.nan, math.nan)
+            return UNKNOWN
         others, most = self.lines - self.settled, self.drawn - self.clear
         if self.drawn == others:  # no chance is left
             rest = Estimate(self.hit, self.hit, most)
@@ -184,12 +184,11 @@ class _Search:
     """
 
     def __init__(self, dataset: xr.Dataset, floor: float, most: int, seed: int) -> None:
-        loss = dataset["loss"].transpose("v", "u", missing_dims="ignore").to_numpy()
+        loss = losses_of(dataset)
         self.plane, self.range, self.most = plane_of(dataset), float(np.nan_to_num(span(loss))), most
         self.least = max(float(floor), LEAST * self.range)
         self.generator = np.random.default_rng(seed)
-        slopes = box_slopes(dataset) / (np.array(self.plane.resolution) - 1) if "grad" in dataset else None
-        self._find_traces(loss, slopes)
+        self._find_traces(loss, step_slopes(dataset) if "grad" in dataset else None)
         self.low, self.high = self.ends[:, 0].copy(), self.ends[:, 1].copy()
         self.state, self.height = np.full(len(self.line), UNSEEN, np.int8), np.zeros(len(self.line))
         self.open = self.drawn = np.zeros(0, np.intp)
@@ -200,8 +199,8 @@ class _Search:
         places = np.stack(np.meshgrid(*axes[::-1], indexing="ij")[::-1], axis=-1)
         found, self.lines = list[tuple[Values, Values, Values, NDArray[np.intp]]](), 0
         for axis in range(loss.ndim):
-            rows, at = (_lines(values, axis, loss.ndim) for values in (loss, places))
-            slope = None if slopes is None else _lines(slopes[..., loss.ndim - 1 - axis], axis, loss.ndim)
+            rows, at = (lines_along(values, axis, loss.ndim) for values in (loss, places))
+            slope = None if slopes is None else lines_along(slopes[..., axis], axis)
             difference = np.diff(rows, axis=1)
             trend = _trend(difference, slope)
             trace = np.abs(difference - trend)
@@ -275,12 +274,6 @@ class _Search:
             undecided=int((self.state == FAILED).sum()),
             evaluations=self.evaluations,
         )
-
-
-def _lines(values: Values, axis: int, rank: int) -> Values:
-    """Return values of samples as lines along an axis, shape (line, sample, ...)."""
-    moved = np.moveaxis(values, axis, rank - 1)
-    return moved.reshape(-1, *moved.shape[rank - 1 :])
 
 
 def _trend(difference: Float[Values, "line step"], slope: Float[Values, "line sample"] | None) -> Values:

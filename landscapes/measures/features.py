@@ -16,7 +16,7 @@ from torch import Tensor
 from ..capacity import Need
 from ..objective import Evaluation, Objective, evaluate
 from ..space import sobol
-from ..statistics import RESAMPLES, Estimate, middle_95
+from ..statistics import RESAMPLES, UNKNOWN, Estimate, middle_95
 from .exploratory import GROUPS, MAX_COEFFICIENTS, MAX_POINTS, Array, Exploratory, MetaModels
 from .polynomials import GradientModel, degrees_of, fit_with_gradients
 
@@ -201,8 +201,7 @@ def active_subspace(slopes: Array, names: Sequence[str], rng: np.random.Generato
     tables = np.stack([slopes[blocks == one].T @ slopes[blocks == one] for one in range(blocks.max() + 1)])
     sizes, vectors = np.linalg.eigh(tables.sum(axis=0))
     if sizes[-1] <= 0:
-        none = Estimate(math.nan, math.nan, math.nan)
-        return ActiveSubspace(len(slopes), (), none, none, {})
+        return ActiveSubspace(len(slopes), (), UNKNOWN, UNKNOWN, {})
     times = rng.multinomial(len(tables), np.full(len(tables), 1 / len(tables)), size=RESAMPLES)
     drawn = [_spectrum(np.linalg.eigvalsh(np.tensordot(one, tables, 1))) for one in times.astype(float)]
     share, participation, directions = _spectrum(sizes)
@@ -253,7 +252,7 @@ def sobol_indices(
     there = np.isfinite(base) & np.isfinite(far) & np.isfinite(varied).all(axis=1)
     base, far, varied = base[there], far[there], varied[there]
     first, total, bound = (dict[str, Estimate]() for _ in range(3))
-    interaction = Estimate(math.nan, math.nan, math.nan)
+    interaction = UNKNOWN
     if len(base) > 1 and np.ptp(base):
         rows = rng.integers(len(base), size=(RESAMPLES, len(base)))
         drawn = [_indices(base[one], far[one], varied[one]) for one in rows]

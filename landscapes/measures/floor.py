@@ -16,7 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..objective import Evaluation, Objective, evaluate
-from ..statistics import CONFIDENCE, Estimate, Values, gradient_error
+from ..statistics import CONFIDENCE, UNKNOWN, Estimate, Values, exactly, gradient_error, middle_95
 
 MIN_POINTS = 4  # that an interval needs
 RESAMPLES = 999  # of the bootstrap
@@ -155,18 +155,17 @@ def _pooled_deviation(apart: Values, freedom: int) -> Estimate:
     holds more often than a bootstrap where points are few and unequal.
     """
     if not len(apart):
-        return Estimate(math.nan, math.nan, math.nan)
+        return UNKNOWN
     variances = apart**2
     whole = float(variances.mean())
     if len(apart) < MIN_POINTS:
-        return Estimate(math.sqrt(whole), math.nan, math.nan)
+        return exactly(math.sqrt(whole))
     if whole == 0:
         return Estimate(0.0, 0.0, 0.0)
     from scipy.special import chdtri
 
     most, spread = float(freedom * len(apart)), float(variances.var(ddof=1))
-    held = min(most, 2 * whole**2 * len(apart) / spread) if spread else most
-    held = max(1.0, held)
+    held = max(1.0, min(most, 2 * whole**2 * len(apart) / spread) if spread else most)
     tails = ((1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2)
     low, high = (math.sqrt(whole * held / float(chdtri(held, tail))) for tail in tails)
     return Estimate(math.sqrt(whole), low, high)
@@ -188,11 +187,9 @@ def _cosine(
     cosines = np.stack([replica_cosines(own, found, sides) for found in replicas.values()], axis=1)
     cosines = cosines[np.isfinite(cosines).any(axis=1)]
     if not len(cosines):
-        return Estimate(math.nan, math.nan, math.nan)
+        return UNKNOWN
     value = float(np.nanmedian(cosines))
     if len(cosines) < MIN_POINTS:
-        return Estimate(value, math.nan, math.nan)
+        return exactly(value)
     rows = np.random.default_rng(seed).integers(len(cosines), size=(RESAMPLES, len(cosines)))
-    again = np.nanmedian(cosines[rows].reshape(RESAMPLES, -1), axis=1)
-    low, high = np.quantile(again, ((1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2))
-    return Estimate(value, float(low), float(high))
+    return middle_95(value, np.nanmedian(cosines[rows].reshape(RESAMPLES, -1), axis=1))

@@ -20,7 +20,7 @@ from ..identity import plane_of
 from ..objective import Objective, evaluate
 from ..plane import Plane
 from ..statistics import Estimate, Values, mean, share, student
-from .ruggedness import box_slopes
+from .ruggedness import box_slopes, losses_of
 
 SCALES = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1)
 STRIDES = (1, 2, 4)  # of the slice's own samples
@@ -124,7 +124,7 @@ def compare_samples(dataset: xr.Dataset, *, deviation: float = 0.0) -> xr.Datase
     close to the border for a central difference have none.
     """
     plane = plane_of(dataset)
-    loss = dataset["loss"].transpose("v", "u", missing_dims="ignore").to_numpy()
+    loss = losses_of(dataset)
     strides = [stride for stride in STRIDES if 2 * stride < min(loss.shape)]
     parts = []
     for stride in strides:

@@ -29,7 +29,6 @@ from .surface import EVALUATIONS_PER_PLACE, PLACES, WAY_POINTS, WAYS
 from .undersampled import Undersampled, find_undersampled, probes
 from .verdict import POINTS, RANGE_POINTS, Verdict, judge, judge_samples, least_difference, measure_range
 
-PRECISION = {"float32": 2.0**-23, "float64": 2.0**-52}  # relative, of an engine that computes in it
 NOISE_POINTS, REPEATS, PAIRS = 16, 4, 12
 SECONDS, BYTES = (1.0, 4e-5), (80_000_000, 300)  # that a slice takes, and each of its samples (2026-11, one core)
 PAIRS_PER_POINT = 8  # pairs of samples that are looked into, for each point of a side of the subgrid
@@ -176,7 +175,7 @@ def measure_profile(
 ) -> Profile:
     """Measure a slice, with new evaluations of its objective at points x points places of it and at random ones.
 
-    `rounding` is the engine's relative precision: `PRECISION` has that of float32 and of float64. `events` counts what
+    `rounding` is the engine's relative precision: `LAST_PLACE` has that of float32 and of float64. `events` counts what
     happens in episodes, which explains jumps. The numerical floor is the slice's own, or else measured now. Where
     neighbours or their gradients are compared it does not count, but noise alone: their numerics are the same.
     """

@@ -36,7 +36,7 @@ from ..lattice import has_all_gradients, lift_between
 from ..objective import Objective, Status, evaluate
 from ..plane import Plane
 from ..statistics import Estimate, Values, share
-from .ruggedness import box_slopes, half_step, span
+from .ruggedness import half_step, losses_of, span, step_slopes
 
 ATTRIBUTE = "unresolved"  # the attribute of a slice that holds its record
 COST = {True: 5, False: 10}  # samples of a slice, with or without gradients, that cost ten times as much as a loss
@@ -100,7 +100,7 @@ def find_undersampled(
     so that any difference beyond rounding counts.
     """
     unit, dataset = unit_of(dataset["loss"].to_numpy()), in_unit(dataset)
-    loss = dataset["loss"].transpose("v", "u", missing_dims="ignore").to_numpy()
+    loss = losses_of(dataset)
     slope = _step_slopes(dataset, loss)
     least = _least(loss, floor / unit)
     strata = _strata(loss, slope, least)
@@ -162,7 +162,7 @@ def contradicted_cells(dataset: xr.Dataset) -> NDArray[np.bool_]:
     says on, and without a record from half a step of a ramp through the range.
     """
     known, unit, dataset = Undersampled.of(dataset), unit_of(dataset["loss"].to_numpy()), in_unit(dataset)
-    loss = dataset["loss"].transpose("v", "u", missing_dims="ignore").to_numpy()
+    loss = losses_of(dataset)
     least = known.least / unit if known and math.isfinite(known.least) else _least(loss, 0.0)
     found = np.zeros([points - 1 for points in loss.shape], dtype=bool)
     found[tuple(_strata(loss, _step_slopes(dataset, loss), least)[CONTRADICTED].T)] = True
@@ -180,8 +180,7 @@ def _step_slopes(dataset: xr.Dataset, loss: Values) -> Values:
     """Return the derivatives by a step from sample to sample along each axis of the array, axis last."""
     if not has_all_gradients(dataset):
         return np.stack([np.gradient(loss, axis=axis) for axis in range(loss.ndim)], axis=-1)
-    slopes: Values = (box_slopes(dataset) / (np.array(plane_of(dataset).resolution) - 1))[..., ::-1]
-    return np.clip(slopes, -LARGE, LARGE)  # no loss continues like that, and sums of them are numbers
+    return np.clip(step_slopes(dataset), -LARGE, LARGE)  # no loss continues like that, and sums of them are numbers
 
 
 def _strata(loss: Values, slope: Values, least: float) -> dict[str, Cells]:

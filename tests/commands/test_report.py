@@ -17,8 +17,7 @@ from gradscape.jobs.report import PaperWords, Report, environments_markdown
 from gradscape.landscapes.convert import from_json
 from gradscape.landscapes.measures.discontinuities import Jump, Jumps
 from gradscape.landscapes.measures.following import Following, ScaleCosine
-from gradscape.landscapes.measures.slice_comparison import exactly
-from gradscape.landscapes.statistics import Estimate
+from gradscape.landscapes.statistics import Estimate, exactly
 from gradscape.landscapes.storage.records import read_json, write_record
 
 from ..command import Run, make

@@ -26,7 +26,7 @@ def test_the_logistic_map_diverges_by_ln_2_a_step() -> None:
             state, done = 4 * state * (1 - state), done + 1
         norm.append(torch.autograd.grad(state.sum(), start, retain_graph=True)[0].abs().numpy())
     found = measure_growth(steps.astype(float), np.array(norm))
-    assert found.is_exponential
+    assert found.shape is Shape.EXPONENTIAL
     assert found.rate.low <= math.log(2) <= found.rate.high
     assert found.rate.value == pytest.approx(math.log(2), abs=0.02)
     assert "exp(0.69" in found.describe()
@@ -36,7 +36,7 @@ def test_the_logistic_map_diverges_by_ln_2_a_step() -> None:
 def test_a_linear_motion_grows_by_its_own_rate(rate: float) -> None:
     scale = np.linspace(1, 5, 16)
     found = measure_growth(TIME, np.exp(rate * TIME)[:, None] * scale)
-    assert found.is_exponential
+    assert found.shape is Shape.EXPONENTIAL
     assert found.rate.value == pytest.approx(rate)
     assert (found.known, found.points) == (16, 16)
     assert found.norm[0] == pytest.approx(3 * math.exp(0.4 * rate))
@@ -46,7 +46,7 @@ def test_a_linear_motion_grows_by_its_own_rate(rate: float) -> None:
 def test_a_flight_grows_by_a_power_of_time_and_does_not_diverge(power: float) -> None:
     noise = np.exp(0.01 * np.random.default_rng(0).standard_normal((5, 16)))
     found = measure_growth(TIME, TIME[:, None] ** power * noise)
-    assert not found.is_exponential
+    assert found.shape is not Shape.EXPONENTIAL
     assert found.power.value == pytest.approx(power, abs=0.05)
     assert f"t^{power:.2g}" in found.describe()
 
@@ -80,7 +80,7 @@ def test_a_linear_oscillation_is_not_called_exponential_however_many_points_swin
         assert found[Shape.EXPONENTIAL] <= 0.05 * 300
         assert found[Shape.UNDECIDED] + found[Shape.BOUNDED] > 150
     whole = np.abs(np.cos(np.array([1.47, 1.3, 1.1, 0.9, 0.6])))[:, None] * np.ones(16)  # a quarter of a swing, rising
-    assert not measure_growth(TIME, whole).is_exponential
+    assert measure_growth(TIME, whole).shape is not Shape.EXPONENTIAL
 
 
 def test_growth_that_ends_is_bounded() -> None:
