@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -48,17 +49,6 @@ class Task:
     piece: str
     number: int
     other: bool
-
-
-@dataclass(frozen=True)
-class _Judging:
-    """Hold what `survey` samples and judges every slice of a census with, by its names."""
-
-    deviation: float
-    own_range: float | None
-    floor: Floor | None
-    seed: int
-    gradients: int
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -167,11 +157,16 @@ class CensusJob(CheckpointedJob["Census"]):
 
     def compute(self, watch: Watch) -> Census:
         """Survey what is missing, and return the census."""
+        from ..landscapes.measures.census import survey
+
         (deviation, own_range), replicas = self._scales(watch), self._replicas(watch)
         self._announce(watch)
         floor = self._floor(replicas, None) if replicas else None
-        judging = _Judging(deviation, own_range, floor, self.seed, self.design.gradients)
-        return self._conclude(self._survey(judging, watch), replicas)
+        judge = partial(
+            survey, deviation=deviation, own_range=own_range, floor=floor, seed=self.seed,
+            gradients=self.design.gradients,
+        )  # fmt: skip
+        return self._conclude(self._survey(judge, watch), replicas)
 
     def write(self, found: Census) -> list[str]:
         """Draw and write the census, the losses in a file of their own."""
@@ -251,20 +246,20 @@ class CensusJob(CheckpointedJob["Census"]):
             seconds = len(left) * (each + MEASURING_SECONDS) + PICTURE_SECONDS
             watch.announce(f"about {duration(seconds)} here; {lower} change it", seconds)
 
-    def _survey(self, judging: _Judging, watch: Watch) -> dict[str, SurveyedSlice]:
+    def _survey(self, judge: Survey, watch: Watch) -> dict[str, SurveyedSlice]:
         from ..landscapes.measures.census import SurveyedSlice
 
         left = self.left()
         with watch.progress(len(self.tasks), "slices") as advance:
             done = len(self.tasks) - len(left)
             advance(done)
-            for piece, arrays in self._do(left, judging):
+            for piece, arrays in self._do(left, judge):
                 self.checkpoint.save(piece, **arrays)
                 advance(done := done + 1)
         pieces = {task.piece: self.checkpoint.load(task.piece) for task in self.tasks}
         return {name: SurveyedSlice.of_arrays(arrays) for name, arrays in pieces.items() if arrays is not None}
 
-    def _do(self, tasks: Sequence[Task], judging: _Judging) -> Iterator[tuple[str, Mapping[str, Any]]]:
+    def _do(self, tasks: Sequence[Task], judge: Survey) -> Iterator[tuple[str, Mapping[str, Any]]]:
         """Survey slices, here or by workers, so many abreast as fill a batch, and yield what each one's piece holds."""
         workers = workers_of(self.executor) if self.executor else 1
         for other in (False, True):
@@ -277,10 +272,10 @@ class CensusJob(CheckpointedJob["Census"]):
             groups = [todo[start : start + size] for start in range(0, len(todo), size)]
             if self.executor is None:
                 for group in groups:
-                    yield from _survey(env, group, judging)
+                    yield from _survey(env, group, judge)
                 continue
             sent = PortableObjective.of(env, recipe(env))
-            for found in run_tasks(self.executor, _survey_there, [(sent, group, judging) for group in groups]):
+            for found in run_tasks(self.executor, _survey_there, [(sent, group, judge) for group in groups]):
                 yield from found
 
     def _conclude(self, found: Mapping[str, SurveyedSlice], replicas: Mapping[str, Evaluation]) -> Census:
@@ -319,6 +314,7 @@ def open_census(folder: Path) -> Census:
 
 
 Piece = tuple[str, dict[str, Any]]  # its name, and what it holds
+Survey = Callable[[Any, Sequence[Any]], Sequence[Any]]  # `measures.census.survey` with all that it judges by
 
 
 def _abreast(env: Environment) -> int:
@@ -328,14 +324,12 @@ def _abreast(env: Environment) -> int:
     return -(-env.preferred_batch // STEEP)
 
 
-def _survey(env: Any, group: Sequence[tuple[str, Plane]], judging: _Judging) -> list[Piece]:
+def _survey(env: Any, group: Sequence[tuple[str, Plane]], judge: Survey) -> list[Piece]:
     """Survey slices, their points simulated in one batch, and return what their pieces hold."""
-    from ..landscapes.measures.census import survey
-
-    found = survey(MemoryBound(env), [plane for _, plane in group], **vars(judging))
+    found = judge(MemoryBound(env), [plane for _, plane in group])
     return [(piece, one.arrays()) for (piece, _), one in zip(group, found, strict=True)]
 
 
-def _survey_there(sent: PortableObjective, group: Sequence[tuple[str, Plane]], judging: _Judging) -> list[Piece]:
+def _survey_there(sent: PortableObjective, group: Sequence[tuple[str, Plane]], judge: Survey) -> list[Piece]:
     """Survey slices on a worker, which keeps the environment that it has made."""
-    return _survey(sent.objective.objective, group, judging)
+    return _survey(sent.objective.objective, group, judge)

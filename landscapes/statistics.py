@@ -180,6 +180,11 @@ def middle_95(value: float, drawn: ArrayLike) -> Estimate:
     return Estimate(value, float(low), float(high))
 
 
+def ratio(value: float, whole: float) -> float:
+    """Return a ratio; nothing is 0 of any whole, and of a whole of 0 nothing else has a share."""
+    return value / whole if whole > 0 else 0.0 if value == 0 else math.nan
+
+
 def gradient_error(grad: Values, reference: Values) -> tuple[Values, Values]:
     """Return cosine and relative error of each gradient, shapes (point,); two that are exactly zero agree."""
     sizes = np.linalg.norm(grad, axis=-1), np.linalg.norm(reference, axis=-1)

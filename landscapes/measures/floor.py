@@ -16,7 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..objective import Evaluation, Objective, evaluate
-from ..statistics import CONFIDENCE, UNKNOWN, Estimate, Values, exactly, gradient_error, middle_95
+from ..statistics import CONFIDENCE, UNKNOWN, Estimate, Values, exactly, gradient_error, middle_95, ratio
 
 MIN_POINTS = 4  # that an interval needs
 RESAMPLES = 999  # of the bootstrap
@@ -126,7 +126,7 @@ def floor_between(
         known = own.loss[own.has_loss]
         range = float(known.max() - known.min()) if len(known) else math.nan
     spread = _pooled_deviation(apart, len(replicas))
-    share = Estimate(*(_ratio(end, range) for end in (spread.value, spread.low, spread.high)))
+    share = Estimate(*(ratio(end, range) for end in (spread.value, spread.low, spread.high)))
     failed = len(own.loss) - len(apart)
     cosine = _cosine(own, replicas, sides, seed)
     return Floor(tuple(replicas), len(apart), failed, spread.value, range, share, cosine)
@@ -169,13 +169,6 @@ def _pooled_deviation(apart: Values, freedom: int) -> Estimate:
     tails = ((1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2)
     low, high = (math.sqrt(whole * held / float(chdtri(held, tail))) for tail in tails)
     return Estimate(math.sqrt(whole), low, high)
-
-
-def _ratio(value: float, whole: float) -> float:
-    """Return a ratio; nothing is 0 of any range, and of a range of 0 nothing else has a share."""
-    if value == 0:
-        return 0.0
-    return value / whole if whole > 0 else math.nan
 
 
 def _cosine(

@@ -27,7 +27,7 @@ from .ruggedness import Ruggedness, ruggedness
 from .slice_floor import counted_from, find_floor, floor_of, split_effort
 from .surface import EVALUATIONS_PER_PLACE, PLACES, WAY_POINTS, WAYS
 from .undersampled import Undersampled, find_undersampled, probes
-from .verdict import POINTS, RANGE_POINTS, Verdict, judge, judge_samples, least_difference, measure_range
+from .verdict import POINTS, RANGE_POINTS, Verdict, judge, least_difference, measure_range
 
 NOISE_POINTS, REPEATS, PAIRS = 16, 4, 12
 SECONDS, BYTES = (1.0, 4e-5), (80_000_000, 300)  # that a slice takes, and each of its samples (2026-11, one core)
@@ -50,10 +50,10 @@ class Profile:
     floor. No measure of losses counts what is below `losses.floor`, which is that of noise or that of numerics,
     whichever is larger. `noise` is None where it is not known.
 
-    `differences`, `differences_of_samples` and `smoothing` sum up `quality`, which is drawn; of samples alone there are
-    but those in the middle. `beyond_the_box` counts the probes that the objective does not allow. `undersampled` says
-    what the samples hide, None where that is not known; `errors` says how many of them raised and what the first of
-    them said. `growth` is that of gradients with the length of episodes, None where it was not measured.
+    `differences`, `differences_of_samples` and `smoothing` sum up `quality`, which is drawn. `beyond_the_box` counts
+    the probes that the objective does not allow. `undersampled` says what the samples hide, None where that is not
+    known; `errors` says how many of them raised and what the first of them said. `growth` is that of gradients with the
+    length of episodes, None where it was not measured.
     """
 
     losses: Ruggedness
@@ -189,63 +189,30 @@ def measure_profile(
     deviation = float(np.nan_to_num(fuzz.deviation))
     steps = gradients.compare_differences(objective, plane, places, deviation=deviation)
     smooth = gradients.smoothed_slopes(objective, plane, places, pairs=PAIRS, seed=seed)
+    whole, pairs = measure_range(objective, seed=seed), PAIRS_PER_POINT * points
     (verdict,) = judge(
-        objective,
-        [dataset],
-        deviation=deviation,
-        floor=numerics,
-        own_range=measure_range(objective, seed=seed),
-        pairs=PAIRS_PER_POINT * points,
-        smoothed=0,  # which they are here, over several widths
-        seed=seed,
-        events=events,
-    )
-    widths, near = gradients.width_table(smooth), gradients.compare_samples(dataset, deviation=deviation)
-    found = _profile(dataset, fuzz, with_bias(verdict, widths), deviation, near)
-    floor = found.losses.floor
+        objective, [dataset], deviation=deviation, floor=numerics, own_range=whole,
+        pairs=pairs, smoothed=0, seed=seed, events=events,
+    )  # fmt: skip
+    near, widths = gradients.compare_samples(dataset, deviation=deviation), gradients.width_table(smooth)
+    floor, repeats = (least_difference(dataset, deviation, one) for one in (numerics, None))
     between = Undersampled.of(dataset) or find_undersampled(objective, dataset, floor=floor, seed=seed)
-    return replace(
-        found,
+    return Profile(
+        losses=ruggedness(dataset, floor=floor, noise=repeats),
+        noise=fuzz,
+        verdict=_with_bias(verdict, widths),
         differences=gradients.scale_table(steps),
+        differences_of_samples=gradients.scale_table(near),
         smoothing=widths,
         beyond_the_box=OutsideBounds(objective.asked, objective.cut),
         undersampled=between,
+        errors=errors_of(dataset),
         quality=gradients.GradientQuality(steps, near, smooth),
     )
 
 
-def profile_samples(dataset: xr.Dataset, *, noise: Noise | None = None, floor: Floor | None = None) -> Profile:
-    """Measure a slice from its samples alone, where its function is not at hand.
-
-    Jumps are not searched, gradients are compared at the scales that the samples allow, and `noise` is what was
-    measured before; None for none. `floor` is by default the slice's own.
-    """
-    known = None if noise is None else float(np.nan_to_num(noise.deviation))
-    verdict, deviation = judge_samples(dataset, deviation=known, floor=floor or floor_of(dataset)), known or 0.0
-    near = gradients.compare_samples(dataset, deviation=deviation) if "grad" in dataset else None
-    return _profile(dataset, noise, verdict, deviation, near)
-
-
-def _profile(
-    dataset: xr.Dataset, fuzz: Noise | None, verdict: Verdict, deviation: float, near: xr.Dataset | None
-) -> Profile:
-    """Measure what takes the samples alone; `near` is what `compare_samples` says of their gradients."""
-    floors = [least_difference(dataset, deviation, numerics) for numerics in (verdict.floor, None)]
-    return Profile(
-        losses=ruggedness(dataset, floor=floors[0], noise=floors[1]),
-        noise=fuzz,
-        verdict=verdict,
-        differences=(),
-        differences_of_samples=() if near is None else gradients.scale_table(near),
-        smoothing=(),
-        beyond_the_box=OutsideBounds(0, 0),
-        undersampled=Undersampled.of(dataset),
-        errors=errors_of(dataset),
-    )
-
-
-def with_bias(verdict: Verdict, widths: Sequence[gradients.WidthRow]) -> Verdict:
-    """Return a verdict that knows where the mean of gradients is biased, of the width that its words are by."""
+def _with_bias(verdict: Verdict, widths: Sequence[gradients.WidthRow]) -> Verdict:
+    """Return a verdict that knows where the mean of gradients is biased, of those widths the one of its words."""
     biased = next((row.biased for row in widths if row.width == WIDTH), None)
     if verdict.following is None or biased is None:
         return verdict

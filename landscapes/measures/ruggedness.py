@@ -171,7 +171,7 @@ def information_content(loss: Values) -> tuple[float, float]:
     if len(places) < 3 or not whole > 0:
         return math.nan, math.nan
     some = places[np.random.default_rng(0).permutation(len(places))[:WALKED]]
-    entropy, _ = walk_information(whole * distances_of(some / _sides(loss.shape)), loss[tuple(some.T)])
+    entropy, _ = walk_information(distances_of(some / _sides(loss.shape)), loss[tuple(some.T)], whole)
     settled = SIZES[(entropy < SETTLED) & (SIZES > 0)]
     return float(entropy.max()), math.log10(settled[0])
 

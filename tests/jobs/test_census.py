@@ -4,8 +4,8 @@ import json
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ from gradscape.jobs import census as module
 from gradscape.jobs.census import CensusJob, open_census
 from gradscape.jobs.scene import SceneSpec
 from gradscape.landscapes.convert import to_json
-from gradscape.landscapes.measures.census import MEASURES, CensusDesign
+from gradscape.landscapes.measures.census import MEASURES, CensusDesign, survey
 from gradscape.landscapes.objective import Evaluation
 from gradscape.landscapes.storage.records import read_json
 
@@ -142,7 +142,7 @@ def test_slices_surveyed_abreast_are_those_surveyed_alone_in_fewer_batches(monke
     env, asked = scene.make(), list[int]()
     design = CensusDesign.draw(env.space, 4, along="pairs", resolution=8, seed=0)
     group = [(f"slice-{number}", design.plane(*place)) for number, place in enumerate(design.places)]
-    how = module._Judging(deviation=0.0, own_range=None, floor=None, seed=0, gradients=2)
+    how = partial(survey, deviation=0.0, seed=0, gradients=2)
     alone = [module._survey(env, [one], how)[0] for one in group]
     evaluate = type(env).evaluate
 
@@ -169,4 +169,4 @@ def test_what_a_slice_raises_ends_all_of_its_group() -> None:
     design = CensusDesign.draw(env.space, 4, along="pairs", resolution=8, seed=0)
     group = [(f"slice-{number}", design.plane(*place)) for number, place in enumerate(design.places)]
     with pytest.raises(TypeError, match="deviation"):
-        module._survey(env, group, SimpleNamespace(seed=0))
+        module._survey(env, group, partial(survey, seed=0))
