@@ -13,13 +13,11 @@ import numpy as np
 import torch
 
 from ..landscapes.capacity import Need, require
-from ..landscapes.convert import from_json
 from ..landscapes.cost import PICTURE_SECONDS, duration
 from ..landscapes.objective import Evaluation, evaluate
 from ..landscapes.sampling.distribution import PortableObjective, run_tasks, workers_of
 from ..landscapes.sampling.memory import MemoryBound
 from ..landscapes.storage.files import replacing
-from ..landscapes.storage.records import read_json, reading
 from ..landscapes.verification import LAST_PLACE
 from .folder import CENSUS, ROOT, folder_named
 from .job import CheckpointedJob
@@ -300,17 +298,6 @@ class CensusJob(CheckpointedJob["Census"]):
             command=self.command,
             floor=self._floor(replicas, median_range) if replicas else None,
         )
-
-
-def open_census(folder: Path) -> Census:
-    """Read the census in a folder. Raises DamagedError where it holds none that is whole."""
-    from ..landscapes.measures.census import Census
-
-    todo = "delete it, and `landscape census` continues from the slices that are kept"
-    with reading(folder / LOSSES, todo), np.load(folder / LOSSES, allow_pickle=False) as arrays:
-        losses = arrays["loss"]
-    with reading(folder / RECORD, todo):
-        return replace(from_json(Census, read_json(folder / RECORD)), losses=losses)
 
 
 Piece = tuple[str, dict[str, Any]]  # its name, and what it holds

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from itertools import combinations
 from typing import TYPE_CHECKING, Any
 
@@ -249,14 +249,9 @@ def thin_out(whole: xr.Dataset) -> xr.Dataset:
     """Return every second sample along each axis, as a slice of half the resolution would have them."""
     plane, thin = plane_of(whole), whole.isel(u=slice(None, None, 2), v=slice(None, None, 2))
     shape = thin.sizes["u"], thin.sizes["v"]
-    steps = [
-        (high - low) / (count - 1) for low, high, count in zip(plane.lower, plane.upper, plane.resolution, strict=True)
-    ]
-    ends = [low + 2 * step * (count - 1) for low, step, count in zip(plane.lower, steps, shape, strict=True)]
-    return _dataset(
-        Plane(plane.origin, plane.basis, plane.lower, torch.stack(ends), shape, plane.labels, plane.scales),
-        *(thin[name].to_numpy() for name in ("loss", "grad", "status")),
-    )
+    upper = torch.stack([axis[2 * (count - 1)] for axis, count in zip(plane.axes(), shape, strict=True)])
+    arrays = (thin[name].to_numpy() for name in ("loss", "grad", "status"))
+    return _dataset(replace(plane, upper=upper, resolution=shape), *arrays)
 
 
 def _dataset(plane: Plane, loss: Array, grad: Array, status: Array) -> xr.Dataset:

@@ -56,36 +56,13 @@ def format_cosine(cosine: float) -> str:
     return f"{cosine:z.2f}" if abs(cosine) < 0.995 else f"{cosine:z.3f}"
 
 
-def measure_floor(
-    objective: Objective,
-    x: Float[Tensor, "points dim"],
-    *,
-    evaluation: Evaluation | None = None,
-    range: float | None = None,
-    seed: int = 0,
-) -> Floor | None:
-    """Evaluate an objective's replicas at some points and measure how far apart they are; None where it has none.
-
-    `evaluation` is the objective's own there, if it is known; without gradients, replicas are evaluated without them.
-    `range` [loss unit] is by default that of its losses at the points.
-
-    Raises ValueError where a replica has another space, and what `evaluate` does.
-    """
-    if objective.device != "cpu":
-        objective.release()  # or else replicas would be made for what it leaves of a GPU's memory
-    replicas = objective.replicas()
-    if not replicas:
-        return None
-    own = evaluate(objective, x, grad=True) if evaluation is None else evaluation
-    found = evaluate_replicas(objective, x, replicas, grad=own.grad is not None)
-    sides = objective.space.upper - objective.space.lower
-    return floor_between(own, found, sides=sides, range=range, seed=seed)
-
-
 def evaluate_replicas(
     objective: Objective, x: Float[Tensor, "points dim"], replicas: Mapping[str, Objective], *, grad: bool
 ) -> dict[str, Evaluation]:
-    """Evaluate each replica of an objective at points, one at a time in memory. Raises what `measure_floor` does."""
+    """Evaluate each replica of an objective at points, one at a time in memory.
+
+    Raises ValueError where a replica has another space, and what `evaluate` does.
+    """
     found = {}
     objective.release()
     for name, replica in replicas.items():
@@ -114,8 +91,8 @@ def floor_between(
 ) -> Floor:
     """Measure how far apart evaluations of an objective and its replicas at the same points are.
 
-    `sides` are the widths of the box, by which gradients are scaled before their cosine is taken. `range` is as in
-    `measure_floor`. Raises ValueError where a replica was evaluated at another number of points.
+    `sides` are the widths of the box, by which gradients are scaled before their cosine is taken. `range` [loss unit]
+    is by default that of the losses. Raises ValueError where a replica was evaluated at another number of points.
     """
     for name, found in replicas.items():
         if len(found.loss) != len(own.loss):

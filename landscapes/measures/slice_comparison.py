@@ -146,10 +146,8 @@ class SliceComparison:
     def _numbers(self) -> list[tuple[str, Estimate, str]]:
         """Return each number with its name and unit."""
         names = {
-            "median": "median difference",
-            "p95": "difference, 95 % of the points",
-            "largest": "largest difference",
-        }
+            "median": "median difference", "p95": "difference, 95 % of the points", "largest": "largest difference",
+        }  # fmt: skip
         rows = [("loss in both", exactly(self.compared / self.points), POINTS)]
         rows += [(name, getattr(self.loss, field), self.loss_unit) for field, name in names.items()]
         shares = self.loss.shares

@@ -77,7 +77,7 @@ def find_floor(
     """Measure the numerical floor of a slice at a few of its samples; None where its objective has no replicas.
 
     The samples are those nearest to Sobol points; their own losses are the slice's. A replica is evaluated as what
-    `through` returns of it. Raises what `measure_floor` does.
+    `through` returns of it. Raises what `evaluate_replicas` does.
     """
     replicas = objective.replicas()
     if not replicas:

@@ -23,10 +23,10 @@ import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import cast
 
 import numpy as np
 import xarray as xr
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from ..convert import from_json, to_json
@@ -223,13 +223,12 @@ def _pairs(values: Values, axis: int) -> tuple[Values, Values]:
 
 def _of_cells(edges: Sequence[Values]) -> Values:
     """Return the largest value of the edges of each cell, NaN where one is."""
-    found: Values | None = None
+    rank, most = len(edges), list[Values]()
     for axis, values in enumerate(edges):
-        most = values
-        for other in range(values.ndim):
-            most = most if other == axis else np.maximum(*_pairs(most, other))
-        found = most if found is None else np.maximum(found, most)
-    return cast("Values", found)
+        windows = sliding_window_view(values, [1 if other == axis else 2 for other in range(rank)])
+        most.append(windows.max(axis=tuple(range(rank, 2 * rank))))
+    found: Values = np.maximum.reduce(most)
+    return found
 
 
 class _Look:

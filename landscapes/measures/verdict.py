@@ -21,7 +21,7 @@ from .floor import Floor
 from .following import FOLLOWING_WORDS, Following, follow_samples, measure_following
 from .noise import noise_floor
 from .ruggedness import span
-from .slice_floor import counted_from
+from .slice_floor import counted_from, floor_of
 from .surface import EXTREME, PLACES, RUGGED, SMOOTH, VERY_SMOOTH, Surface, look_between, measure_surface
 
 FAILS, FLAT, NOISY, LARGE_FLAT, DISCONTINUOUS = (
@@ -211,25 +211,22 @@ def _follow(
     objective: Objective, datasets: Sequence[xr.Dataset], *, deviation: float, points: int, smoothed: int, seed: int
 ) -> Sequence[Following | None]:
     """Measure how gradients follow on slices that have gradients, None for the others."""
-    found: list[Following | None] = [None] * len(datasets)
-    able = [number for number, one in enumerate(datasets) if "grad" in one]
-    if able:
-        planes = [plane_of(datasets[number]) for number in able]
-        ranges = [float(np.nan_to_num(span(datasets[number]["loss"].to_numpy()))) for number in able]
-        told = measure_following(
-            objective, planes, ranges=ranges, deviation=deviation, points=points, smoothed=smoothed, seed=seed
-        )
-        for number, one in zip(able, told, strict=True):
-            found[number] = one
-    return found
+    able = [one for one in datasets if "grad" in one]
+    if not able:
+        return [None] * len(datasets)
+    ranges = [float(np.nan_to_num(span(one["loss"].to_numpy()))) for one in able]
+    planes = [plane_of(one) for one in able]
+    told = measure_following(
+        objective, planes, ranges=ranges, deviation=deviation, points=points, smoothed=smoothed, seed=seed
+    )
+    found = iter(told)
+    return [next(found) if "grad" in one else None for one in datasets]
 
 
-def judge_samples(
-    dataset: xr.Dataset, *, deviation: float | None = None, floor: Floor | None = None, own_range: float | None = None
-) -> Verdict:
+def judge_samples(dataset: xr.Dataset, *, deviation: float | None = None) -> Verdict:
     """Judge a slice from its samples alone: jumps are not searched, gradients compared where samples are close."""
-    least = least_difference(dataset, deviation or 0.0, floor)
-    surface = measure_surface(dataset, floor=least, own_range=own_range)
+    floor = floor_of(dataset)
+    surface = measure_surface(dataset, floor=least_difference(dataset, deviation or 0.0, floor))
     following = follow_samples(dataset, deviation=float(np.nan_to_num(deviation or 0.0)), points=dataset["loss"].size)
     return _verdict(dataset, surface, None, following, deviation, floor)
 

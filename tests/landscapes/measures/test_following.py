@@ -100,7 +100,7 @@ SAID = {
     "plateau": (from_torch(lambda x: bowl(x).clamp(min=0.5), SPACE), "follow", "zero"),
     "flat": (from_torch(lambda x: 1 + 0 * x.sum(1), SPACE), "zero"),
     "a million times": (with_gradient(lambda x, slope: 1e6 * slope), "follow", "exploding"),
-    "steep": (from_torch(lambda x: torch.tanh(50 * x[:, 0]) + 0 * x[:, 1], SPACE), "follow"),
+    "steep": (from_torch(lambda x: torch.tanh(50 * x[:, 0]) + 0 * x[:, 1], SPACE), "zero"),
     "missing": (with_gradient(lambda x, slope: np.where(x[:, :1] > 0.2, np.nan, slope)), "missing"),
     "few are missing": (with_gradient(lambda x, slope: np.where(x[:, :1] > 0.98, np.nan, slope)), "follow"),
     "failed": (from_torch(lambda x: torch.where(x[:, 0] > 0.2, torch.nan, bowl(x)), SPACE), "follow"),
