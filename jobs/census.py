@@ -189,15 +189,15 @@ class CensusJob(CheckpointedJob["Census"]):
         from ..landscapes.measures.noise import noise
         from ..landscapes.measures.verdict import measure_range
 
-        if (kept := self.checkpoint.load("noise")) is None:
+        def measure() -> dict[str, float]:
             with watch.busy(f"{self.env.name}: {PREPARING}, then its noise"):
                 self.env.prepare()
                 x = self.env.space.uniform(NOISE_POINTS, seed=self.seed)
                 rounding = LAST_PLACE[self.env.fidelity.precision]
                 found = noise(self.env, x, rounding=rounding, repeats=REPEATS, seed=self.seed)
-                whole = measure_range(self.env, seed=self.seed)
-            kept = {"deviation": np.array(found.deviation), "range": np.array(whole)}
-            self.checkpoint.save("noise", **kept)
+                return {"deviation": found.deviation, "range": measure_range(self.env, seed=self.seed)}
+
+        kept = self.checkpoint.load_or_compute("noise", measure)
         return float(np.nan_to_num(kept["deviation"])), float(kept["range"])
 
     def _replicas(self, watch: Watch) -> dict[str, Evaluation]:

@@ -20,7 +20,7 @@ from ..convert import NOT_JSON
 from ..directions import orthonormal
 from ..identity import plane_of
 from ..lattice import count_gradients
-from ..objective import Evaluation, Objective, ObjectiveWrapper, evaluate
+from ..objective import Objective, evaluate
 from ..plane import Plane
 from ..space import ParameterSpace
 from ..statistics import UNKNOWN, Estimate, clustered_share, exactly, middle_95
@@ -29,7 +29,7 @@ from .floor import Floor
 from .following import CHIEF, SCALES
 from .ruggedness import ruggedness
 from .surface import EVALUATIONS_PER_PLACE, WAY_POINTS, WAYS, Surface, measure_surface
-from .verdict import FLAT, WORDS, Verdict, judge, least_difference
+from .verdict import FLAT, WORDS, CountedObjective, Verdict, judge, least_difference
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -188,7 +188,7 @@ def survey(
     `gradients`. Measures are those of a report, without their intervals within the slice: what counts here is how they
     differ from slice to slice. Jumps are looked for in at most `STEEP` pairs of samples of a slice.
     """
-    counted = _Counting(objective)
+    counted = CountedObjective(objective)
     wholes = sample_cuts(counted, planes, gradients=gradients)
     verdicts = judge(
         counted, wholes, deviation=deviation, floor=floor, own_range=own_range,
@@ -200,20 +200,9 @@ def survey(
         coarse = measure_surface(thin, floor=least_difference(thin, deviation, floor), own_range=own_range)
         measures, halved = _measure(whole, verdict, verdict.surface), _measure(thin, verdict, coarse)
         halved[MEASURES.index("jumps")] = math.nan
-        episodes = (counted.episodes + number) // len(planes)  # an even share, which add up to all
+        episodes = (counted.asked - counted.cut + number) // len(planes)  # an even share, which add up to all
         surveyed.append(SurveyedSlice(whole["loss"].to_numpy(), measures, halved, verdict.words, episodes))
     return surveyed
-
-
-class _Counting(ObjectiveWrapper):
-    """Evaluate an objective, and count its episodes."""
-
-    episodes = 0
-
-    def evaluate(self, x: Tensor, *, grad: bool = True) -> Evaluation:
-        """Return losses, and gradients if asked."""
-        self.episodes += len(x)
-        return self.objective.evaluate(x, grad=grad)
 
 
 def judging_effort() -> tuple[int, int]:

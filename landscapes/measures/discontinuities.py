@@ -156,21 +156,8 @@ def find_jumps(
     floors = [0.0] * len(datasets) if least is None else least
     slices = [_Search(*one, most, seed) for one in zip(datasets, floors, strict=True)]
     for choose in (_Search.strongest, _Search.draw):
-        chosen = [choose(one) for one in slices]
-        for one, pairs, seen in zip(slices, chosen, _look(objective, slices, chosen), strict=True):
-            one.learn(pairs, seen)
+        _look(objective, slices, [choose(one) for one in slices])
     return [one.conclude(events) for one in slices]
-
-
-@dataclass(frozen=True, eq=False)
-class _Look:
-    """Hold what became of pairs: the ends that are left of each, its state, its height and the losses evaluated."""
-
-    low: Values
-    high: Values
-    state: NDArray[np.int8]
-    height: Values
-    evaluations: int
 
 
 UNSEEN, FAILED, NO_JUMP, JUMP = range(4)  # what is known of a trace
@@ -244,12 +231,6 @@ class _Search:
         place[by_line] = np.arange(len(pairs)) - np.repeat(starts, np.diff(starts, append=len(pairs)))
         return pairs[np.sort(np.argsort(place, kind="stable")[:most])]
 
-    def learn(self, pairs: NDArray[np.intp], look: _Look) -> None:
-        """Keep what became of pairs."""
-        self.low[pairs], self.high[pairs] = look.low, look.high
-        self.state[pairs], self.height[pairs] = look.state, look.height
-        self.evaluations += look.evaluations
-
     def conclude(self, events: Count | None) -> Jumps:
         """Return the jumps that were found, and what is known of the lines."""
         found = np.flatnonzero(self.state == JUMP)
@@ -307,8 +288,11 @@ def _integrals(slope: Float[Values, "line sample"]) -> tuple[Values, Values]:
     return linear, (13 * (wide[:, 1:-2] + wide[:, 2:-1]) - wide[:, :-3] - wide[:, 3:]) / 24
 
 
-def _look(objective: Objective, slices: Sequence[_Search], chosen: Sequence[NDArray[np.intp]]) -> list[_Look]:
-    """Look into pairs of all slices, given by their numbers: bisect them, and compare both sides of what is left."""
+def _look(objective: Objective, slices: Sequence[_Search], chosen: Sequence[NDArray[np.intp]]) -> None:
+    """Look into pairs of all slices, given by their numbers: bisect them, and compare both sides of what is left.
+
+    What became of a pair is kept by its slice: its last ends, its state and its height.
+    """
     several = list(zip(slices, chosen, strict=True))
     owner = np.repeat(np.arange(len(slices)), [len(pairs) for pairs in chosen])
     asked = _Batch(objective, [one.plane for one in slices], owner)
@@ -323,9 +307,10 @@ def _look(objective: Objective, slices: Sequence[_Search], chosen: Sequence[NDAr
     within = np.ptp(around, axis=-1).max(axis=1)
     jump = open_ & ~failed & (height >= least) & (height > APART * within)
     state = np.where(failed, FAILED, np.where(jump, JUMP, NO_JUMP)).astype(np.int8)
-    of = [owner == number for number in range(len(slices))]
-    counts = asked.counts.tolist()
-    return [_Look(low[at], high[at], state[at], height[at], count) for at, count in zip(of, counts, strict=True)]
+    for number, (one, pairs) in enumerate(several):
+        at = owner == number
+        one.low[pairs], one.high[pairs], one.state[pairs], one.height[pairs] = low[at], high[at], state[at], height[at]
+        one.evaluations += int(asked.counts[number])
 
 
 def _bisect(

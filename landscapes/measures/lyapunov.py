@@ -81,8 +81,7 @@ class GradientGrowth:
             low, high = self.rate.low, self.rate.high
             return f"gradients grow like exp({self.rate.value:z.3g} t), t in s ({low:z.3g} to {high:z.3g}/s)"
         if self.shape is Shape.POWER:
-            low, high = self.power.low, self.power.high
-            return f"gradients grow like t^{self.power.value:z.2g} ({low:z.2g} to {high:z.2g}), not exponentially"
+            return f"gradients grow like t^{power}, not exponentially"
         if self.shape is Shape.BOUNDED:
             return f"gradients stay bounded; as a power of time their exponent is {power}"
         return f"cannot tell how gradients grow: as an exponential by {rate}/s, as a power of time by {power}"

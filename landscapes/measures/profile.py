@@ -9,13 +9,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import torch
 import xarray as xr
-from jaxtyping import Float
-from torch import Tensor
 
 from ..capacity import Need
 from ..convert import NOT_JSON
 from ..identity import errors_of, plane_of
-from ..objective import Evaluation, Objective, ObjectiveWrapper, evaluate, in_box
+from ..objective import Objective
 from ..statistics import Estimate, share
 from . import gradient_quality as gradients
 from .discontinuities import EVALUATIONS_PER_PAIR, Count, Jumps
@@ -27,7 +25,7 @@ from .ruggedness import Ruggedness, ruggedness
 from .slice_floor import counted_from, find_floor, floor_of, split_effort
 from .surface import EVALUATIONS_PER_PLACE, PLACES, WAY_POINTS, WAYS
 from .undersampled import Undersampled, find_undersampled, probes
-from .verdict import POINTS, RANGE_POINTS, Verdict, judge, least_difference, measure_range
+from .verdict import POINTS, RANGE_POINTS, CountedObjective, Verdict, judge, least_difference, measure_range
 
 NOISE_POINTS, REPEATS, PAIRS = 16, 4, 12
 SECONDS, BYTES = (1.0, 4e-5), (80_000_000, 300)  # that a slice takes, and each of its samples (2026-11, one core)
@@ -179,7 +177,7 @@ def measure_profile(
     happens in episodes, which explains jumps. The numerical floor is the slice's own, or else measured now. Where
     neighbours or their gradients are compared it does not count, but noise alone: their numerics are the same.
     """
-    plane, objective = plane_of(dataset), _Within(objective)
+    plane, objective = plane_of(dataset), CountedObjective(objective)
     generator = torch.Generator().manual_seed(seed)
     places = gradients.subgrid(plane, points if plane.rank == 2 else points**2)
     shares = torch.rand(NOISE_POINTS, plane.rank, generator=generator, dtype=torch.float64)
@@ -217,21 +215,6 @@ def _with_bias(verdict: Verdict, widths: Sequence[gradients.WidthRow]) -> Verdic
     if verdict.following is None or biased is None:
         return verdict
     return replace(verdict, following=replace(verdict.following, biased=biased))
-
-
-class _Within(ObjectiveWrapper):
-    """Evaluate an objective where it may be asked, and count the points where it may not."""
-
-    def __init__(self, objective: Objective) -> None:
-        super().__init__(objective)
-        self.beyond_box = True  # those are left out here
-        self.asked = self.cut = 0
-
-    def evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool = True) -> Evaluation:
-        self.asked += len(x)
-        if not self.objective.beyond_box:
-            self.cut += int((~in_box(self.space, x)).sum())
-        return evaluate(self.objective, x, grad=grad)
 
 
 def _shares(estimate: Estimate | None) -> str:

@@ -231,18 +231,20 @@ def _of_cells(edges: Sequence[Values]) -> Values:
     return found
 
 
+@dataclass
 class _Look:
     """Look into cells of a slice by new evaluations, and count them.
 
     An answer is 1 for a cell that is undersampled, 0 for one that is not, NaN where an evaluation failed.
     """
 
-    def __init__(
-        self, objective: Objective, plane: Plane, loss: Values, slope: Values, least: float, unit: float
-    ) -> None:
-        self.objective, self.plane, self.loss, self.slope, self.least = objective, plane, loss, slope, least
-        self.unit = unit  # of losses, slopes and `least`
-        self.episodes = 0
+    objective: Objective
+    plane: Plane
+    loss: Values
+    slope: Values
+    least: float
+    unit: float  # of losses, slopes and `least`
+    episodes: int = 0
 
     def ask(self, at: Values) -> Values:
         """Return the losses at places between samples, shape (count, rank), in steps along each axis of the array."""

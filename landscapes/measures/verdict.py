@@ -13,9 +13,11 @@ from typing import ClassVar
 
 import numpy as np
 import xarray as xr
+from jaxtyping import Float
+from torch import Tensor
 
 from ..identity import plane_of
-from ..objective import Objective, evaluate
+from ..objective import Evaluation, Objective, ObjectiveWrapper, evaluate, in_box
 from .discontinuities import Count, Jumps, find_jumps
 from .floor import Floor
 from .following import FOLLOWING_WORDS, Following, follow_samples, measure_following
@@ -168,6 +170,22 @@ class Verdict:
         if self.noise is None:
             return "noise not measured" if self.deviation is None else f"noise {self.deviation:.2g}"
         return f"95 % of repeats agree within {100 * self.noise:.2g} % of the range"
+
+
+class CountedObjective(ObjectiveWrapper):
+    """Evaluate an objective where it may be asked, and count all points and those where it may not, which are `cut`."""
+
+    def __init__(self, objective: Objective) -> None:
+        super().__init__(objective)
+        self.beyond_box = True  # those are left out here
+        self.asked = self.cut = 0
+
+    def evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool = True) -> Evaluation:
+        """Return losses, and gradients if asked."""
+        self.asked += len(x)
+        if not self.objective.beyond_box:
+            self.cut += int((~in_box(self.space, x)).sum())
+        return evaluate(self.objective, x, grad=grad)
 
 
 def _failed(failed: int, samples: int) -> str:

@@ -46,7 +46,7 @@ WIDE = ParameterSpace(("x", "y"), SPACE.lower, torch.tensor([1.0, 199.0]).double
         (bowl, lambda x: 3 * bowl(x), {}, 1.0, 1.0, 0.0, 3.0, 4.0),
         (bowl, lambda x: -bowl(x), {"resolution": 17}, -1.0, -1.0, 288 / 289, 1.0, 4.0),  # both are zero at the bottom
         (lambda x: x[0], lambda x: x[1], {}, 0.0, 0.0, None, 1.0, 2.0),
-        (lambda x: x[0] + x[1] / 100, lambda x: x[0] - x[1] / 100, {"space": WIDE}, 0.0, 0.0, None, 1.0, 3.98),
+        (lambda x: x[0] + x[1] / 100, lambda x: x[0] - x[1] / 100, {"space": WIDE}, None, 0.0, None, 1.0, 3.98),
         # Two valleys disagree between their bottoms: at -0.3, -0.2, ..., 0.3 of 21 columns.
         (lambda x: (x[0] + 0.35) ** 2, lambda x: (x[0] - 0.35) ** 2, {}, None, 1.0, 7 / 21, None, 1.4),
         (lambda x: (x[0] + 0.35) ** 2, lambda x: (x[0] - 0.35) ** 2, {"dims": ("x",)}, None, 1.0, 7 / 21, None, 1.4),
