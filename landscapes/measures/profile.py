@@ -48,10 +48,10 @@ class Profile:
     floor. No measure of losses counts what is below `losses.floor`, which is that of noise or that of numerics,
     whichever is larger. `noise` is None where it is not known.
 
-    `differences`, `differences_of_samples` and `smoothing` sum up `quality`, which is drawn. `beyond_the_box` counts
-    the probes that the objective does not allow. `undersampled` says what the samples hide, None where that is not
-    known; `errors` says how many of them raised and what the first of them said. `growth` is that of gradients with the
-    length of episodes, None where it was not measured.
+    `differences`, `differences_of_samples` and `smoothing` sum up `quality`, which is drawn; records of samples alone
+    have but those in the middle. `beyond_the_box` counts the probes that the objective does not allow. `undersampled`
+    says what the samples hide, None where that is not known; `errors` says how many of them raised and what the first
+    of them said. `growth` is that of gradients with the length of episodes, None where it was not measured.
     """
 
     losses: Ruggedness
@@ -190,7 +190,7 @@ def measure_profile(
     whole, pairs = measure_range(objective, seed=seed), PAIRS_PER_POINT * points
     (verdict,) = judge(
         objective, [dataset], deviation=deviation, floor=numerics, own_range=whole,
-        pairs=pairs, smoothed=0, seed=seed, events=events,
+        pairs=pairs, smoothed=0, seed=seed, events=events,  # they are smoothed here, over several widths
     )  # fmt: skip
     near, widths = gradients.compare_samples(dataset, deviation=deviation), gradients.width_table(smooth)
     floor, repeats = (least_difference(dataset, deviation, one) for one in (numerics, None))
