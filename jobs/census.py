@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,13 +13,12 @@ import numpy as np
 import torch
 
 from ..landscapes.capacity import Need, require
-from ..landscapes.convert import from_json
 from ..landscapes.cost import PICTURE_SECONDS, duration
 from ..landscapes.objective import Evaluation, evaluate
 from ..landscapes.sampling.distribution import PortableObjective, run_tasks, workers_of
 from ..landscapes.sampling.memory import MemoryBound
 from ..landscapes.storage.files import replacing
-from ..landscapes.storage.records import read_json, reading
+from ..landscapes.verification import LAST_PLACE
 from .folder import CENSUS, ROOT, folder_named
 from .job import CheckpointedJob
 from .plan import simulation_seconds
@@ -47,17 +47,6 @@ class Task:
     piece: str
     number: int
     other: bool
-
-
-@dataclass(frozen=True)
-class _Judging:
-    """Hold what `survey` samples and judges every slice of a census with, by its names."""
-
-    deviation: float
-    own_range: float | None
-    floor: Floor | None
-    seed: int
-    gradients: int
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -166,11 +155,16 @@ class CensusJob(CheckpointedJob["Census"]):
 
     def compute(self, watch: Watch) -> Census:
         """Survey what is missing, and return the census."""
+        from ..landscapes.measures.census import survey
+
         (deviation, own_range), replicas = self._scales(watch), self._replicas(watch)
         self._announce(watch)
         floor = self._floor(replicas, None) if replicas else None
-        judging = _Judging(deviation, own_range, floor, self.seed, self.design.gradients)
-        return self._conclude(self._survey(judging, watch), replicas)
+        judge = partial(
+            survey, deviation=deviation, own_range=own_range, floor=floor, seed=self.seed,
+            gradients=self.design.gradients,
+        )  # fmt: skip
+        return self._conclude(self._survey(judge, watch), replicas)
 
     def write(self, found: Census) -> list[str]:
         """Draw and write the census, the losses in a file of their own."""
@@ -193,18 +187,17 @@ class CensusJob(CheckpointedJob["Census"]):
     def _scales(self, watch: Watch) -> tuple[float, float]:
         """Return the deviation of the losses' noise and their range, at random points of the box [loss unit]."""
         from ..landscapes.measures.noise import noise
-        from ..landscapes.measures.profile import PRECISION
         from ..landscapes.measures.verdict import measure_range
 
-        if (kept := self.checkpoint.load("noise")) is None:
+        def measure() -> dict[str, float]:
             with watch.busy(f"{self.env.name}: {PREPARING}, then its noise"):
                 self.env.prepare()
                 x = self.env.space.uniform(NOISE_POINTS, seed=self.seed)
-                rounding = PRECISION[self.env.fidelity.precision]
+                rounding = LAST_PLACE[self.env.fidelity.precision]
                 found = noise(self.env, x, rounding=rounding, repeats=REPEATS, seed=self.seed)
-                whole = measure_range(self.env, seed=self.seed)
-            kept = {"deviation": np.array(found.deviation), "range": np.array(whole)}
-            self.checkpoint.save("noise", **kept)
+                return {"deviation": found.deviation, "range": measure_range(self.env, seed=self.seed)}
+
+        kept = self.checkpoint.load_or_compute("noise", measure)
         return float(np.nan_to_num(kept["deviation"])), float(kept["range"])
 
     def _replicas(self, watch: Watch) -> dict[str, Evaluation]:
@@ -251,20 +244,20 @@ class CensusJob(CheckpointedJob["Census"]):
             seconds = len(left) * (each + MEASURING_SECONDS) + PICTURE_SECONDS
             watch.announce(f"about {duration(seconds)} here; {lower} change it", seconds)
 
-    def _survey(self, judging: _Judging, watch: Watch) -> dict[str, SurveyedSlice]:
+    def _survey(self, judge: Survey, watch: Watch) -> dict[str, SurveyedSlice]:
         from ..landscapes.measures.census import SurveyedSlice
 
         left = self.left()
         with watch.progress(len(self.tasks), "slices") as advance:
             done = len(self.tasks) - len(left)
             advance(done)
-            for piece, arrays in self._do(left, judging):
+            for piece, arrays in self._do(left, judge):
                 self.checkpoint.save(piece, **arrays)
                 advance(done := done + 1)
         pieces = {task.piece: self.checkpoint.load(task.piece) for task in self.tasks}
         return {name: SurveyedSlice.of_arrays(arrays) for name, arrays in pieces.items() if arrays is not None}
 
-    def _do(self, tasks: Sequence[Task], judging: _Judging) -> Iterator[tuple[str, Mapping[str, Any]]]:
+    def _do(self, tasks: Sequence[Task], judge: Survey) -> Iterator[tuple[str, Mapping[str, Any]]]:
         """Survey slices, here or by workers, so many abreast as fill a batch, and yield what each one's piece holds."""
         workers = workers_of(self.executor) if self.executor else 1
         for other in (False, True):
@@ -277,10 +270,10 @@ class CensusJob(CheckpointedJob["Census"]):
             groups = [todo[start : start + size] for start in range(0, len(todo), size)]
             if self.executor is None:
                 for group in groups:
-                    yield from _survey(env, group, judging)
+                    yield from _survey(env, group, judge)
                 continue
             sent = PortableObjective.of(env, recipe(env))
-            for found in run_tasks(self.executor, _survey_there, [(sent, group, judging) for group in groups]):
+            for found in run_tasks(self.executor, _survey_there, [(sent, group, judge) for group in groups]):
                 yield from found
 
     def _conclude(self, found: Mapping[str, SurveyedSlice], replicas: Mapping[str, Evaluation]) -> Census:
@@ -307,18 +300,8 @@ class CensusJob(CheckpointedJob["Census"]):
         )
 
 
-def open_census(folder: Path) -> Census:
-    """Read the census in a folder. Raises DamagedError where it holds none that is whole."""
-    from ..landscapes.measures.census import Census
-
-    todo = "delete it, and `landscape census` continues from the slices that are kept"
-    with reading(folder / LOSSES, todo), np.load(folder / LOSSES, allow_pickle=False) as arrays:
-        losses = arrays["loss"]
-    with reading(folder / RECORD, todo):
-        return replace(from_json(Census, read_json(folder / RECORD)), losses=losses)
-
-
 Piece = tuple[str, dict[str, Any]]  # its name, and what it holds
+Survey = Callable[[Any, Sequence[Any]], Sequence[Any]]  # `measures.census.survey` with all that it judges by
 
 
 def _abreast(env: Environment) -> int:
@@ -328,14 +311,12 @@ def _abreast(env: Environment) -> int:
     return -(-env.preferred_batch // STEEP)
 
 
-def _survey(env: Any, group: Sequence[tuple[str, Plane]], judging: _Judging) -> list[Piece]:
+def _survey(env: Any, group: Sequence[tuple[str, Plane]], judge: Survey) -> list[Piece]:
     """Survey slices, their points simulated in one batch, and return what their pieces hold."""
-    from ..landscapes.measures.census import survey
-
-    found = survey(MemoryBound(env), [plane for _, plane in group], **vars(judging))
+    found = judge(MemoryBound(env), [plane for _, plane in group])
     return [(piece, one.arrays()) for (piece, _), one in zip(group, found, strict=True)]
 
 
-def _survey_there(sent: PortableObjective, group: Sequence[tuple[str, Plane]], judging: _Judging) -> list[Piece]:
+def _survey_there(sent: PortableObjective, group: Sequence[tuple[str, Plane]], judge: Survey) -> list[Piece]:
     """Survey slices on a worker, which keeps the environment that it has made."""
-    return _survey(sent.objective.objective, group, judging)
+    return _survey(sent.objective.objective, group, judge)

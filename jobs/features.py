@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from ..landscapes.capacity import peak_memory, require, size
 from ..landscapes.cost import duration
 from ..landscapes.measures.features import Features, effort, measure_features, need_of, own_seconds
+from ..landscapes.verification import LAST_PLACE
 from .plan import simulation_seconds
 from .watch import PREPARING, Watch, Work
 
@@ -25,8 +26,6 @@ def features_of(env: Environment, seed: int, watch: Watch) -> Features:
 
     Raises TooLargeError for more parameters than this machine has memory for.
     """
-    from ..landscapes.measures.profile import PRECISION
-
     dim = env.space.dim
     require("parameters", dim, need_of)
     losses, gradients = effort(dim)
@@ -39,4 +38,4 @@ def features_of(env: Environment, seed: int, watch: Watch) -> Features:
         seconds + own_seconds(dim),
     )
     with watch.progress(losses + gradients, "episodes of features") as advance:
-        return measure_features(env, seed=seed, rounding=PRECISION[env.fidelity.precision], follow=advance)
+        return measure_features(env, seed=seed, rounding=LAST_PLACE[env.fidelity.precision], follow=advance)

@@ -30,7 +30,7 @@ from ..landscapes.objective import BoxedObjective, Evaluation, ObjectiveWrapper,
 from ..landscapes.plain import digest
 from ..landscapes.storage.files import is_full, make_folder, other_files, replacing, tidy, write_json
 from ..landscapes.storage.records import read_json, reading, write_record
-from ..landscapes.verification import RESAMPLE, verify_dataset
+from ..landscapes.verification import LAST_PLACE, RESAMPLE, verify_dataset
 from .features import features_of, features_work
 from .folder import REPORT, REPORTS, ROOT, SLICE_FILE, SLICE_STORE, folder_named, store_in
 from .plan import simulation_seconds
@@ -174,10 +174,8 @@ class ReportJob:
         known: dict[str, Environment] = {}
         bare: dict[str, Environment] = {}
         for subject in self.subjects:
-            dataset = _open(subject)
-            env = environment_of(dataset, self.device, self.env)
+            dataset, env, key = self._open(subject)
             env = known.setdefault(digest(env.identity()), env)
-            key = ReportKey(self.points, self.seed, digest_of(dataset), env.version_on(env.engine))
             held = [one for one in (self._place(subject), self._beside(subject)) if one and _holds(one, key)]
             if not held:
                 yield report_work(env, dataset["loss"].shape, self.points)
@@ -198,13 +196,19 @@ class ReportJob:
         folder = report.folder
         if report.features is not None or folder is None:
             return report
-        env = environment_of(_open(subject), self.device, self.env)
+        _, env, _ = self._open(subject)
         name = digest(env.identity())
         if name not in known:
             known[name] = features_of(env, self.seed, watch)
         report = replace(report, features=known[name])
         write_record(folder / RECORD, to_json(report))
         return report
+
+    def _open(self, subject: ReportedSlice) -> tuple[xr.Dataset, Environment, ReportKey]:
+        """Return a slice, its environment, and what decides its report."""
+        dataset = _open(subject)
+        env = environment_of(dataset, self.device, self.env)
+        return dataset, env, ReportKey(self.points, self.seed, digest_of(dataset), env.version_on(env.engine))
 
     def _place(self, subject: ReportedSlice) -> Path:
         return self.folder if self.single else self.folder / subject.name
@@ -216,9 +220,7 @@ class ReportJob:
 
     def _find(self, subject: ReportedSlice, folder: Path, watch: Watch) -> Report:
         """Return a report that is there, or next to its slice, or else measure it."""
-        dataset = _open(subject)
-        env = environment_of(dataset, self.device, self.env)
-        key = ReportKey(self.points, self.seed, digest_of(dataset), env.version_on(env.engine))
+        dataset, env, key = self._open(subject)
         if (beside := self._beside(subject)) is not None:
             _fetch(beside, folder, key, watch)
         if (folder / RECORD).exists():
@@ -273,14 +275,14 @@ def report_work(env: Environment, shape: tuple[int, ...], points: int) -> Work:
 
 def measure(env: Environment, dataset: xr.Dataset, points: int, seed: int, watch: Watch) -> Profile:
     """Announce what measuring a slice of an environment costs, and measure it."""
-    from ..landscapes.measures.profile import PRECISION, effort, measure_profile
+    from ..landscapes.measures.profile import effort, measure_profile
 
     total = sum(effort(dataset["loss"].ndim, points, dataset["loss"].shape))
     _announce(env, dataset, points, watch)
     objective = BoxedObjective(env) if stored_identity(dataset).get("boxed") else env
     with watch.progress(total) as advance:
         counted = _Counted(objective, env.preferred_batch, advance)
-        rounding = PRECISION[env.fidelity.precision]
+        rounding = LAST_PLACE[env.fidelity.precision]
         found = measure_profile(counted, dataset, rounding=rounding, points=points, seed=seed, events=env.events)
         advance(total)
     return found
@@ -706,8 +708,8 @@ def _cosine(verdict: Verdict, scale: float) -> float | None:
     return None if at is None else _value(at.cosine)
 
 
-def _value(estimate: Estimate | None, scale: float = 1.0) -> float | None:
-    return None if estimate is None or not math.isfinite(estimate.value) else scale * estimate.value
+def _value(estimate: Estimate) -> float | None:
+    return estimate.value if math.isfinite(estimate.value) else None
 
 
 def _span(values: Iterable[float | None], form: str) -> str:

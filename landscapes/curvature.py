@@ -15,7 +15,7 @@ from torch import Tensor
 
 from .objective import Evaluation, Objective, Status, in_box
 from .sampling.memory import MemoryBound
-from .statistics import Estimate, mean
+from .statistics import Estimate, mean, ratio
 from .verification import LAST_PLACE
 
 Array = NDArray[np.float64]
@@ -329,8 +329,8 @@ def _whole_spectrum(curvature: Curvature, step: float, ladder: tuple[StepChange,
     return Spectrum(
         step=step, ladder=ladder, values=values, vectors=vectors, residual=residual, difference=difference,
         by_losses=by_losses, loss_error=_loss_error(curvature, step), trace=Estimate(trace, trace - off, trace + off),
-        asymmetry=_ratio(float(np.linalg.norm(skew)), size),
-        asymmetry_explained=_ratio(SAFETY * float(np.linalg.norm(change)), size),
+        asymmetry=ratio(float(np.linalg.norm(skew)), size),
+        asymmetry_explained=ratio(SAFETY * float(np.linalg.norm(change)), size),
         nodes=np.zeros((0, 0)), weights=np.zeros((0, 0)),
     )  # fmt: skip
 
@@ -373,8 +373,8 @@ def _partial_spectrum(
     return Spectrum(
         step=step, ladder=ladder, values=seen[3][order], vectors=_oriented(vectors[order]), residual=seen[0][order],
         difference=seen[1][order], by_losses=seen[2][order], loss_error=_loss_error(curvature, step),
-        trace=Estimate(trace.value, trace.low - off, trace.high + off), asymmetry=_ratio(skewness, size),
-        asymmetry_explained=_ratio(SAFETY * float(np.sqrt(dim * np.square(change).sum(axis=1).mean())), size),
+        trace=Estimate(trace.value, trace.low - off, trace.high + off), asymmetry=ratio(skewness, size),
+        asymmetry_explained=ratio(SAFETY * float(np.sqrt(dim * np.square(change).sum(axis=1).mean())), size),
         nodes=found.nodes, weights=found.weights,
     )  # fmt: skip
 
@@ -506,7 +506,3 @@ def _oriented(rows: Array) -> Array:
     largest = np.take_along_axis(rows, np.abs(rows).argmax(axis=1)[:, None], axis=1)
     oriented: Array = rows * np.where(largest < 0, -1.0, 1.0)
     return oriented
-
-
-def _ratio(part: float, whole: float) -> float:
-    return part / whole if whole > 0 else 0.0 if part == 0 else float("nan")

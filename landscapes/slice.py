@@ -97,10 +97,10 @@ class Slice:
         import pandas as pd
 
         from .lattice import sampled_lattice
-        from .measures.ruggedness import minima, span
+        from .measures.ruggedness import losses_of, minima, span
 
         data = sampled_lattice(self.data)
-        loss = data["loss"].transpose("v", "u", missing_dims="ignore").to_numpy()
+        loss = losses_of(data)
         found = minima(loss)
         deep = found.depth > depth * span(loss)
         places = np.unravel_index(found.sample[deep], loss.shape)[::-1]  # u first
@@ -138,9 +138,9 @@ class Slice:
         StoreMismatchError where the objective gives other numbers now than the slice holds.
         """
         from .lattice import sampled_lattice
-        from .measures.profile import PRECISION, measure_profile
+        from .measures.profile import measure_profile
         from .objective import BoxedObjective
-        from .verification import RESAMPLE, verify_dataset
+        from .verification import LAST_PLACE, RESAMPLE, verify_dataset
 
         if missing := int((self.data["status"] == Status.MISSING).sum()):
             raise ValueError(f"{missing} samples of this slice are missing; let what samples it continue first")
@@ -150,7 +150,7 @@ class Slice:
         objective = self.remake()
         if self.folder is not None:
             verify_dataset(objective, self.data, self.folder, todo=RESAMPLE)
-        rounding = PRECISION[self.identity.get("settings", {}).get("precision", "float64")]
+        rounding = LAST_PLACE[self.identity.get("settings", {}).get("precision", "float64")]
         return measure_profile(
             BoxedObjective(objective) if self.identity.get("boxed") else objective, sampled_lattice(self.data),
             rounding=rounding, points=points, seed=seed, events=objective.events,

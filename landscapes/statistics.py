@@ -25,6 +25,14 @@ class Estimate:
     high: float
 
 
+UNKNOWN = Estimate(math.nan, math.nan, math.nan)
+
+
+def exactly(value: float) -> Estimate:
+    """Return a number without an interval: it is of these samples alone, or they are too few for one."""
+    return Estimate(value, math.nan, math.nan)
+
+
 @dataclass(frozen=True)
 class Line:
     """Hold a line fitted to points by least squares, and the standard error of its slope, 0 for two points."""
@@ -68,11 +76,15 @@ def jackknife(
         sides = zip(block, BLOCKS[samples.ndim], samples.shape, strict=True)
         left[tuple(slice(at * size // of, (at + 1) * size // of) for at, of, size in sides)] = np.nan
         parts.append(statistic(left))
+    return from_parts(value, parts, least=least, most=most)
+
+
+def from_parts(value: float, parts: Sequence[float], *, least: float = -np.inf, most: float = np.inf) -> Estimate:
+    """Return a number with the jackknife's interval, from those without each part of the samples; NaN is left out."""
     known = np.array(parts)[np.isfinite(parts)]
     if len(known) < 2 or not math.isfinite(value):
-        return Estimate(value, math.nan, math.nan)
-    deviation = math.sqrt((len(known) - 1) * float(np.mean((known - known.mean()) ** 2)))
-    reach = deviation * float(student(len(known) - 1))
+        return exactly(value)
+    reach = math.sqrt((len(known) - 1) * float(np.var(known))) * float(student(len(known) - 1))
     return Estimate(value, max(least, value - reach), min(most, value + reach))
 
 
@@ -95,7 +107,7 @@ def exact_share(found: Estimate, tries: int) -> Estimate:
 def share(hits: int, tries: int) -> Estimate:
     """Return a share with its exact binomial interval (Clopper & Pearson 1934)."""
     if not tries:
-        return Estimate(math.nan, math.nan, math.nan)
+        return UNKNOWN
     return Estimate(hits / tries, *_binomial(hits, tries))
 
 
@@ -109,10 +121,10 @@ def clustered_share(hits: Values, clusters: Sequence[NDArray[np.intp]]) -> Estim
     """
     tries = len(hits)
     if not tries:
-        return Estimate(math.nan, math.nan, math.nan)
+        return UNKNOWN
     value = float(hits.mean())
     if not clusters:
-        return Estimate(value, math.nan, math.nan)
+        return exactly(value)
     count = min(_independent(hits, one) for one in clusters)
     return Estimate(value, *(_binomial(value * count, count) if count > 0 else (0.0, 1.0)))
 
@@ -154,10 +166,10 @@ def mean(values: Values, *, least: float = -np.inf, most: float = np.inf) -> Est
     """Return the mean of independent values, NaN left out, with Student's interval."""
     known = values[np.isfinite(values)]
     if not len(known):
-        return Estimate(math.nan, math.nan, math.nan)
+        return UNKNOWN
     value = float(known.mean())
     if len(known) == 1:
-        return Estimate(value, math.nan, math.nan)
+        return exactly(value)
     reach = float(known.std(ddof=1)) / math.sqrt(len(known)) * float(student(len(known) - 1))
     return Estimate(value, max(least, value - reach), min(most, value + reach))
 
@@ -166,6 +178,11 @@ def middle_95(value: float, drawn: ArrayLike) -> Estimate:
     """Return a number with the middle 95 % of what a bootstrap drew, shape (resample,)."""
     low, high = np.quantile(np.asarray(drawn), ((1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2))
     return Estimate(value, float(low), float(high))
+
+
+def ratio(value: float, whole: float) -> float:
+    """Return a ratio; nothing is 0 of any whole, and of a whole of 0 nothing else has a share."""
+    return value / whole if whole > 0 else 0.0 if value == 0 else math.nan
 
 
 def gradient_error(grad: Values, reference: Values) -> tuple[Values, Values]:

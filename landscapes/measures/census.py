@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from itertools import combinations
 from typing import TYPE_CHECKING, Any
 
@@ -20,16 +20,16 @@ from ..convert import NOT_JSON
 from ..directions import orthonormal
 from ..identity import plane_of
 from ..lattice import count_gradients
-from ..objective import Evaluation, Objective, ObjectiveWrapper, evaluate
+from ..objective import Objective, evaluate
 from ..plane import Plane
 from ..space import ParameterSpace
-from ..statistics import CONFIDENCE, Estimate, clustered_share
+from ..statistics import UNKNOWN, Estimate, clustered_share, exactly, middle_95
 from .discontinuities import EVALUATIONS_PER_PAIR
 from .floor import Floor
 from .following import CHIEF, SCALES
 from .ruggedness import ruggedness
 from .surface import EVALUATIONS_PER_PLACE, WAY_POINTS, WAYS, Surface, measure_surface
-from .verdict import FLAT, WORDS, Verdict, judge, least_difference
+from .verdict import FLAT, WORDS, CountedObjective, Verdict, judge, least_difference
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -188,7 +188,7 @@ def survey(
     `gradients`. Measures are those of a report, without their intervals within the slice: what counts here is how they
     differ from slice to slice. Jumps are looked for in at most `STEEP` pairs of samples of a slice.
     """
-    counted = _Counting(objective)
+    counted = CountedObjective(objective)
     wholes = sample_cuts(counted, planes, gradients=gradients)
     verdicts = judge(
         counted, wholes, deviation=deviation, floor=floor, own_range=own_range,
@@ -200,20 +200,9 @@ def survey(
         coarse = measure_surface(thin, floor=least_difference(thin, deviation, floor), own_range=own_range)
         measures, halved = _measure(whole, verdict, verdict.surface), _measure(thin, verdict, coarse)
         halved[MEASURES.index("jumps")] = math.nan
-        episodes = (counted.episodes + number) // len(planes)  # an even share, which add up to all
+        episodes = (counted.asked - counted.cut + number) // len(planes)  # an even share, which add up to all
         surveyed.append(SurveyedSlice(whole["loss"].to_numpy(), measures, halved, verdict.words, episodes))
     return surveyed
-
-
-class _Counting(ObjectiveWrapper):
-    """Evaluate an objective, and count its episodes."""
-
-    episodes = 0
-
-    def evaluate(self, x: Tensor, *, grad: bool = True) -> Evaluation:
-        """Return losses, and gradients if asked."""
-        self.episodes += len(x)
-        return self.objective.evaluate(x, grad=grad)
 
 
 def judging_effort() -> tuple[int, int]:
@@ -249,14 +238,9 @@ def thin_out(whole: xr.Dataset) -> xr.Dataset:
     """Return every second sample along each axis, as a slice of half the resolution would have them."""
     plane, thin = plane_of(whole), whole.isel(u=slice(None, None, 2), v=slice(None, None, 2))
     shape = thin.sizes["u"], thin.sizes["v"]
-    steps = [
-        (high - low) / (count - 1) for low, high, count in zip(plane.lower, plane.upper, plane.resolution, strict=True)
-    ]
-    ends = [low + 2 * step * (count - 1) for low, step, count in zip(plane.lower, steps, shape, strict=True)]
-    return _dataset(
-        Plane(plane.origin, plane.basis, plane.lower, torch.stack(ends), shape, plane.labels, plane.scales),
-        *(thin[name].to_numpy() for name in ("loss", "grad", "status")),
-    )
+    upper = torch.stack([axis[2 * (count - 1)] for axis, count in zip(plane.axes(), shape, strict=True)])
+    arrays = (thin[name].to_numpy() for name in ("loss", "grad", "status"))
+    return _dataset(replace(plane, upper=upper, resolution=shape), *arrays)
 
 
 def _dataset(plane: Plane, loss: Array, grad: Array, status: Array) -> xr.Dataset:
@@ -267,7 +251,7 @@ def _dataset(plane: Plane, loss: Array, grad: Array, status: Array) -> xr.Datase
 
 def _alone(statistic: Any, samples: Array, **bounds: float) -> Estimate:
     """Return a measure without an interval, which the other slices give."""
-    return Estimate(statistic(samples), math.nan, math.nan)
+    return exactly(statistic(samples))
 
 
 def _measure(dataset: xr.Dataset, verdict: Verdict, surface: Surface) -> Array:
@@ -518,8 +502,8 @@ def spread(values: Array, drawn: NDArray[np.int64]) -> Spread:
     """Return how the values of a measure are distributed, NaN left out."""
     known = np.isfinite(values)
     if not known.any():
-        return Spread((np.nan,) * len(QUANTILES), Estimate(np.nan, np.nan, np.nan))
-    middle = Estimate(float(np.median(values[known])), *_interval(_medians(values[known], drawn[:, known])))
+        return Spread((np.nan,) * len(QUANTILES), UNKNOWN)
+    middle = middle_95(float(np.median(values[known])), _medians(values[known], drawn[:, known]))
     return Spread(tuple(float(one) for one in np.quantile(values[known], QUANTILES)), middle)
 
 
@@ -531,12 +515,6 @@ def _medians(values: Array, drawn: NDArray[np.int64]) -> Array:
     last = upto[:, -1:] - 1
     below, above = (values[order][(upto <= at).sum(axis=1)] for at in (last // 2, (last + 1) // 2))
     return np.asarray((below + above) / 2)
-
-
-def _interval(found: Array) -> tuple[float, float]:
-    tail = (1 - CONFIDENCE) / 2
-    low, high = np.quantile(found, [tail, 1 - tail])
-    return float(low), float(high)
 
 
 def divide(

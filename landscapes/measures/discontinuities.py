@@ -31,8 +31,8 @@ from torch import Tensor
 from ..identity import plane_of
 from ..objective import Objective, evaluate
 from ..plane import Plane
-from ..statistics import Estimate, Values, share, upper_bound
-from .ruggedness import box_slopes, span
+from ..statistics import UNKNOWN, Estimate, Values, share, upper_bound
+from .ruggedness import lines_along, losses_of, span, step_slopes
 
 LEAST = 0.01  # of the slice's range, from which on a difference is a jump
 HALVINGS = 12  # a gap between samples is looked into down to 1/4096 of it
@@ -87,7 +87,7 @@ class Jumps:
     def share(self) -> Estimate:
         """Share of the lines that cross a jump; drawn lines that are neither hit nor clear may or may not."""
         if not self.lines:
-            return Estimate(math.nan, math.nan, math.nan)
+            return UNKNOWN
         others, most = self.lines - self.settled, self.drawn - self.clear
         if self.drawn == others:  # no chance is left
             rest = Estimate(self.hit, self.hit, most)
@@ -156,21 +156,8 @@ def find_jumps(
     floors = [0.0] * len(datasets) if least is None else least
     slices = [_Search(*one, most, seed) for one in zip(datasets, floors, strict=True)]
     for choose in (_Search.strongest, _Search.draw):
-        chosen = [choose(one) for one in slices]
-        for one, pairs, seen in zip(slices, chosen, _look(objective, slices, chosen), strict=True):
-            one.learn(pairs, seen)
+        _look(objective, slices, [choose(one) for one in slices])
     return [one.conclude(events) for one in slices]
-
-
-@dataclass(frozen=True, eq=False)
-class _Look:
-    """Hold what became of pairs: the ends that are left of each, its state, its height and the losses evaluated."""
-
-    low: Values
-    high: Values
-    state: NDArray[np.int8]
-    height: Values
-    evaluations: int
 
 
 UNSEEN, FAILED, NO_JUMP, JUMP = range(4)  # what is known of a trace
@@ -184,12 +171,11 @@ class _Search:
     """
 
     def __init__(self, dataset: xr.Dataset, floor: float, most: int, seed: int) -> None:
-        loss = dataset["loss"].transpose("v", "u", missing_dims="ignore").to_numpy()
+        loss = losses_of(dataset)
         self.plane, self.range, self.most = plane_of(dataset), float(np.nan_to_num(span(loss))), most
         self.least = max(float(floor), LEAST * self.range)
         self.generator = np.random.default_rng(seed)
-        slopes = box_slopes(dataset) / (np.array(self.plane.resolution) - 1) if "grad" in dataset else None
-        self._find_traces(loss, slopes)
+        self._find_traces(loss, step_slopes(dataset) if "grad" in dataset else None)
         self.low, self.high = self.ends[:, 0].copy(), self.ends[:, 1].copy()
         self.state, self.height = np.full(len(self.line), UNSEEN, np.int8), np.zeros(len(self.line))
         self.open = self.drawn = np.zeros(0, np.intp)
@@ -200,8 +186,8 @@ class _Search:
         places = np.stack(np.meshgrid(*axes[::-1], indexing="ij")[::-1], axis=-1)
         found, self.lines = list[tuple[Values, Values, Values, NDArray[np.intp]]](), 0
         for axis in range(loss.ndim):
-            rows, at = (_lines(values, axis, loss.ndim) for values in (loss, places))
-            slope = None if slopes is None else _lines(slopes[..., loss.ndim - 1 - axis], axis, loss.ndim)
+            rows, at = (lines_along(values, axis, loss.ndim) for values in (loss, places))
+            slope = None if slopes is None else lines_along(slopes[..., axis], axis)
             difference = np.diff(rows, axis=1)
             trend = _trend(difference, slope)
             trace = np.abs(difference - trend)
@@ -245,12 +231,6 @@ class _Search:
         place[by_line] = np.arange(len(pairs)) - np.repeat(starts, np.diff(starts, append=len(pairs)))
         return pairs[np.sort(np.argsort(place, kind="stable")[:most])]
 
-    def learn(self, pairs: NDArray[np.intp], look: _Look) -> None:
-        """Keep what became of pairs."""
-        self.low[pairs], self.high[pairs] = look.low, look.high
-        self.state[pairs], self.height[pairs] = look.state, look.height
-        self.evaluations += look.evaluations
-
     def conclude(self, events: Count | None) -> Jumps:
         """Return the jumps that were found, and what is known of the lines."""
         found = np.flatnonzero(self.state == JUMP)
@@ -275,12 +255,6 @@ class _Search:
             undecided=int((self.state == FAILED).sum()),
             evaluations=self.evaluations,
         )
-
-
-def _lines(values: Values, axis: int, rank: int) -> Values:
-    """Return values of samples as lines along an axis, shape (line, sample, ...)."""
-    moved = np.moveaxis(values, axis, rank - 1)
-    return moved.reshape(-1, *moved.shape[rank - 1 :])
 
 
 def _trend(difference: Float[Values, "line step"], slope: Float[Values, "line sample"] | None) -> Values:
@@ -314,8 +288,11 @@ def _integrals(slope: Float[Values, "line sample"]) -> tuple[Values, Values]:
     return linear, (13 * (wide[:, 1:-2] + wide[:, 2:-1]) - wide[:, :-3] - wide[:, 3:]) / 24
 
 
-def _look(objective: Objective, slices: Sequence[_Search], chosen: Sequence[NDArray[np.intp]]) -> list[_Look]:
-    """Look into pairs of all slices, given by their numbers: bisect them, and compare both sides of what is left."""
+def _look(objective: Objective, slices: Sequence[_Search], chosen: Sequence[NDArray[np.intp]]) -> None:
+    """Look into pairs of all slices, given by their numbers: bisect them, and compare both sides of what is left.
+
+    What became of a pair is kept by its slice: its last ends, its state and its height.
+    """
     several = list(zip(slices, chosen, strict=True))
     owner = np.repeat(np.arange(len(slices)), [len(pairs) for pairs in chosen])
     asked = _Batch(objective, [one.plane for one in slices], owner)
@@ -330,9 +307,10 @@ def _look(objective: Objective, slices: Sequence[_Search], chosen: Sequence[NDAr
     within = np.ptp(around, axis=-1).max(axis=1)
     jump = open_ & ~failed & (height >= least) & (height > APART * within)
     state = np.where(failed, FAILED, np.where(jump, JUMP, NO_JUMP)).astype(np.int8)
-    of = [owner == number for number in range(len(slices))]
-    counts = asked.counts.tolist()
-    return [_Look(low[at], high[at], state[at], height[at], count) for at, count in zip(of, counts, strict=True)]
+    for number, (one, pairs) in enumerate(several):
+        at = owner == number
+        one.low[pairs], one.high[pairs], one.state[pairs], one.height[pairs] = low[at], high[at], state[at], height[at]
+        one.evaluations += int(asked.counts[number])
 
 
 def _bisect(

@@ -120,12 +120,7 @@ class InformationContent:
     @classmethod
     def of(cls, distances: Array, y: Array) -> InformationContent:
         """Walk the tour from the first point on."""
-        order = _tour(distances)
-        slopes = np.diff(y[order]) / distances[order[:-1], order[1:]]
-        signs, sizes = np.sign(slopes).astype(np.int8), np.abs(slopes)
-        _, first, same = np.unique(np.searchsorted(np.sort(sizes), SIZES), return_index=True, return_inverse=True)
-        found = np.array([_information(np.where(sizes < size, 0, signs)) for size in SIZES[first]])
-        entropy, partial = found[same].T
+        entropy, partial = walk_information(distances, y)
         settled, half = SIZES[entropy < SETTLED], SIZES[partial > HALF * partial[0]]
         largest = float(entropy.max())
         eps_max = float(np.median(SIZES[entropy == largest]))
@@ -384,13 +379,22 @@ def _middle(distances: Array, middle: Callable[[Array], Any]) -> float:
     return float(middle(known)) if len(known) else math.nan
 
 
-def _tour(distances: Array) -> NDArray[np.int_]:
-    """Return points in order, from the first one on to the nearest of those left each time."""
-    left, order = np.ones(len(distances), bool), [0]
-    for _ in range(len(distances) - 1):
+def walk_information(distances: Array, y: Array, unit: float = 1.0) -> tuple[Array, Array]:
+    """Return entropy and share of turns of a walk by the sizes from which on a slope counts, shapes (size,) of `SIZES`.
+
+    Losses count in a `unit`. The walk goes from the first point on to the nearest of those left each time (Munoz et al.
+    2015, eqs. 6 to 10).
+    """
+    left, order = np.ones(len(y), bool), [0]
+    for _ in range(len(y) - 1):
         left[order[-1]] = False
         order.append(int(np.where(left, distances[order[-1]], np.inf).argmin()))
-    return np.array(order)
+    slopes = np.diff(y[order]) / unit / distances[order[:-1], order[1:]]
+    signs, sizes = np.sign(slopes).astype(np.int8), np.abs(slopes)
+    _, first, same = np.unique(np.searchsorted(np.sort(sizes), SIZES), return_index=True, return_inverse=True)
+    found = np.array([_information(np.where(sizes < size, 0, signs)) for size in SIZES[first]])
+    entropy, partial = found[same].T
+    return entropy, partial
 
 
 def _information(signs: NDArray[np.int8]) -> tuple[float, float]:

@@ -16,7 +16,7 @@ from torch import Tensor
 from ..capacity import Need
 from ..objective import Evaluation, Objective, evaluate
 from ..space import sobol
-from ..statistics import RESAMPLES, Estimate, middle_95
+from ..statistics import RESAMPLES, UNKNOWN, Estimate, middle_95
 from .exploratory import GROUPS, MAX_COEFFICIENTS, MAX_POINTS, Array, Exploratory, MetaModels
 from .polynomials import GradientModel, degrees_of, fit_with_gradients
 
@@ -142,7 +142,7 @@ def measure_features(
     """
     space, dim = objective.space, objective.space.dim
     unit = sobol(POINTS * dim, dim, seed=seed)
-    found = _evaluate(objective, space.from_unit(unit), grad=True, follow=follow)
+    found = evaluate_parts(objective, space.from_unit(unit), grad=True, follow=follow)
     loss = found.loss.numpy()
     there = np.isfinite(loss)
     x, y = unit.numpy()[there], loss[there]
@@ -178,13 +178,14 @@ def _refuse(y: Array, dim: int, rounding: float) -> str:
     return ""
 
 
-def _evaluate(
+def evaluate_parts(
     objective: Objective,
     x: Float[Tensor, "point dim"],
     *,
     grad: bool,
     follow: Callable[[int], None] = lambda done: None,
 ) -> Evaluation:
+    """Evaluate an objective as many points at a time as it prefers; `follow` hears how many are done."""
     parts, done = list[Evaluation](), 0
     for rows in torch.split(x, objective.preferred_batch):
         parts.append(evaluate(objective, rows, grad=grad))
@@ -201,8 +202,7 @@ def active_subspace(slopes: Array, names: Sequence[str], rng: np.random.Generato
     tables = np.stack([slopes[blocks == one].T @ slopes[blocks == one] for one in range(blocks.max() + 1)])
     sizes, vectors = np.linalg.eigh(tables.sum(axis=0))
     if sizes[-1] <= 0:
-        none = Estimate(math.nan, math.nan, math.nan)
-        return ActiveSubspace(len(slopes), (), none, none, {})
+        return ActiveSubspace(len(slopes), (), UNKNOWN, UNKNOWN, {})
     times = rng.multinomial(len(tables), np.full(len(tables), 1 / len(tables)), size=RESAMPLES)
     drawn = [_spectrum(np.linalg.eigvalsh(np.tensordot(one, tables, 1))) for one in times.astype(float)]
     share, participation, directions = _spectrum(sizes)
@@ -231,12 +231,12 @@ def _vary(objective: Objective, seed: int, follow: Callable[[int], None]) -> tup
     space, dim = objective.space, objective.space.dim
     both = sobol(BASE, 2 * dim, seed=seed + 1)
     base, far = both[:, :dim], both[:, dim:]
-    ends = _evaluate(objective, space.from_unit(torch.cat([base, far])), grad=False, follow=follow).loss.numpy()
+    ends = evaluate_parts(objective, space.from_unit(torch.cat([base, far])), grad=False, follow=follow).loss.numpy()
     varied, at_once = list[Array](), max(1, objective.preferred_batch // dim)
     for rows in torch.split(torch.arange(BASE), at_once):
         points = base[rows, None, :].repeat(1, dim, 1)
         points.diagonal(dim1=1, dim2=2).copy_(far[rows])
-        found = _evaluate(objective, space.from_unit(points.reshape(-1, dim)), grad=False)
+        found = evaluate_parts(objective, space.from_unit(points.reshape(-1, dim)), grad=False)
         varied.append(found.loss.numpy().reshape(len(rows), dim))
         follow(2 * BASE + (int(rows[-1]) + 1) * dim)
     return ends[:BASE], ends[BASE:], np.concatenate(varied)
@@ -253,7 +253,7 @@ def sobol_indices(
     there = np.isfinite(base) & np.isfinite(far) & np.isfinite(varied).all(axis=1)
     base, far, varied = base[there], far[there], varied[there]
     first, total, bound = (dict[str, Estimate]() for _ in range(3))
-    interaction = Estimate(math.nan, math.nan, math.nan)
+    interaction = UNKNOWN
     if len(base) > 1 and np.ptp(base):
         rows = rng.integers(len(base), size=(RESAMPLES, len(base)))
         drawn = [_indices(base[one], far[one], varied[one]) for one in rows]

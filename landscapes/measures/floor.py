@@ -16,7 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..objective import Evaluation, Objective, evaluate
-from ..statistics import CONFIDENCE, Estimate, Values, gradient_error
+from ..statistics import CONFIDENCE, UNKNOWN, Estimate, Values, exactly, gradient_error, middle_95, ratio
 
 MIN_POINTS = 4  # that an interval needs
 RESAMPLES = 999  # of the bootstrap
@@ -56,36 +56,13 @@ def format_cosine(cosine: float) -> str:
     return f"{cosine:z.2f}" if abs(cosine) < 0.995 else f"{cosine:z.3f}"
 
 
-def measure_floor(
-    objective: Objective,
-    x: Float[Tensor, "points dim"],
-    *,
-    evaluation: Evaluation | None = None,
-    range: float | None = None,
-    seed: int = 0,
-) -> Floor | None:
-    """Evaluate an objective's replicas at some points and measure how far apart they are; None where it has none.
-
-    `evaluation` is the objective's own there, if it is known; without gradients, replicas are evaluated without them.
-    `range` [loss unit] is by default that of its losses at the points.
-
-    Raises ValueError where a replica has another space, and what `evaluate` does.
-    """
-    if objective.device != "cpu":
-        objective.release()  # or else replicas would be made for what it leaves of a GPU's memory
-    replicas = objective.replicas()
-    if not replicas:
-        return None
-    own = evaluate(objective, x, grad=True) if evaluation is None else evaluation
-    found = evaluate_replicas(objective, x, replicas, grad=own.grad is not None)
-    sides = objective.space.upper - objective.space.lower
-    return floor_between(own, found, sides=sides, range=range, seed=seed)
-
-
 def evaluate_replicas(
     objective: Objective, x: Float[Tensor, "points dim"], replicas: Mapping[str, Objective], *, grad: bool
 ) -> dict[str, Evaluation]:
-    """Evaluate each replica of an objective at points, one at a time in memory. Raises what `measure_floor` does."""
+    """Evaluate each replica of an objective at points, one at a time in memory.
+
+    Raises ValueError where a replica has another space, and what `evaluate` does.
+    """
     found = {}
     objective.release()
     for name, replica in replicas.items():
@@ -114,8 +91,8 @@ def floor_between(
 ) -> Floor:
     """Measure how far apart evaluations of an objective and its replicas at the same points are.
 
-    `sides` are the widths of the box, by which gradients are scaled before their cosine is taken. `range` is as in
-    `measure_floor`. Raises ValueError where a replica was evaluated at another number of points.
+    `sides` are the widths of the box, by which gradients are scaled before their cosine is taken. `range` [loss unit]
+    is by default that of the losses. Raises ValueError where a replica was evaluated at another number of points.
     """
     for name, found in replicas.items():
         if len(found.loss) != len(own.loss):
@@ -126,7 +103,7 @@ def floor_between(
         known = own.loss[own.has_loss]
         range = float(known.max() - known.min()) if len(known) else math.nan
     spread = _pooled_deviation(apart, len(replicas))
-    share = Estimate(*(_ratio(end, range) for end in (spread.value, spread.low, spread.high)))
+    share = Estimate(*(ratio(end, range) for end in (spread.value, spread.low, spread.high)))
     failed = len(own.loss) - len(apart)
     cosine = _cosine(own, replicas, sides, seed)
     return Floor(tuple(replicas), len(apart), failed, spread.value, range, share, cosine)
@@ -155,28 +132,20 @@ def _pooled_deviation(apart: Values, freedom: int) -> Estimate:
     holds more often than a bootstrap where points are few and unequal.
     """
     if not len(apart):
-        return Estimate(math.nan, math.nan, math.nan)
+        return UNKNOWN
     variances = apart**2
     whole = float(variances.mean())
     if len(apart) < MIN_POINTS:
-        return Estimate(math.sqrt(whole), math.nan, math.nan)
+        return exactly(math.sqrt(whole))
     if whole == 0:
         return Estimate(0.0, 0.0, 0.0)
     from scipy.special import chdtri
 
     most, spread = float(freedom * len(apart)), float(variances.var(ddof=1))
-    held = min(most, 2 * whole**2 * len(apart) / spread) if spread else most
-    held = max(1.0, held)
+    held = max(1.0, min(most, 2 * whole**2 * len(apart) / spread) if spread else most)
     tails = ((1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2)
     low, high = (math.sqrt(whole * held / float(chdtri(held, tail))) for tail in tails)
     return Estimate(math.sqrt(whole), low, high)
-
-
-def _ratio(value: float, whole: float) -> float:
-    """Return a ratio; nothing is 0 of any range, and of a range of 0 nothing else has a share."""
-    if value == 0:
-        return 0.0
-    return value / whole if whole > 0 else math.nan
 
 
 def _cosine(
@@ -188,11 +157,9 @@ def _cosine(
     cosines = np.stack([replica_cosines(own, found, sides) for found in replicas.values()], axis=1)
     cosines = cosines[np.isfinite(cosines).any(axis=1)]
     if not len(cosines):
-        return Estimate(math.nan, math.nan, math.nan)
+        return UNKNOWN
     value = float(np.nanmedian(cosines))
     if len(cosines) < MIN_POINTS:
-        return Estimate(value, math.nan, math.nan)
+        return exactly(value)
     rows = np.random.default_rng(seed).integers(len(cosines), size=(RESAMPLES, len(cosines)))
-    again = np.nanmedian(cosines[rows].reshape(RESAMPLES, -1), axis=1)
-    low, high = np.quantile(again, ((1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2))
-    return Estimate(value, float(low), float(high))
+    return middle_95(value, np.nanmedian(cosines[rows].reshape(RESAMPLES, -1), axis=1))

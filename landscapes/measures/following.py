@@ -20,9 +20,9 @@ from torch import Tensor
 
 from ..objective import Objective, Status, evaluate
 from ..plane import Plane
-from ..statistics import Estimate, Values, mean, share
-from .gradient_quality import agreement, central_differences, differences_of_samples, find_bias, smoothed_slopes
-from .ruggedness import box_slopes, span
+from ..statistics import UNKNOWN, Estimate, Values, mean, share
+from .gradient_quality import agreement, central_differences, differences_of_samples, smoothed_slopes, width_table
+from .ruggedness import box_slopes, losses_of, span
 
 SCALES = (0.001, 0.01, 0.05)  # of the box
 CHIEF = 0.01  # the scale whose grade is the word, and over which other faults of gradients show
@@ -41,7 +41,6 @@ SHOWN = 4  # deviations of a difference by noise alone, beyond which it is a slo
 VANISHING = 1e-9  # ranges per side of the box, up to which a gradient is zero
 EXPLODES = 100  # times the slope over 1 % of the box, and ranges per side of the box, beyond which a gradient explodes
 WIDTH = 0.01  # of the box: the standard deviation of the Gaussian under which means of gradients are held to slopes
-UNKNOWN = Estimate(math.nan, math.nan, math.nan)
 NEAR = 2  # times a scale, or its part, that differences of samples may be over instead
 
 
@@ -207,7 +206,7 @@ def follow_samples(
     """
     if "grad" not in dataset:
         return None
-    loss = dataset["loss"].transpose("v", "u", missing_dims="ignore").to_numpy()
+    loss = losses_of(dataset)
     slope, status = box_slopes(dataset), dataset["status"].transpose("v", "u", missing_dims="ignore").to_numpy()
     asked = np.flatnonzero(np.isfinite(slope).all(axis=-1) | (status == Status.NO_GRADIENT))
     chosen = np.unravel_index(np.sort(np.random.default_rng(seed).permutation(asked)[:points]), loss.shape)
@@ -258,9 +257,7 @@ def _conclude(
 
 
 def _biased(objective: Objective, plane: Plane, u: Float[Tensor, "point rank"], pairs: int, seed: int) -> Estimate:
-    found = smoothed_slopes(objective, plane, u, widths=(WIDTH,), pairs=pairs, seed=seed)
-    known = np.isfinite(found["bias"].to_numpy()).all(axis=-1)
-    return share(int(find_bias(found).to_numpy()[known].sum()), int(known.sum()))
+    return width_table(smoothed_slopes(objective, plane, u, widths=(WIDTH,), pairs=pairs, seed=seed))[0].biased
 
 
 def _share(estimate: Estimate) -> str:

@@ -20,7 +20,7 @@ from ..identity import plane_of
 from ..objective import Objective, evaluate
 from ..plane import Plane
 from ..statistics import Estimate, Values, mean, share, student
-from .ruggedness import box_slopes
+from .ruggedness import box_slopes, losses_of
 
 SCALES = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1)
 STRIDES = (1, 2, 4)  # of the slice's own samples
@@ -77,27 +77,19 @@ def subgrid(plane: Plane, points: int) -> Float[Tensor, "count rank"]:
 
 
 def compare_differences(
-    objective: Objective,
-    plane: Plane,
-    u: Float[Tensor, "count rank"],
-    *,
-    deviation: float = 0.0,
-    scales: Sequence[float] = SCALES,
+    objective: Objective, plane: Plane, u: Float[Tensor, "count rank"], *, deviation: float = 0.0
 ) -> xr.Dataset:
     """Hold slopes by AD against central differences over steps of several scales, at points of a plane.
 
     Returns `cosine`, `sign` and `error`, dims (scale, point), as in `agreement`, and `place`, dims (point, axis).
     """
-    sides = plane.upper - plane.lower
     exact = evaluate(objective, plane.lift(u), grad=True)
     assert exact.grad is not None  # as it was asked for
-    slope = plane.slope(exact.grad) * sides
-    (differences,) = central_differences(objective, [plane], u[None], scales)
-    parts = [
-        agreement(slope.numpy(), difference, math.sqrt(2) * deviation / scale)
-        for scale, difference in zip(scales, differences, strict=True)
-    ]
-    return xr.Dataset(_stack(parts, "scale", "point"), {"scale": list(scales), "place": (("point", "axis"), u.numpy())})
+    slope = (plane.slope(exact.grad) * (plane.upper - plane.lower)).numpy()
+    (differences,) = central_differences(objective, [plane], u[None], SCALES)
+    over = zip(SCALES, differences, strict=True)
+    parts = [agreement(slope, difference, math.sqrt(2) * deviation / scale) for scale, difference in over]
+    return xr.Dataset(_stack(parts, "scale", "point"), {"scale": list(SCALES), "place": (("point", "axis"), u.numpy())})
 
 
 def central_differences(
@@ -105,12 +97,9 @@ def central_differences(
 ) -> Float[Values, "plane scale point rank"]:
     """Return central differences over parts of the box at points of planes, from one batch [loss unit per side]."""
     sides = torch.stack([plane.upper - plane.lower for plane in planes])
-    steps = (
-        torch.diag_embed(sides)[:, None, None] * torch.tensor(scales, dtype=torch.float64).reshape(1, -1, 1, 1, 1) / 2
-    )
-    ends = torch.stack(
-        [u[:, None, :, None] - steps, u[:, None, :, None] + steps], dim=1
-    )  # plane way scale point axis u
+    widths = torch.tensor(scales, dtype=torch.float64).reshape(1, -1, 1, 1, 1)
+    steps, at = torch.diag_embed(sides)[:, None, None] * widths / 2, u[:, None, :, None]
+    ends = torch.stack([at - steps, at + steps], dim=1)  # plane way scale point axis u
     x = [plane.lift(part.reshape(-1, plane.rank)) for plane, part in zip(planes, ends, strict=True)]
     loss = evaluate(objective, torch.cat(x), grad=False).loss.reshape(ends.shape[:-1]).numpy()
     found: Values = (loss[:, 1] - loss[:, 0]) / np.reshape(scales, (1, -1, 1, 1))
@@ -124,7 +113,7 @@ def compare_samples(dataset: xr.Dataset, *, deviation: float = 0.0) -> xr.Datase
     close to the border for a central difference have none.
     """
     plane = plane_of(dataset)
-    loss = dataset["loss"].transpose("v", "u", missing_dims="ignore").to_numpy()
+    loss = losses_of(dataset)
     strides = [stride for stride in STRIDES if 2 * stride < min(loss.shape)]
     parts = []
     for stride in strides:
@@ -164,17 +153,18 @@ def scale_table(found: xr.Dataset) -> tuple[ScaleRow, ...]:
     """Return a row for each scale: points that show a slope, their mean cosine and sign agreement, median error."""
     rows = list[ScaleRow]()
     for scale in found["scale"].to_numpy():
-        cosine, sign, error = (found[name].sel(scale=scale).to_numpy() for name in ("cosine", "sign", "error"))
-        seen = np.isfinite(cosine)
+        values = [found[name].sel(scale=scale).to_numpy() for name in ("cosine", "sign", "error")]
+        seen = np.isfinite(values[0])
+        cosine, sign, error = (one[seen] for one in values)
         rows.append(
             ScaleRow(
                 scale=float(scale),
-                points=int(seen.sum()),
-                of=int(cosine.size),
-                cosine=mean(cosine[seen], least=-1, most=1),
-                sign=mean(sign[seen], least=0, most=1),
-                uphill=share(int((cosine[seen] < 0).sum()), int(seen.sum())),
-                error=float(np.median(error[seen])) if seen.any() else math.nan,
+                points=len(cosine),
+                of=seen.size,
+                cosine=mean(cosine, least=-1, most=1),
+                sign=mean(sign, least=0, most=1),
+                uphill=share(int((cosine < 0).sum()), len(cosine)),
+                error=float(np.median(error)) if len(error) else math.nan,
             )
         )
     return tuple(rows)

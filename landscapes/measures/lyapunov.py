@@ -14,7 +14,7 @@ from enum import StrEnum
 
 import numpy as np
 
-from ..statistics import Estimate, Line, Values, fit_line, mean, student
+from ..statistics import UNKNOWN, Estimate, Line, Values, fit_line, mean, student
 
 MIN_HORIZONS = 4  # horizons that a rate is fitted to
 MIN_KNOWN_SHARE = 0.5  # share of the points whose gradients must be known at all horizons
@@ -61,7 +61,7 @@ class GradientGrowth:
             return Shape.UNDECIDED
         time, logs = np.array(self.time), np.log(self.norm)
         exponential, power = fit_line(time, logs), fit_line(np.log(time), logs)
-        if max(_low(exponential, len(time)), _low(power, len(time))) <= 0:
+        if max(one.slope - _reach(one, len(time)) for one in (exponential, power)) <= 0:
             return Shape.BOUNDED if power.slope + _reach(power, len(time)) < 1 else Shape.UNDECIDED
         left = {
             Shape.EXPONENTIAL: _squares(logs - exponential.slope * time),
@@ -72,11 +72,6 @@ class GradientGrowth:
         told = len(time) * math.log(left[second] / left[best])  # AICc of shapes that have as many parameters
         return best if told > EVIDENCE else Shape.UNDECIDED
 
-    @property
-    def is_exponential(self) -> bool:
-        """Whether gradients grow like an exponential, and neither like a power of time nor to a bound."""
-        return self.shape is Shape.EXPONENTIAL
-
     def describe(self) -> str:
         """Say in a line how gradients grow."""
         if not math.isfinite(self.rate.value):
@@ -86,8 +81,7 @@ class GradientGrowth:
             low, high = self.rate.low, self.rate.high
             return f"gradients grow like exp({self.rate.value:z.3g} t), t in s ({low:z.3g} to {high:z.3g}/s)"
         if self.shape is Shape.POWER:
-            low, high = self.power.low, self.power.high
-            return f"gradients grow like t^{self.power.value:z.2g} ({low:z.2g} to {high:z.2g}), not exponentially"
+            return f"gradients grow like t^{power}, not exponentially"
         if self.shape is Shape.BOUNDED:
             return f"gradients stay bounded; as a power of time their exponent is {power}"
         return f"cannot tell how gradients grow: as an exponential by {rate}/s, as a power of time by {power}"
@@ -104,14 +98,10 @@ def measure_growth(time: Values, norm: Values) -> GradientGrowth:
         raise ValueError(f"lengths of episodes ascend from above 0; got {time.tolist()}")
     there = np.isfinite(norm).all(axis=0) & (norm > 0).all(axis=0)
     known, points = int(there.sum()), norm.shape[1]
-    medians = np.full(len(time), math.nan)
-    nothing = Estimate(math.nan, math.nan, math.nan)
-    if known:
-        medians = np.median(norm[:, there], axis=1)
+    medians = np.median(norm[:, there], axis=1) if known else np.full(len(time), math.nan)
+    drawn = tuple(time.tolist()), tuple(medians.tolist()), known, points
     if len(time) < MIN_HORIZONS or known < 2 or known < MIN_KNOWN_SHARE * points:
-        return GradientGrowth(
-            nothing, nothing, (math.nan, math.nan), tuple(time.tolist()), tuple(medians.tolist()), known, points
-        )
+        return GradientGrowth(UNKNOWN, UNKNOWN, (math.nan, math.nan), *drawn)
     logs, axes = np.log(norm[:, there]), (time, np.log(time))
     fits = [[_fit(axis, column) for column in logs.T] for axis in axes]
     rate, power = (
@@ -119,7 +109,7 @@ def measure_growth(time: Values, norm: Values) -> GradientGrowth:
         for fit, axis in zip(fits, axes, strict=True)
     )
     first, second = (math.sqrt(float(np.mean([left**2 for _, left in fit]))) for fit in fits)
-    return GradientGrowth(rate, power, (first, second), tuple(time.tolist()), tuple(medians.tolist()), known, points)
+    return GradientGrowth(rate, power, (first, second), *drawn)
 
 
 def _fit(axis: Values, values: Values) -> tuple[float, float]:
@@ -137,10 +127,6 @@ def _widened(found: Estimate, line: Line, count: int) -> Estimate:
 def _reach(line: Line, count: int) -> float:
     """Return half the width of the 95 % interval of the slope of a line through so many points."""
     return float(line.standard_error * student(count - 2))
-
-
-def _low(line: Line, count: int) -> float:
-    return line.slope - _reach(line, count)
 
 
 def _squares(left: Values) -> float:

@@ -30,10 +30,6 @@ class Noise:
         """The largest of the three [loss unit]."""
         return max(self.again, self.batch, self.rounding)
 
-    def floor(self, samples: int) -> float:
-        """Return how far apart noise alone should put the extremes of so many samples [loss unit]."""
-        return noise_floor(self.deviation, samples)
-
 
 def noise_floor(deviation: float, samples: int) -> float:
     """Return how far apart noise of a standard deviation should put the extremes of so many samples.

@@ -9,7 +9,7 @@ from itertools import combinations_with_replacement
 import numpy as np
 from numpy.typing import NDArray
 
-from ..statistics import RESAMPLES, Estimate, middle_95
+from ..statistics import RESAMPLES, UNKNOWN, Estimate, middle_95
 from .exploratory import MAX_COEFFICIENTS, MAX_POINTS, Array
 
 FOLDS, ROUNDS = 10, 3  # parts of the points that are held out, and rounds of weighting
@@ -188,6 +188,6 @@ def _without(factors: tuple[int, ...], axis: int) -> tuple[int, ...]:
 def _explained(left: Array, whole: Array, rng: np.random.Generator) -> Estimate:
     """Return 1 - sum of `left` by sum of `whole`, shapes (point,), with its bootstrap interval over points."""
     if not np.isfinite(left).all() or not whole.sum():
-        return Estimate(math.nan, math.nan, math.nan)
+        return UNKNOWN
     rows = rng.integers(len(left), size=(RESAMPLES, len(left)))
     return middle_95(1 - float(left.sum() / whole.sum()), 1 - left[rows].sum(axis=1) / whole[rows].sum(axis=1))

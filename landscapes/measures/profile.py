@@ -9,13 +9,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import torch
 import xarray as xr
-from jaxtyping import Float
-from torch import Tensor
 
 from ..capacity import Need
 from ..convert import NOT_JSON
 from ..identity import errors_of, plane_of
-from ..objective import Evaluation, Objective, ObjectiveWrapper, evaluate, in_box
+from ..objective import Objective
 from ..statistics import Estimate, share
 from . import gradient_quality as gradients
 from .discontinuities import EVALUATIONS_PER_PAIR, Count, Jumps
@@ -27,9 +25,8 @@ from .ruggedness import Ruggedness, ruggedness
 from .slice_floor import counted_from, find_floor, floor_of, split_effort
 from .surface import EVALUATIONS_PER_PLACE, PLACES, WAY_POINTS, WAYS
 from .undersampled import Undersampled, find_undersampled, probes
-from .verdict import POINTS, RANGE_POINTS, Verdict, judge, judge_samples, least_difference, measure_range
+from .verdict import POINTS, RANGE_POINTS, CountedObjective, Verdict, judge, least_difference, measure_range
 
-PRECISION = {"float32": 2.0**-23, "float64": 2.0**-52}  # relative, of an engine that computes in it
 NOISE_POINTS, REPEATS, PAIRS = 16, 4, 12
 SECONDS, BYTES = (1.0, 4e-5), (80_000_000, 300)  # that a slice takes, and each of its samples (2026-11, one core)
 PAIRS_PER_POINT = 8  # pairs of samples that are looked into, for each point of a side of the subgrid
@@ -51,10 +48,10 @@ class Profile:
     floor. No measure of losses counts what is below `losses.floor`, which is that of noise or that of numerics,
     whichever is larger. `noise` is None where it is not known.
 
-    `differences`, `differences_of_samples` and `smoothing` sum up `quality`, which is drawn; of samples alone there are
-    but those in the middle. `beyond_the_box` counts the probes that the objective does not allow. `undersampled` says
-    what the samples hide, None where that is not known; `errors` says how many of them raised and what the first of
-    them said. `growth` is that of gradients with the length of episodes, None where it was not measured.
+    `differences`, `differences_of_samples` and `smoothing` sum up `quality`, which is drawn; records of samples alone
+    have but those in the middle. `beyond_the_box` counts the probes that the objective does not allow. `undersampled`
+    says what the samples hide, None where that is not known; `errors` says how many of them raised and what the first
+    of them said. `growth` is that of gradients with the length of episodes, None where it was not measured.
     """
 
     losses: Ruggedness
@@ -176,11 +173,11 @@ def measure_profile(
 ) -> Profile:
     """Measure a slice, with new evaluations of its objective at points x points places of it and at random ones.
 
-    `rounding` is the engine's relative precision: `PRECISION` has that of float32 and of float64. `events` counts what
+    `rounding` is the engine's relative precision: `LAST_PLACE` has that of float32 and of float64. `events` counts what
     happens in episodes, which explains jumps. The numerical floor is the slice's own, or else measured now. Where
     neighbours or their gradients are compared it does not count, but noise alone: their numerics are the same.
     """
-    plane, objective = plane_of(dataset), _Within(objective)
+    plane, objective = plane_of(dataset), CountedObjective(objective)
     generator = torch.Generator().manual_seed(seed)
     places = gradients.subgrid(plane, points if plane.rank == 2 else points**2)
     shares = torch.rand(NOISE_POINTS, plane.rank, generator=generator, dtype=torch.float64)
@@ -190,82 +187,34 @@ def measure_profile(
     deviation = float(np.nan_to_num(fuzz.deviation))
     steps = gradients.compare_differences(objective, plane, places, deviation=deviation)
     smooth = gradients.smoothed_slopes(objective, plane, places, pairs=PAIRS, seed=seed)
+    whole, pairs = measure_range(objective, seed=seed), PAIRS_PER_POINT * points
     (verdict,) = judge(
-        objective,
-        [dataset],
-        deviation=deviation,
-        floor=numerics,
-        own_range=measure_range(objective, seed=seed),
-        pairs=PAIRS_PER_POINT * points,
-        smoothed=0,  # which they are here, over several widths
-        seed=seed,
-        events=events,
-    )
-    widths, near = gradients.width_table(smooth), gradients.compare_samples(dataset, deviation=deviation)
-    found = _profile(dataset, fuzz, with_bias(verdict, widths), deviation, near)
-    floor = found.losses.floor
+        objective, [dataset], deviation=deviation, floor=numerics, own_range=whole,
+        pairs=pairs, smoothed=0, seed=seed, events=events,  # they are smoothed here, over several widths
+    )  # fmt: skip
+    near, widths = gradients.compare_samples(dataset, deviation=deviation), gradients.width_table(smooth)
+    floor, repeats = (least_difference(dataset, deviation, one) for one in (numerics, None))
     between = Undersampled.of(dataset) or find_undersampled(objective, dataset, floor=floor, seed=seed)
-    return replace(
-        found,
+    return Profile(
+        losses=ruggedness(dataset, floor=floor, noise=repeats),
+        noise=fuzz,
+        verdict=_with_bias(verdict, widths),
         differences=gradients.scale_table(steps),
+        differences_of_samples=gradients.scale_table(near),
         smoothing=widths,
         beyond_the_box=OutsideBounds(objective.asked, objective.cut),
         undersampled=between,
+        errors=errors_of(dataset),
         quality=gradients.GradientQuality(steps, near, smooth),
     )
 
 
-def profile_samples(dataset: xr.Dataset, *, noise: Noise | None = None, floor: Floor | None = None) -> Profile:
-    """Measure a slice from its samples alone, where its function is not at hand.
-
-    Jumps are not searched, gradients are compared at the scales that the samples allow, and `noise` is what was
-    measured before; None for none. `floor` is by default the slice's own.
-    """
-    known = None if noise is None else float(np.nan_to_num(noise.deviation))
-    verdict, deviation = judge_samples(dataset, deviation=known, floor=floor or floor_of(dataset)), known or 0.0
-    near = gradients.compare_samples(dataset, deviation=deviation) if "grad" in dataset else None
-    return _profile(dataset, noise, verdict, deviation, near)
-
-
-def _profile(
-    dataset: xr.Dataset, fuzz: Noise | None, verdict: Verdict, deviation: float, near: xr.Dataset | None
-) -> Profile:
-    """Measure what takes the samples alone; `near` is what `compare_samples` says of their gradients."""
-    floors = [least_difference(dataset, deviation, numerics) for numerics in (verdict.floor, None)]
-    return Profile(
-        losses=ruggedness(dataset, floor=floors[0], noise=floors[1]),
-        noise=fuzz,
-        verdict=verdict,
-        differences=(),
-        differences_of_samples=() if near is None else gradients.scale_table(near),
-        smoothing=(),
-        beyond_the_box=OutsideBounds(0, 0),
-        undersampled=Undersampled.of(dataset),
-        errors=errors_of(dataset),
-    )
-
-
-def with_bias(verdict: Verdict, widths: Sequence[gradients.WidthRow]) -> Verdict:
-    """Return a verdict that knows where the mean of gradients is biased, of the width that its words are by."""
+def _with_bias(verdict: Verdict, widths: Sequence[gradients.WidthRow]) -> Verdict:
+    """Return a verdict that knows where the mean of gradients is biased, of those widths the one of its words."""
     biased = next((row.biased for row in widths if row.width == WIDTH), None)
     if verdict.following is None or biased is None:
         return verdict
     return replace(verdict, following=replace(verdict.following, biased=biased))
-
-
-class _Within(ObjectiveWrapper):
-    """Evaluate an objective where it may be asked, and count the points where it may not."""
-
-    def __init__(self, objective: Objective) -> None:
-        super().__init__(objective)
-        self.beyond_box = True  # those are left out here
-        self.asked = self.cut = 0
-
-    def evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool = True) -> Evaluation:
-        self.asked += len(x)
-        if not self.objective.beyond_box:
-            self.cut += int((~in_box(self.space, x)).sum())
-        return evaluate(self.objective, x, grad=grad)
 
 
 def _shares(estimate: Estimate | None) -> str:

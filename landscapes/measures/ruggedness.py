@@ -21,6 +21,7 @@ from ..identity import plane_of
 from ..large import refuse_large
 from ..objective import Status
 from ..statistics import Estimate, Values, exact_share, fit_line, jackknife, share
+from .exploratory import SETTLED, SIZES, distances_of, walk_information
 
 FLAT_SLOPE = 1e-3  # a slope below it is effectively zero [ranges of the losses per side of the box]
 NOTABLE = 0.01  # the least depth of a notable minimum, as a fraction of the range
@@ -28,7 +29,7 @@ THRESHOLDS = (1e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1, 0.3)  # depths that minima are 
 BEST_SHARE = 0.05  # share of the samples that dispersion calls the best
 LAGS, WIDEST = 3, 4  # fewest that an exponent is fitted to; the widest is this part of the side
 DISTANCES = sorted({1} | {part * 2**power for power in range(20) for part in (2, 3)})  # in steps
-WALKED, SETTLED = 500, 0.05  # points of a walk, and the information content under which it has settled
+WALKED = 500  # points of a walk
 PAIRED = 4096  # most samples whose pairs are gone through one by one, 8 million of them
 
 
@@ -106,9 +107,9 @@ def level_samples(loss: Values, depth: float) -> Values:
     most = np.zeros_like(loss)
     for axis in range(loss.ndim):
         apart = np.nan_to_num(np.abs(np.diff(loss, axis=axis)))
-        before, after = ([(0, 0)] * loss.ndim for _ in range(2))
-        before[axis], after[axis] = (1, 0), (0, 1)
-        most = np.maximum(most, np.maximum(np.pad(apart, before), np.pad(apart, after)))
+        for side in (slice(1, None), slice(-1)):
+            near = (slice(None),) * axis + (side,)
+            most[near] = np.maximum(most[near], apart)
     return np.where(np.isfinite(loss), (most <= depth).astype(float), np.nan)
 
 
@@ -117,15 +118,15 @@ def correlation_length(loss: Values, axis: int) -> float:
 
     Each line varies about its own mean; lines count by their variance.
     """
-    lines = _lines(loss, axis)
+    lines = lines_along(loss, axis)
     lines = lines[np.isfinite(lines).any(axis=1)]
     lines = lines - np.nanmean(lines, axis=1, keepdims=True)
     points, before = lines.shape[1], 1.0
-    variance = _mean(lines**2)
+    variance = known_mean(lines**2)
     if not variance > 0:
         return math.nan
     for lag in range(1, points):
-        now = _mean(lines[:, :-lag] * lines[:, lag:]) / variance
+        now = known_mean(lines[:, :-lag] * lines[:, lag:]) / variance
         if now < 1 / math.e:
             return float((lag - (1 / math.e - now) / (before - now)) / (points - 1))
         before = now if math.isfinite(now) else before
@@ -141,11 +142,11 @@ def holder_exponent(loss: Values, axis: int, floor: float) -> float:
     more, whatever the landscape is like within it, so longer distances are left out. So are differences no larger than
     `floor`. NaN where fewer than three distances are left: such a landscape varies within the samples' distance.
     """
-    lines, known = _lines(loss, axis), list[tuple[float, float]]()
+    lines, known = lines_along(loss, axis), list[tuple[float, float]]()
     sides = lines.shape[1] - 1
     longest = sides * min(1 / WIDEST, np.nan_to_num(correlation_length(loss, axis)))
     for lag in (lag for lag in DISTANCES if lag <= longest):
-        apart = math.sqrt(_mean((lines[:, lag:] - lines[:, :-lag]) ** 2))
+        apart = math.sqrt(known_mean((lines[:, lag:] - lines[:, :-lag]) ** 2))
         if apart > floor:
             known.append((math.log(lag), math.log(apart)))
     return fit_line(*zip(*known, strict=True)).slope if len(known) >= LAGS else math.nan
@@ -153,7 +154,7 @@ def holder_exponent(loss: Values, axis: int, floor: float) -> float:
 
 def total_variation(loss: Values, axis: int) -> float:
     """Return how many times lines along an axis go through their own range: 1 if monotone, 2 across a bowl."""
-    lines = _lines(loss, axis)
+    lines = lines_along(loss, axis)
     ranges = sum(span(line) for line in lines[np.isfinite(lines).any(axis=1)])
     return float(np.nansum(np.abs(np.diff(lines, axis=1)))) / ranges if ranges > 0 else math.nan
 
@@ -169,32 +170,10 @@ def information_content(loss: Values) -> tuple[float, float]:
     places, whole = np.argwhere(np.isfinite(loss)), span(loss)
     if len(places) < 3 or not whole > 0:
         return math.nan, math.nan
-    some = np.random.default_rng(0).permutation(len(places))[:WALKED]
-    walk = _nearest_walk(places[some] / _sides(loss.shape))
-    losses = loss[tuple(places[some[walk.order]].T)]
-    sizes = np.concatenate([[0.0], np.logspace(-5.0, 15.0, 1000)])
-    entropy = np.array([_entropy(counts) for counts in _pair_counts(np.diff(losses) / whole / walk.length, sizes)])
-    settled = sizes[(entropy < SETTLED) & (sizes > 0)]
+    some = places[np.random.default_rng(0).permutation(len(places))[:WALKED]]
+    entropy, _ = walk_information(distances_of(some / _sides(loss.shape)), loss[tuple(some.T)], whole)
+    settled = SIZES[(entropy < SETTLED) & (SIZES > 0)]
     return float(entropy.max()), math.log10(settled[0])
-
-
-@dataclass(frozen=True)
-class Walk:
-    """Hold in which order points are visited, shape (point,), and how far the steps are, shape (point - 1,)."""
-
-    order: NDArray[np.intp]
-    length: Values
-
-
-def _nearest_walk(points: Values) -> Walk:
-    """Go from the first point to the nearest that was not visited, and so on, shape (point, rank)."""
-    order, lengths, left = [0], list[float](), np.ones(len(points), bool)
-    for _ in range(len(points) - 1):
-        left[order[-1]] = False
-        apart = np.where(left, np.linalg.norm(points - points[order[-1]], axis=1), np.inf)
-        order.append(int(apart.argmin()))
-        lengths.append(float(apart.min()))
-    return Walk(np.array(order), np.array(lengths))
 
 
 def turns(loss: Values, floor: float = 0.0) -> float:
@@ -204,13 +183,14 @@ def turns(loss: Values, floor: float = 0.0) -> float:
     Munoz et al. 2015, eq. 10, but that a walk which never turns has none, and that one which goes back by no more than
     `floor` [loss unit] has not turned.
     """
-    turned = steps = 0
+    turned = 0
     for axis in range(loss.ndim):
         small = span(loss) / (loss.shape[axis] - 1) / 2
-        difference = np.diff(_lines(loss, axis), axis=1)
-        steps += int(np.isfinite(difference).sum())
-        turned += _reversals(np.where(np.abs(difference) > small, difference, 0.0).cumsum(axis=1), floor)
-    return turned / steps if steps else math.nan
+        difference = np.diff(lines_along(loss, axis), axis=1)
+        walks = np.pad(np.where(np.abs(difference) > small, difference, 0.0).cumsum(axis=1), ((0, 0), (1, 0)))
+        turned += count_turns(walks, np.nextafter(floor, np.inf))
+    tries = steps(loss)
+    return turned / tries if tries else math.nan
 
 
 def steps(loss: Values) -> int:
@@ -218,16 +198,17 @@ def steps(loss: Values) -> int:
     return sum(int(np.isfinite(np.diff(loss, axis=axis)).sum()) for axis in range(loss.ndim))
 
 
-def _reversals(walks: Values, floor: float) -> int:
-    """Count how often walks from 0, shape (walk, step), go back from their last extreme by more than `floor`."""
-    high, low = np.zeros(len(walks)), np.zeros(len(walks))
-    way, turned = np.zeros(len(walks), int), 0  # 0 while a walk has gone nowhere
-    for at in walks.T:
-        high, low = np.maximum(high, at), np.minimum(low, at)
-        down, up = (way >= 0) & (high - at > floor), (way <= 0) & (at - low > floor)
+def count_turns(lines: Values, depth: float) -> int:
+    """Count how often lines, shape (line, sample), turn back by `depth` or more; samples that are NaN are passed."""
+    high, low = np.full(len(lines), -np.inf), np.full(len(lines), np.inf)
+    way, turned = np.zeros(len(lines), int), 0  # 0 while a line has gone nowhere
+    for at in lines.T:
+        high, low = np.fmax(high, at), np.fmin(low, at)
+        with np.errstate(invalid="ignore"):
+            down, up = (way >= 0) & (high - at >= depth), (way <= 0) & (at - low >= depth)
         turned += int((way[down | up] != 0).sum())
         way = np.where(down, -1, np.where(up, 1, way))
-        high, low = np.where(up, at, high), np.where(down, at, low)
+        high, low = np.where(up | down, at, high), np.where(up | down, at, low)
     return turned
 
 
@@ -317,7 +298,7 @@ def ruggedness(
     `noise` [loss unit] is the floor of repeats, by default `floor`. Neighbours are level by that one: their numerics
     are the same, so that their difference is a slope, however fine the samples are.
     """
-    loss = dataset["loss"].transpose("v", "u", missing_dims="ignore").to_numpy()
+    loss = losses_of(dataset)
     whole, found = span(loss), minima(loss)
     notable = found.sample[found.depth > max(floor, NOTABLE * whole)]
     shares = basins(loss, notable) if len(notable) else np.full(1, math.nan)
@@ -327,7 +308,7 @@ def ruggedness(
         return exact_share(estimate(statistic, samples), tries)
 
     def mean_of(flags: Values) -> Estimate:
-        return share_of(_mean, flags, int(np.isfinite(flags).sum()))
+        return share_of(known_mean, flags, int(np.isfinite(flags).sum()))
 
     def along_axes(measure: Callable[[Values, int], float], **bounds: float) -> tuple[Estimate, ...]:
         axes = range(loss.ndim)[::-1]  # u first
@@ -381,33 +362,29 @@ def _below(slopes: Values, size: float) -> Values:
     return np.where(np.isfinite(length), (length <= size).astype(float), np.nan)
 
 
-def _lines(loss: Values, axis: int) -> Values:
-    return np.moveaxis(loss, axis, -1).reshape(-1, loss.shape[axis])
+def step_slopes(dataset: xr.Dataset) -> Values:
+    """Return the derivatives along the axes of the array, axis last [loss unit per step between samples]."""
+    slopes: Values = (box_slopes(dataset) / (np.array(plane_of(dataset).resolution) - 1))[..., ::-1]
+    return slopes
 
 
-def _mean(values: Values) -> float:
+def losses_of(dataset: xr.Dataset) -> Values:
+    """Return the losses of a slice, shape (u,) or (v, u)."""
+    return dataset["loss"].transpose("v", "u", missing_dims="ignore").to_numpy().astype(float, copy=False)
+
+
+def lines_along(values: Values, axis: int, rank: int | None = None) -> Values:
+    """Return values of samples as lines along an axis of so many, by default all: shape (line, sample, ...)."""
+    last = (rank or values.ndim) - 1
+    moved = np.moveaxis(values, axis, last)
+    return moved.reshape(-1, *moved.shape[last:])
+
+
+def known_mean(values: Values) -> float:
+    """Return the mean of values, NaN left out."""
     with warnings.catch_warnings():  # of nothing at all it is NaN
         warnings.simplefilter("ignore", RuntimeWarning)
         return float(np.nanmean(values))
-
-
-def _pair_counts(steps: Values, sizes: Values) -> Values:
-    """Count pairs of successive slopes of a walk by their symbols at each size, shape (size, symbol, symbol).
-
-    A slope's symbol is its sign, but 0 at every size that it does not exceed (Munoz et al. 2015, eq. 6).
-    """
-    symbols = 1 + np.where(np.abs(steps) > sizes[:, None], np.sign(steps), 0).astype(int)
-    pairs = 3 * symbols[:, :-1] + symbols[:, 1:]
-    return np.array([np.bincount(one, minlength=9) for one in pairs], float).reshape(-1, 3, 3)
-
-
-def _entropy(counts: Values) -> float:
-    """Return Munoz et al. 2015, eq. 7: the entropy of pairs of steps that differ, to base 6."""
-    if not counts.sum():
-        return math.nan
-    shares = counts[~np.eye(3, dtype=bool)] / counts.sum()
-    shares = shares[shares > 0]
-    return float(-(shares * np.log(shares)).sum() / math.log(6))
 
 
 def _sides(shape: tuple[int, ...]) -> NDArray[np.intp]:

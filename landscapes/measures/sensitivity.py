@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from itertools import combinations, pairwise
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -17,6 +17,7 @@ from torch import Tensor
 from ..objective import Objective, evaluate
 from ..plain import finite
 from ..space import ParameterSpace, sobol
+from .features import evaluate_parts
 
 if TYPE_CHECKING:
     from ..storage.checkpoint import Checkpoint
@@ -163,9 +164,10 @@ def explore(
     """
     groups = list(_groups(objective, design))
     done = 0
-    first: list[dict[str, Any]] = []
+    first = []
     for number, rows in enumerate(groups):
-        first.append(_piece(checkpoint, f"moved-{number}", lambda rows=rows: _evaluate_moves(objective, design, rows)))  # type: ignore[misc]
+        moves = partial(_evaluate_moves, objective, design, rows)
+        first.append(checkpoint.load_or_compute(f"moved-{number}", moves))
         follow(done := done + len(rows) * (1 + LINE * design.space.dim))
     loss, grad, line, far = (np.concatenate([part[name] for part in first]) for name in ("loss", "grad", "line", "far"))
     alone = Responses(loss, grad, line, design.offsets, far, np.empty((len(loss), 0)), [])
@@ -174,7 +176,7 @@ def explore(
     cross = []
     for number, rows in enumerate(groups):
         evaluate_pairs = partial(_evaluate_pairs, objective, design, rows, pairs)
-        cross.append(_piece(checkpoint, f"crossed-{number}", evaluate_pairs)["loss"])
+        cross.append(checkpoint.load_or_compute(f"crossed-{number}", evaluate_pairs)["loss"])
         follow(done := done + len(rows) * len(pairs))
     return Responses(loss, grad, line, design.offsets, far, np.concatenate(cross), pairs)
 
@@ -223,32 +225,20 @@ def _groups(objective: Objective, design: Design) -> list[range]:
     return [range(low, high) for low, high in pairwise(edges)]
 
 
-def _piece(checkpoint: Checkpoint, name: str, compute: Callable[[], dict[str, Array]]) -> dict[str, Array]:
-    found = checkpoint.load(name)
-    if found is None:
-        found = compute()
-        checkpoint.save(name, **found)
-    return found
-
-
 def _evaluate_moves(objective: Objective, design: Design, rows: range) -> dict[str, Array]:
     start = evaluate(objective, design.starts(rows), grad=True)
     widths = design.space.upper - design.space.lower
     grad = start.grad * widths if start.grad is not None else torch.empty(0)
-    moved = _losses(objective, design.move_one(rows)).reshape(len(rows), design.space.dim, -1)
+    moves = evaluate_parts(objective, design.move_one(rows), grad=False)
+    moved = moves.loss.numpy().reshape(len(rows), design.space.dim, -1)
     return {"loss": start.loss.numpy(), "grad": grad.numpy(), "line": moved[:, :, :-1], "far": moved[:, :, -1]}
 
 
 def _evaluate_pairs(
     objective: Objective, design: Design, rows: range, pairs: list[tuple[int, int]]
 ) -> dict[str, Array]:
-    return {"loss": _losses(objective, design.move_pairs(rows, pairs)).reshape(len(rows), len(pairs))}
-
-
-def _losses(objective: Objective, x: Float[Tensor, "point dim"]) -> Array:
-    at_once = objective.preferred_batch
-    parts = [evaluate(objective, part, grad=False) for part in torch.split(x, at_once)]
-    return np.concatenate([part.loss.numpy() for part in parts])
+    found = evaluate_parts(objective, design.move_pairs(rows, pairs), grad=False)
+    return {"loss": found.loss.numpy().reshape(len(rows), len(pairs))}
 
 
 def _mean(values: Array, axis: int) -> Array:

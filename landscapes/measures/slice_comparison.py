@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 import torch
 import xarray as xr
-from numpy.typing import NDArray
 
 from ..convert import NOT_JSON
 from ..identity import (
@@ -27,7 +26,7 @@ from ..large import refuse_large
 from ..lattice import sampled_lattice
 from ..objective import Status
 from ..space import scaled_labels
-from ..statistics import Estimate, gradient_error, jackknife, median_of, p95_of, spearman
+from ..statistics import Estimate, Values, exactly, gradient_error, jackknife, median_of, p95_of, spearman
 from .ruggedness import box_slopes, span
 
 if TYPE_CHECKING:
@@ -36,7 +35,6 @@ if TYPE_CHECKING:
     from ..draw.figure import Picture
     from ..plane import Plane
 
-Values = NDArray[np.float64]
 PLACING = ("plane", "cut", "boxed", "parameters")  # in a slice's identity: where it lies, not what it is of
 PARTS = {"basis": "directions", "lower": "lower ends", "upper": "upper ends", "origin": "points they go through"}
 ROUNDING = 1e-9  # planes that are no farther apart, relatively, are the same
@@ -148,10 +146,8 @@ class SliceComparison:
     def _numbers(self) -> list[tuple[str, Estimate, str]]:
         """Return each number with its name and unit."""
         names = {
-            "median": "median difference",
-            "p95": "difference, 95 % of the points",
-            "largest": "largest difference",
-        }
+            "median": "median difference", "p95": "difference, 95 % of the points", "largest": "largest difference",
+        }  # fmt: skip
         rows = [("loss in both", exactly(self.compared / self.points), POINTS)]
         rows += [(name, getattr(self.loss, field), self.loss_unit) for field, name in names.items()]
         shares = self.loss.shares
@@ -366,11 +362,6 @@ def _over_blocks(
         return float(statistic(*(one.ravel()[rows] for one in fields))) if len(rows) else math.nan
 
     return jackknife(of, numbers, least=least, most=most)
-
-
-def exactly(value: float) -> Estimate:
-    """Return a number that is of these samples, and estimates nothing."""
-    return Estimate(value, math.nan, math.nan)
 
 
 def _share(estimate: Estimate, whole: float) -> Estimate:

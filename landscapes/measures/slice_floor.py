@@ -77,7 +77,7 @@ def find_floor(
     """Measure the numerical floor of a slice at a few of its samples; None where its objective has no replicas.
 
     The samples are those nearest to Sobol points; their own losses are the slice's. A replica is evaluated as what
-    `through` returns of it. Raises what `measure_floor` does.
+    `through` returns of it. Raises what `evaluate_replicas` does.
     """
     replicas = objective.replicas()
     if not replicas:
@@ -115,12 +115,9 @@ def spread_samples(dataset: xr.Dataset, points: int, *, seed: int = 0) -> NDArra
 
 
 def sample_points(dataset: xr.Dataset) -> Float[Tensor, "sample dim"]:
-    """Return the parameters at all samples of a slice, in the order of its array."""
+    """Return the parameters at all samples of a slice, v before u."""
     plane = plane_of(dataset)
-    axes = dict(zip(("u", "v"), (axis.numpy() for axis in plane.axes()), strict=False))
-    grid = np.meshgrid(*(axes[str(name)] for name in dataset["loss"].dims), indexing="ij")
-    by_name = dict(zip(map(str, dataset["loss"].dims), grid, strict=True))
-    return plane.lift(torch.from_numpy(np.stack([by_name[name].ravel() for name in axes], axis=1)))
+    return plane.grid().reshape(-1, plane.dim)
 
 
 def evaluation_of(dataset: xr.Dataset) -> Evaluation:

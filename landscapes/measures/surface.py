@@ -25,8 +25,8 @@ from ..identity import plane_of
 from ..lattice import lift_between
 from ..objective import Objective, evaluate
 from ..plane import Plane
-from ..statistics import Estimate, Values, exact_share, fit_line, jackknife, share, student
-from .ruggedness import box_slopes, minima, span
+from ..statistics import UNKNOWN, Estimate, Values, exact_share, exactly, fit_line, from_parts, jackknife, share
+from .ruggedness import count_turns, known_mean, lines_along, losses_of, minima, span, step_slopes
 
 VERY_SMOOTH, SMOOTH, RUGGED, EXTREME = "very smooth", "smooth with local minima", "rugged", "extremely rugged"
 LEAST = 0.01  # of the range: the least prominence that counts, and the error from which samples do not tell a loss
@@ -74,7 +74,7 @@ def look_between(
     for the lowest. Along a narrow valley samples have minima that are not there: the straight way to the next has no
     pass.
     """
-    planes, losses = [plane_of(one) for one in datasets], [_loss(one) for one in datasets]
+    planes, losses = [plane_of(one) for one in datasets], [losses_of(one) for one in datasets]
     drawn = [_draw(plane.rank, places, seed) for plane in planes]
     ways = [_ways(loss, floor) for loss, floor in zip(losses, floors, strict=True)]
     x = []
@@ -192,14 +192,13 @@ def measure_surface(
 
     `floor` [loss unit] is what noise or numerics alone put losses apart by, `own_range` that of the whole environment.
     """
-    loss = _loss(dataset)
+    loss = losses_of(dataset)
     whole, floor = span(loss), max(floor, rounding(loss))
     if not whole > max(floor, LEAST * (own_range or 0.0)):
-        none = Estimate(math.nan, math.nan, math.nan)
-        flat = math.isfinite(whole)
+        none, flat = UNKNOWN, math.isfinite(whole)
         return Surface(whole, floor, floor, flat, none, (none,) * loss.ndim, none, none, none, False, None, False, "")
     depth = max(floor, LEAST * whole)
-    slope = _step_slopes(dataset) if "grad" in dataset else None
+    slope = step_slopes(dataset) if "grad" in dataset else None
     known = _Samples(loss, slope, depth) if between is None else _Probed(loss, slope, depth, between, floor)
     bands = [max(floor, depth * BAND), depth, max(floor, depth / BAND)]
     counts = [max(1, int((known.prominence > bound).sum())) for bound in bands]
@@ -236,7 +235,7 @@ class _Samples:
         known = _finite(self.error)
         self.off = share(int((known > depth).sum()), len(known))
         self.minima = minima(loss)
-        self.prominence, self.holder = self.minima.depth, Estimate(math.nan, math.nan, math.nan)
+        self.prominence, self.holder = self.minima.depth, UNKNOWN
         self.smooth = bool(len(known)) and float(np.mean(known**2)) < EXPLAINED * float(np.mean(rise**2))
 
     def doubt(self, word: str) -> str:
@@ -307,20 +306,9 @@ def turning_points(loss: Values, axis: int, depth: float) -> float:
 
     A line counts where at least half of its samples have a loss.
     """
-    lines = np.moveaxis(loss, axis, -1).reshape(-1, loss.shape[axis])
+    lines = lines_along(loss, axis)
     lines = lines[np.isfinite(lines).mean(axis=1) >= 0.5]
-    if not len(lines):
-        return math.nan
-    high, low = np.full(len(lines), -np.inf), np.full(len(lines), np.inf)
-    way, turned = np.zeros(len(lines), int), 0  # 0 while a line has gone nowhere
-    for at in lines.T:
-        high, low = np.fmax(high, at), np.fmin(low, at)
-        with np.errstate(invalid="ignore"):
-            down, up = (way >= 0) & (high - at >= depth), (way <= 0) & (at - low >= depth)
-        turned += int((way[down | up] != 0).sum())
-        way = np.where(down, -1, np.where(up, 1, way))
-        high, low = np.where(up | down, at, high), np.where(up | down, at, low)
-    return turned / len(lines)
+    return count_turns(lines, depth) / len(lines) if len(lines) else math.nan
 
 
 def level_share(loss: Values, floor: float) -> Estimate:
@@ -335,7 +323,7 @@ def level_share(loss: Values, floor: float) -> Estimate:
     ranges = np.ptp(windows, axis=tuple(range(-loss.ndim, 0)))
     levels = np.where(np.isfinite(ranges), (ranges <= max(bound, floor)).astype(float), np.nan)
     apart = math.prod(points // (width + 1) for points, width in zip(loss.shape, widths, strict=True))
-    found = exact_share(jackknife(_known_mean, levels, least=0.0, most=1.0), apart)
+    found = exact_share(jackknife(known_mean, levels, least=0.0, most=1.0), apart)
     return Estimate(math.nan, math.nan, found.high) if floor > bound else found
 
 
@@ -346,11 +334,9 @@ def short_exponent(between: Between, floor: float) -> Estimate:
     whose differences are within `floor` [loss unit] are left out; NaN where fewer than three are left.
     """
     rises = between.rise[np.isfinite(between.rise).all(axis=1)]
-    if len(rises) < 2 * GROUPS:
-        return Estimate(math.nan, math.nan, math.nan)
-    seen = rises.mean(axis=0) > max(floor, 0.0)
+    seen = rises.mean(axis=0) > max(floor, 0.0) if len(rises) >= 2 * GROUPS else np.zeros(0)
     if seen.sum() < 3:
-        return Estimate(math.nan, math.nan, math.nan)
+        return UNKNOWN
     distances = np.log(np.array(DISTANCES)[seen])
 
     def exponent(part: Values) -> float:
@@ -358,11 +344,8 @@ def short_exponent(between: Between, floor: float) -> Estimate:
         return fit_line(distances, np.log(apart)).slope if (apart > 0).all() else math.nan
 
     value = exponent(rises)
-    parts = np.array([exponent(np.delete(rises, slice(k, None, GROUPS), axis=0)) for k in range(GROUPS)])
-    if not np.isfinite(parts).all():
-        return Estimate(value, math.nan, math.nan)
-    reach = math.sqrt((GROUPS - 1) * float(np.var(parts))) * float(student(GROUPS - 1))
-    return Estimate(value, value - reach, value + reach)
+    parts = [exponent(np.delete(rises, slice(k, None, GROUPS), axis=0)) for k in range(GROUPS)]
+    return from_parts(value, parts) if np.isfinite(parts).all() else exactly(value)
 
 
 def rounding(loss: Values) -> float:
@@ -433,19 +416,5 @@ def _interpolate(loss: Values, slope: Values | None, places: Values) -> Values:
     return found
 
 
-def _loss(dataset: xr.Dataset) -> Values:
-    return dataset["loss"].transpose("v", "u", missing_dims="ignore").to_numpy().astype(float)
-
-
-def _step_slopes(dataset: xr.Dataset) -> Values:
-    slopes: Values = (box_slopes(dataset) / (np.array(plane_of(dataset).resolution) - 1))[..., ::-1]
-    return slopes
-
-
 def _finite(values: Values) -> Values:
     return values[np.isfinite(values)]
-
-
-def _known_mean(values: Values) -> float:
-    known = _finite(values)
-    return float(known.mean()) if known.size else math.nan

@@ -23,10 +23,10 @@ import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import cast
 
 import numpy as np
 import xarray as xr
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from ..convert import from_json, to_json
@@ -36,7 +36,7 @@ from ..lattice import has_all_gradients, lift_between
 from ..objective import Objective, Status, evaluate
 from ..plane import Plane
 from ..statistics import Estimate, Values, share
-from .ruggedness import box_slopes, half_step, span
+from .ruggedness import half_step, losses_of, span, step_slopes
 
 ATTRIBUTE = "unresolved"  # the attribute of a slice that holds its record
 COST = {True: 5, False: 10}  # samples of a slice, with or without gradients, that cost ten times as much as a loss
@@ -100,7 +100,7 @@ def find_undersampled(
     so that any difference beyond rounding counts.
     """
     unit, dataset = unit_of(dataset["loss"].to_numpy()), in_unit(dataset)
-    loss = dataset["loss"].transpose("v", "u", missing_dims="ignore").to_numpy()
+    loss = losses_of(dataset)
     slope = _step_slopes(dataset, loss)
     least = _least(loss, floor / unit)
     strata = _strata(loss, slope, least)
@@ -162,7 +162,7 @@ def contradicted_cells(dataset: xr.Dataset) -> NDArray[np.bool_]:
     says on, and without a record from half a step of a ramp through the range.
     """
     known, unit, dataset = Undersampled.of(dataset), unit_of(dataset["loss"].to_numpy()), in_unit(dataset)
-    loss = dataset["loss"].transpose("v", "u", missing_dims="ignore").to_numpy()
+    loss = losses_of(dataset)
     least = known.least / unit if known and math.isfinite(known.least) else _least(loss, 0.0)
     found = np.zeros([points - 1 for points in loss.shape], dtype=bool)
     found[tuple(_strata(loss, _step_slopes(dataset, loss), least)[CONTRADICTED].T)] = True
@@ -180,8 +180,7 @@ def _step_slopes(dataset: xr.Dataset, loss: Values) -> Values:
     """Return the derivatives by a step from sample to sample along each axis of the array, axis last."""
     if not has_all_gradients(dataset):
         return np.stack([np.gradient(loss, axis=axis) for axis in range(loss.ndim)], axis=-1)
-    slopes: Values = (box_slopes(dataset) / (np.array(plane_of(dataset).resolution) - 1))[..., ::-1]
-    return np.clip(slopes, -LARGE, LARGE)  # no loss continues like that, and sums of them are numbers
+    return np.clip(step_slopes(dataset), -LARGE, LARGE)  # no loss continues like that, and sums of them are numbers
 
 
 def _strata(loss: Values, slope: Values, least: float) -> dict[str, Cells]:
@@ -224,27 +223,28 @@ def _pairs(values: Values, axis: int) -> tuple[Values, Values]:
 
 def _of_cells(edges: Sequence[Values]) -> Values:
     """Return the largest value of the edges of each cell, NaN where one is."""
-    found: Values | None = None
+    rank, most = len(edges), list[Values]()
     for axis, values in enumerate(edges):
-        most = values
-        for other in range(values.ndim):
-            most = most if other == axis else np.maximum(*_pairs(most, other))
-        found = most if found is None else np.maximum(found, most)
-    return cast("Values", found)
+        windows = sliding_window_view(values, [1 if other == axis else 2 for other in range(rank)])
+        most.append(windows.max(axis=tuple(range(rank, 2 * rank))))
+    found: Values = np.maximum.reduce(most)
+    return found
 
 
+@dataclass
 class _Look:
     """Look into cells of a slice by new evaluations, and count them.
 
     An answer is 1 for a cell that is undersampled, 0 for one that is not, NaN where an evaluation failed.
     """
 
-    def __init__(
-        self, objective: Objective, plane: Plane, loss: Values, slope: Values, least: float, unit: float
-    ) -> None:
-        self.objective, self.plane, self.loss, self.slope, self.least = objective, plane, loss, slope, least
-        self.unit = unit  # of losses, slopes and `least`
-        self.episodes = 0
+    objective: Objective
+    plane: Plane
+    loss: Values
+    slope: Values
+    least: float
+    unit: float  # of losses, slopes and `least`
+    episodes: int = 0
 
     def ask(self, at: Values) -> Values:
         """Return the losses at places between samples, shape (count, rank), in steps along each axis of the array."""

@@ -13,15 +13,17 @@ from typing import ClassVar
 
 import numpy as np
 import xarray as xr
+from jaxtyping import Float
+from torch import Tensor
 
 from ..identity import plane_of
-from ..objective import Objective, evaluate
+from ..objective import Evaluation, Objective, ObjectiveWrapper, evaluate, in_box
 from .discontinuities import Count, Jumps, find_jumps
 from .floor import Floor
 from .following import FOLLOWING_WORDS, Following, follow_samples, measure_following
 from .noise import noise_floor
 from .ruggedness import span
-from .slice_floor import counted_from
+from .slice_floor import counted_from, floor_of
 from .surface import EXTREME, PLACES, RUGGED, SMOOTH, VERY_SMOOTH, Surface, look_between, measure_surface
 
 FAILS, FLAT, NOISY, LARGE_FLAT, DISCONTINUOUS = (
@@ -170,6 +172,22 @@ class Verdict:
         return f"95 % of repeats agree within {100 * self.noise:.2g} % of the range"
 
 
+class CountedObjective(ObjectiveWrapper):
+    """Evaluate an objective where it may be asked, and count all points and those where it may not, which are `cut`."""
+
+    def __init__(self, objective: Objective) -> None:
+        super().__init__(objective)
+        self.beyond_box = True  # those are left out here
+        self.asked = self.cut = 0
+
+    def evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool = True) -> Evaluation:
+        """Return losses, and gradients if asked."""
+        self.asked += len(x)
+        if not self.objective.beyond_box:
+            self.cut += int((~in_box(self.space, x)).sum())
+        return evaluate(self.objective, x, grad=grad)
+
+
 def _failed(failed: int, samples: int) -> str:
     return f"no loss at {failed / samples:.1%} of the samples" if failed else "a loss at every sample"
 
@@ -211,25 +229,22 @@ def _follow(
     objective: Objective, datasets: Sequence[xr.Dataset], *, deviation: float, points: int, smoothed: int, seed: int
 ) -> Sequence[Following | None]:
     """Measure how gradients follow on slices that have gradients, None for the others."""
-    found: list[Following | None] = [None] * len(datasets)
-    able = [number for number, one in enumerate(datasets) if "grad" in one]
-    if able:
-        planes = [plane_of(datasets[number]) for number in able]
-        ranges = [float(np.nan_to_num(span(datasets[number]["loss"].to_numpy()))) for number in able]
-        told = measure_following(
-            objective, planes, ranges=ranges, deviation=deviation, points=points, smoothed=smoothed, seed=seed
-        )
-        for number, one in zip(able, told, strict=True):
-            found[number] = one
-    return found
+    able = [one for one in datasets if "grad" in one]
+    if not able:
+        return [None] * len(datasets)
+    ranges = [float(np.nan_to_num(span(one["loss"].to_numpy()))) for one in able]
+    planes = [plane_of(one) for one in able]
+    told = measure_following(
+        objective, planes, ranges=ranges, deviation=deviation, points=points, smoothed=smoothed, seed=seed
+    )
+    found = iter(told)
+    return [next(found) if "grad" in one else None for one in datasets]
 
 
-def judge_samples(
-    dataset: xr.Dataset, *, deviation: float | None = None, floor: Floor | None = None, own_range: float | None = None
-) -> Verdict:
+def judge_samples(dataset: xr.Dataset, *, deviation: float | None = None) -> Verdict:
     """Judge a slice from its samples alone: jumps are not searched, gradients compared where samples are close."""
-    least = least_difference(dataset, deviation or 0.0, floor)
-    surface = measure_surface(dataset, floor=least, own_range=own_range)
+    floor = floor_of(dataset)
+    surface = measure_surface(dataset, floor=least_difference(dataset, deviation or 0.0, floor))
     following = follow_samples(dataset, deviation=float(np.nan_to_num(deviation or 0.0)), points=dataset["loss"].size)
     return _verdict(dataset, surface, None, following, deviation, floor)
 

@@ -17,9 +17,8 @@ from gradscape.jobs.report import PaperWords, Report, environments_markdown
 from gradscape.landscapes.convert import from_json
 from gradscape.landscapes.measures.discontinuities import Jump, Jumps
 from gradscape.landscapes.measures.following import Following, ScaleCosine
-from gradscape.landscapes.measures.slice_comparison import exactly
-from gradscape.landscapes.statistics import Estimate
-from gradscape.landscapes.storage.records import read_json
+from gradscape.landscapes.statistics import Estimate, exactly
+from gradscape.landscapes.storage.records import read_json, write_record
 
 from ..command import Run, make
 
@@ -49,11 +48,27 @@ def test_a_slice_is_reported_in_numbers_and_words(run: Run, cut: Path, tmp_path:
     named = read_json(tmp_path / "told/measures.json")
     assert named["Local minima deeper than 1 % of the range"] == "3"
     assert (tmp_path / "told/gradient-quality.png").read_bytes().startswith(b"\x89PNG")
+    file = tmp_path / "told/report.json"
+    write_record(file, {**read_json(file), "device": "cuda"})
     again = run("report cut --points-per-axis 2 --out told")
-    assert "there already" in again.stderr
+    assert "told is there already, measured on cuda" in again.stderr
     assert "smooth with local minima: 3 minima and " in again.stdout
     assert "a loss at every sample\n" in again.stdout
     run.refuse("report cut --points-per-axis 3 --out told", said="holds another report (points 2 there, 3 here)")
+
+
+def test_a_stopped_report_says_what_is_kept_and_that_the_slice_is_of_another_model(
+    run: Run, cut: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stop(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(job, "measure", stop)
+    monkeypatch.setattr(Function, "model_version", 99)
+    done = run("report cut --out told")
+    assert done.returncode == 130
+    assert "stopped: 0 of 1 reports are kept" in done.stderr
+    assert "warning: cut was sampled otherwise (model_version 1 there, 99 here" in done.stderr
 
 
 def test_features_over_all_parameters_are_added_to_a_report_that_is_there(run: Run, cut: Path, tmp_path: Path) -> None:
@@ -169,14 +184,6 @@ def test_a_row_of_an_environment_spans_its_slices_and_says_whether_the_paper_agr
     )
     assert environments_markdown(two[1:]).endswith("| yes |\n")
     assert environments_markdown([judged(known, 0, 0.0, 0.0, None)]).endswith("| no |\n")
-
-
-def test_a_slice_of_another_model_is_reported_with_a_warning(
-    run: Run, cut: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(Function, "model_version", 99)
-    done = run("report cut --points-per-axis 2 --out told")
-    assert "warning: cut was sampled otherwise (model_version 1 there, 99 here" in done.stderr
 
 
 @pytest.mark.parametrize("cut", [["rastrigin", "--set", "dim=5"], ["branin"]])

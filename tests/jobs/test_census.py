@@ -1,11 +1,9 @@
 """`landscape census` and `gs.census`: what they leave, continue from, and refuse."""
 
-import json
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,14 +12,14 @@ import torch
 import gradscape as gs
 from gradscape.envs.base import Environment
 from gradscape.jobs import census as module
-from gradscape.jobs.census import CensusJob, open_census
+from gradscape.jobs.census import CensusJob
 from gradscape.jobs.scene import SceneSpec
-from gradscape.landscapes.convert import to_json
-from gradscape.landscapes.measures.census import MEASURES, CensusDesign
+from gradscape.landscapes.convert import from_json, to_json
+from gradscape.landscapes.measures.census import MEASURES, Census, CensusDesign, survey
 from gradscape.landscapes.objective import Evaluation
 from gradscape.landscapes.storage.records import read_json
 
-from ..command import Said
+from ..command import Run
 
 HOW = {"slices": 4, "resolution": 8}
 SCENE = SceneSpec("ackley", device="cpu", options={"dim": 3})
@@ -36,12 +34,10 @@ def test_a_census_is_written_read_and_drawn(tmp_path: Path) -> None:
     grades = [found.words[word] for word in ("gradients follow", "gradients follow loosely", "gradients do not follow")]
     assert sum(one.value for one in grades) == 1
     assert all(one.low < one.high for one in grades)
-    again = open_census(tmp_path / "made")
-    assert (
-        to_json(again)
-        == to_json(found)
-        == {name: value for name, value in read_json(tmp_path / "made/census.json").items() if name != "checksum"}
-    )
+    record = read_json(tmp_path / "made/census.json")
+    assert to_json(from_json(Census, record)) == to_json(found) == {k: v for k, v in record.items() if k != "checksum"}
+    with np.load(tmp_path / "made/census.npz") as arrays:
+        assert np.array_equal(arrays["loss"], found.losses)
     assert (tmp_path / "made/census.png").read_bytes().startswith(b"\x89PNG")
 
 
@@ -91,30 +87,12 @@ def test_what_cannot_be_is_refused(tmp_path: Path) -> None:
         CensusJob.open(SCENE, slices=4, resolution=9, out=tmp_path / "made")
 
 
-def test_the_verb_and_python_say_the_same(run: Callable[..., Said], tmp_path: Path) -> None:
-    said = run(
-        *[
-            "census",
-            "ackley",
-            "--set",
-            "dim=3",
-            "--slices",
-            "4",
-            "--resolution",
-            "8",
-            "--device",
-            "cpu",
-            "--out",
-            "made",
-            "--json",
-        ],
-        cwd=tmp_path,
-    )
-    assert said.returncode == 0, said.stderr
+def test_the_verb_and_python_say_the_same(run: Run, tmp_path: Path) -> None:
+    said = run.ok("census ackley --set dim=3 --slices 4 --resolution 8 --device cpu --out made --json")
     assert "slices that it fits" in said.stderr
     found = gs.census("ackley", slices=4, resolution=8, out=tmp_path / "called", device="cpu", options={"dim": 3})
     for name in ("slices", "words", "parts"):
-        assert json.loads(said.stdout)[name] == to_json(found)[name]
+        assert said.json[name] == to_json(found)[name]
 
 
 def test_gradients_at_every_second_sample_change_no_measure(tmp_path: Path) -> None:
@@ -127,7 +105,7 @@ def test_gradients_at_every_second_sample_change_no_measure(tmp_path: Path) -> N
     for one, other in zip(second.slices, every.slices, strict=True):
         assert one.measures == other.measures
         assert one.measures[MEASURES.index("cosine")] is not None
-    assert open_census(tmp_path / "second").gradients == 2
+    assert second.gradients == 2
     with pytest.raises(ValueError, match="gradients"):
         CensusJob.open(scene, **HOW, out=tmp_path / "second")
 
@@ -142,7 +120,7 @@ def test_slices_surveyed_abreast_are_those_surveyed_alone_in_fewer_batches(monke
     env, asked = scene.make(), list[int]()
     design = CensusDesign.draw(env.space, 4, along="pairs", resolution=8, seed=0)
     group = [(f"slice-{number}", design.plane(*place)) for number, place in enumerate(design.places)]
-    how = module._Judging(deviation=0.0, own_range=None, floor=None, seed=0, gradients=2)
+    how = partial(survey, deviation=0.0, seed=0, gradients=2)
     alone = [module._survey(env, [one], how)[0] for one in group]
     evaluate = type(env).evaluate
 
@@ -169,4 +147,4 @@ def test_what_a_slice_raises_ends_all_of_its_group() -> None:
     design = CensusDesign.draw(env.space, 4, along="pairs", resolution=8, seed=0)
     group = [(f"slice-{number}", design.plane(*place)) for number, place in enumerate(design.places)]
     with pytest.raises(TypeError, match="deviation"):
-        module._survey(env, group, SimpleNamespace(seed=0))
+        module._survey(env, group, partial(survey, seed=0))

@@ -75,19 +75,14 @@ def test_the_eigenvalues_of_a_quadratic_form_lie_within_their_errors(dim: int, d
     assert found.asymmetry <= 3 * found.asymmetry_explained + 1e-9
 
 
-def test_eigenvectors_are_those_of_the_form_and_point_one_way() -> None:
+def test_eigenvectors_are_those_of_the_form_and_equal_eigenvalues_are_found_twice() -> None:
     f = form(SPECTRA[10])
     found = spectrum(f, f.space.center)
     frame = np.linalg.qr(np.random.default_rng(0).standard_normal((10, 10)))[0]
-    overlap = np.abs(found.vectors @ frame)
-    np.testing.assert_allclose(overlap, np.eye(10), atol=1e-6)
+    np.testing.assert_allclose(np.abs(found.vectors @ frame), np.eye(10), atol=1e-6)
     assert (np.take_along_axis(found.vectors, np.abs(found.vectors).argmax(axis=1)[:, None], axis=1) > 0).all()
-
-
-def test_an_eigenvalue_that_is_there_twice_is_found_twice() -> None:
-    values = np.concatenate([np.ones(60), 2 * np.ones(58), [7.0, 7.0]])
-    f = form(values)
-    assert spectrum(f, f.space.center).values[:3] == pytest.approx([7, 7, 2])
+    twice = form(np.concatenate([np.ones(60), 2 * np.ones(58), [7.0, 7.0]]))
+    assert spectrum(twice, twice.space.center).values[:3] == pytest.approx([7, 7, 2])
 
 
 def test_the_sampled_spectrum_has_the_share_of_negative_eigenvalues_and_the_trace() -> None:
@@ -111,18 +106,14 @@ def test_intervals_of_the_trace_cover_it_as_often_as_they_say(monkeypatch: pytes
 
 
 def test_truncation_is_within_the_errors_where_higher_derivatives_are_large() -> None:
-    f = gs.from_torch(lambda x: torch.sin(30 * x).sum(dim=1), SPACE)
-    found = spectrum(f)
+    found = spectrum(gs.from_torch(lambda x: torch.sin(30 * x).sum(dim=1), SPACE))
     true = np.sort(-4 * 900 * np.sin(30 * POINT.numpy()))[::-1]
     assert (np.abs(found.values - true) <= found.error).all()
     assert found.error.max() < 1e-4 * np.abs(true).max()
-
-
-def test_rosenbrock_at_its_minimum() -> None:
-    found = spectrum(gs.make("rosenbrock"), torch.ones(2, dtype=torch.float64))
+    lowest = spectrum(gs.make("rosenbrock"), torch.ones(2, dtype=torch.float64))
     exact = np.linalg.eigvalsh(np.array([[802.0, -400.0], [-400.0, 200.0]]) * 15**2)[::-1]  # its box is 15 wide
-    assert (np.abs(found.values - exact) <= found.error).all()
-    assert found.values[0] / found.values[1] == pytest.approx(2508.01, abs=0.1)
+    assert (np.abs(lowest.values - exact) <= lowest.error).all()
+    assert lowest.values[0] / lowest.values[1] == pytest.approx(2508.01, abs=0.1)
 
 
 @pytest.mark.parametrize("noise", [1e-4, 1e-2, 1.0])
@@ -172,27 +163,19 @@ def test_gradients_of_no_loss_are_asymmetric_by_probes_too() -> None:
     assert found.asymmetry > 1e3 * found.asymmetry_explained
 
 
-def test_losses_dispute_gradients_of_twice_the_loss() -> None:
-    found = spectrum(own(lambda x: (half_square(x), 2 * x @ A)))
-    assert found.disputed.all()
-    assert found.error == pytest.approx(np.abs(TRUE))
-    assert found.by_losses == pytest.approx(TRUE)
-
-
-def test_a_jump_of_the_loss_spoils_the_direction_that_crosses_it() -> None:
-    f = own(lambda x: (half_square(x) + (x[:, 0] > 0.2 + 1e-7), x @ A))
-    found = spectrum(f)
-    assert found.disputed.tolist() == [True, False, False]
-    assert found.error[0] > abs(found.values[0])
-
-
-def test_a_kink_at_the_point_cannot_be_told_and_one_beside_it_does_no_harm() -> None:
+def test_losses_dispute_gradients_of_twice_the_loss_jumps_and_kinks_at_the_point() -> None:
+    twice = spectrum(own(lambda x: (half_square(x), 2 * x @ A)))
+    assert twice.disputed.all()
+    assert twice.error == pytest.approx(np.abs(TRUE))
+    assert twice.by_losses == pytest.approx(TRUE)
+    jump = spectrum(own(lambda x: (half_square(x) + (x[:, 0] > 0.2 + 1e-7), x @ A)))
+    assert jump.disputed.tolist() == [True, False, False]
+    assert jump.error[0] > abs(jump.values[0])
     f = gs.from_torch(lambda x: x.abs().sum(dim=1) + half_square(x), SPACE)
-    at = spectrum(f, torch.tensor([0.0, 0.5, 0.5], dtype=torch.float64))
-    assert abs(at.values[0]) < at.error[0]
-    beside = spectrum(f, torch.tensor([1e-2, 0.5, 0.5], dtype=torch.float64))
-    assert beside.values == pytest.approx(TRUE, rel=1e-6)
-    assert (beside.error < 1e-6).all()
+    kink, near = (spectrum(f, torch.tensor([at, 0.5, 0.5], dtype=torch.float64)) for at in (0.0, 1e-2))
+    assert abs(kink.values[0]) < kink.error[0]
+    assert near.values == pytest.approx(TRUE, rel=1e-6)
+    assert (near.error < 1e-6).all()
 
 
 def test_differences_of_losses_where_there_are_no_gradients() -> None:
@@ -208,11 +191,31 @@ def test_differences_of_losses_where_there_are_no_gradients() -> None:
     assert found.error.max() < 1e-4
 
 
-def test_too_many_parameters_without_gradients_are_refused_with_what_to_do() -> None:
-    space = gs.ParameterSpace.box([f"p{at}" for at in range(31)], -1.0, 1.0)
-    f = gs.from_numpy(lambda x: (x**2).sum(axis=1), space, name="bare")
-    with pytest.raises(ValueError, match=r"30 parameters at most, and it has 31: give it gradients \(gs.from_torch"):
-        spectrum(f, space.center)
+@pytest.mark.parametrize(
+    ("f", "x", "said"),
+    [
+        (
+            gs.from_numpy(lambda x: (x**2).sum(axis=1), gs.ParameterSpace.box([f"p{k}" for k in range(31)], -1.0, 1.0)),
+            torch.zeros(31).double(),
+            r"30 parameters at most, and it has 31: give it gradients \(gs.from_torch",
+        ),
+        (
+            gs.from_torch(lambda x: half_square(x) + (1e-9 - (x - POINT).norm(dim=1)).sqrt() * 0, SPACE, name="thin"),
+            POINT,
+            r"thin failed near this point.*NONFINITE at [abc] [-+].* of the box from there",
+        ),
+        (
+            gs.from_torch(lambda x: x.abs().sqrt().sum(dim=1), SPACE),
+            torch.zeros(3).double(),
+            "no finite loss and gradient at this point: NO_GRADIENT there",
+        ),
+    ],
+    ids=["no gradients", "fails at every step", "fails itself"],
+)
+def test_points_without_a_hessian_are_refused(f: gs.Environment, x: torch.Tensor, said: str) -> None:
+    with pytest.raises(ValueError, match=said) as refused:
+        spectrum(f, x)
+    assert isinstance(refused.value, FailedPointsError) is (f.space.dim == 3)
 
 
 def test_a_failing_step_gives_way_to_a_smaller_one() -> None:
@@ -223,21 +226,6 @@ def test_a_failing_step_gives_way_to_a_smaller_one() -> None:
     assert curvature.failures[-1] == "NONFINITE at a +0.016 of the box from there"
     assert found.step == 1 / 256
     assert found.values == pytest.approx(TRUE)
-
-
-def test_points_that_fail_at_every_step_are_named() -> None:
-    f = gs.from_torch(
-        lambda x: half_square(x) + torch.where((x - POINT).norm(dim=1) < 1e-9, 0.0, torch.nan), SPACE, name="thin"
-    )
-    with pytest.raises(
-        FailedPointsError, match=r"thin failed near this point.*NONFINITE at [abc] [-+].* of the box from there"
-    ):
-        spectrum(f)
-
-
-def test_a_point_that_fails_has_no_hessian() -> None:
-    with pytest.raises(FailedPointsError, match="no finite loss and gradient at this point: NO_GRADIENT there"):
-        spectrum(gs.from_torch(lambda x: x.abs().sqrt().sum(dim=1), SPACE), torch.zeros(3, dtype=torch.float64))
 
 
 def test_a_point_at_the_bounds_is_moved_inwards_and_one_beyond_refused() -> None:

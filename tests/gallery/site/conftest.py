@@ -20,12 +20,11 @@ from gradscape.jobs.card import save_slices
 from gradscape.jobs.report import PaperWords, Report
 from gradscape.landscapes.convert import to_json
 from gradscape.landscapes.measures.following import Following, ScaleCosine
-from gradscape.landscapes.measures.slice_comparison import exactly
 from gradscape.landscapes.objective import Evaluation, Objective
 from gradscape.landscapes.plane import Plane
 from gradscape.landscapes.sampling.fill import sample
 from gradscape.landscapes.space import ParameterSpace
-from gradscape.landscapes.statistics import Estimate
+from gradscape.landscapes.statistics import Estimate, exactly
 from gradscape.landscapes.storage.records import write_record
 from gradscape.landscapes.storage.store import SliceStore
 from gradscape.optim.league import SceneStandings

@@ -35,30 +35,33 @@ class Bowl(Objective):
         return Evaluation.from_results(x.square().sum(dim=1), 2 * x if grad else None)
 
 
+def drawn(dim: int, slices: int, along: str = "pairs") -> CensusDesign:
+    return CensusDesign.draw(
+        ParameterSpace.box([f"x{n}" for n in range(dim)], -1.0, 3.0), slices, along=along, resolution=8, seed=1
+    )
+
+
 def test_every_cut_goes_through_every_point_and_none_is_drawn_twice() -> None:
-    design = CensusDesign.draw(BOX, 64, along="pairs", resolution=8, seed=1)
+    design, again = drawn(5, 64), drawn(5, 64)
     assert (len(design.bases), len(design.cuts)) == (8, 8)
     assert len({cut.dims for cut in design.cuts}) == 8
     assert len(set(design.places)) == 64
     plane = design.plane(3, 2)
-    axes = list(design.cuts[2].dims or ())
     assert plane.lower.tolist() == [-1.0, -1.0]
-    held = [k for k in range(5) if k not in axes]
+    held = [k for k in range(5) if k not in (design.cuts[2].dims or ())]
     assert plane.origin[held].tolist() == design.bases[3][held].tolist()
-    again = CensusDesign.draw(BOX, 64, along="pairs", resolution=8, seed=1)
     assert torch.equal(again.bases, design.bases)
     assert again.cuts == design.cuts
 
 
 def test_few_pairs_leave_more_points_and_two_parameters_one_slice() -> None:
-    three = CensusDesign.draw(ParameterSpace.box(["a", "b", "c"], 0.0, 1.0), 16, along="pairs", resolution=8, seed=0)
+    three, two = drawn(3, 16), drawn(2, 16)
     assert (len(three.bases), len(three.cuts)) == (5, 3)
-    two = CensusDesign.draw(ParameterSpace.box(["a", "b"], 0.0, 1.0), 16, along="pairs", resolution=8, seed=0)
     assert (len(two.bases), len(two.cuts)) == (1, 1)
     with pytest.raises(ValueError, match="takes two parameters"):
-        CensusDesign.draw(ParameterSpace.box(["a"], 0.0, 1.0), 16, along="pairs", resolution=8, seed=0)
+        drawn(1, 16)
     with pytest.raises(ValueError, match="along pairs or random; got 'rows'"):
-        CensusDesign.draw(BOX, 16, along="rows", resolution=8, seed=0)
+        drawn(5, 16, "rows")
 
 
 def test_random_directions_are_orthonormal_in_widths_of_the_box_and_nothing_is_asked_outside() -> None:

@@ -12,7 +12,7 @@ import xarray as xr
 
 from gradscape import ParameterSpace, Plane, from_numpy, from_torch, sample
 from gradscape.landscapes.measures.discontinuities import EVALUATIONS_PER_PAIR, HALVINGS, LEAST, Jump, Jumps, find_jumps
-from gradscape.landscapes.measures.noise import noise
+from gradscape.landscapes.measures.noise import noise, noise_floor
 from gradscape.landscapes.objective import Objective
 from gradscape.landscapes.statistics import Estimate, share
 
@@ -116,19 +116,12 @@ def test_a_steep_slope_between_two_samples_is_no_jump(steepness: float, resoluti
     assert found.checked > 0 or resolution == 96
 
 
-def test_what_no_gradient_explains_is_found_without_gradients_too() -> None:
+def test_jumps_are_found_without_gradients_and_with_exploding_ones() -> None:
     objective, dataset = sampled(step, resolution=48)
-    found = jumps(objective, dataset.drop_vars("grad"), most=16)
-    assert len(found.found) == 16
-
-
-def test_exploding_gradients_hide_no_jump() -> None:
-    def exploding(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return (x**2).sum(axis=1) + (x[:, 0] > EDGE), 1e9 * np.sign(np.sin(1e5 * x))
-
-    objective = from_numpy(exploding, SPACE)
-    dataset = sample(objective, Plane.through(SPACE, SPACE.center, (0, 1), resolution=48))
-    found = jumps(objective, dataset, most=16)
+    assert len(jumps(objective, dataset.drop_vars("grad"), most=16).found) == 16
+    exploding = from_numpy(lambda x: ((x**2).sum(axis=1) + (x[:, 0] > EDGE), 1e9 * np.sign(np.sin(1e5 * x))), SPACE)
+    dataset = sample(exploding, Plane.through(SPACE, SPACE.center, (0, 1), resolution=48))
+    found = jumps(exploding, dataset, most=16)
     assert found.settled == found.crossed - found.hit == 8  # each of the strongest traces is a jump
     assert found.share.low < 0.5 < found.share.high
 
@@ -236,29 +229,18 @@ def test_a_slice_of_failures_or_of_one_value_has_no_jump() -> None:
         assert (found.checked, found.found, found.largest) == (0, (), 0)
 
 
-def test_noise_is_measured_where_the_objective_is_noisy() -> None:
-    rng = np.random.default_rng(0)
-
-    def noisy(x: np.ndarray) -> np.ndarray:
-        return (x**2).sum(axis=1) + 1e-3 * rng.normal(size=len(x))
-
-    found = noise(from_numpy(noisy, SPACE), SPACE.uniform(100, seed=0), rounding=1e-16)
+def test_noise_is_that_of_repeats_of_batches_and_of_rounding() -> None:
+    rng, x = np.random.default_rng(0), SPACE.uniform(100, seed=0)
+    noisy = from_numpy(lambda x: (x**2).sum(axis=1) + 1e-3 * rng.normal(size=len(x)), SPACE)
+    found = noise(noisy, x, rounding=1e-16)
     assert found.again == pytest.approx(1e-3, rel=0.15)
     assert found.batch == pytest.approx(1e-3, rel=0.25)
-    assert found.floor(2304) == pytest.approx(2 * found.deviation * math.sqrt(2 * math.log(2304)))
-
-
-def test_a_deterministic_objective_has_round_off_only() -> None:
-    exact = from_torch(lambda x: x.square().sum(1), SPACE)
-    found = noise(exact, SPACE.uniform(50, seed=0), rounding=1e-7)
-    assert found.again == found.batch == 0
-    assert 1e-8 < found.rounding < 1e-6
+    assert noise_floor(1.0, 2304) == pytest.approx(2 * math.sqrt(2 * math.log(2304)))
+    exact = noise(from_torch(lambda x: x.square().sum(1), SPACE), x, rounding=1e-7)
+    assert exact.again == exact.batch == 0
+    assert 1e-8 < exact.rounding < 1e-6
     rounded = from_torch(lambda x: x.float().square().sum(1), SPACE)
-    assert noise(rounded, SPACE.uniform(50, seed=0), rounding=2**-23).rounding > found.rounding / 10
-
-
-def test_a_loss_that_depends_on_its_batch_is_found_out() -> None:
-    leaky = from_torch(lambda x: x.sum(1) + 1e-3 * x.mean(), SPACE)
-    found = noise(leaky, SPACE.uniform(30, seed=0), rounding=1e-16)
-    assert found.again == 0
-    assert found.batch > 1e-5
+    assert noise(rounded, x, rounding=2**-23).rounding > exact.rounding / 10
+    leaky = noise(from_torch(lambda x: x.sum(1) + 1e-3 * x.mean(), SPACE), x, rounding=1e-16)
+    assert leaky.again == 0
+    assert leaky.batch > 1e-5

@@ -76,30 +76,26 @@ def test_peaks_are_the_levels_of_a_staircase() -> None:
     assert LossDistribution.of(np.append(levels, 9.0)).number_of_peaks == 3  # one loss alone is no peak
 
 
-def test_models_explain_what_they_can_express() -> None:
+def test_models_explain_what_they_can_express_unless_their_coefficients_are_too_many() -> None:
+    """With all products 2 d^2 + d coefficients, at 50 d points: too many from 25 parameters on."""
     x = points(3)
     plane = MetaModels.of(x, x @ [1.0, -2.0, 4.0] + 7)
-    assert plane.lin_simple_adj_r2 == pytest.approx(1)
-    assert plane.lin_simple_intercept == pytest.approx(7)
-    assert plane.lin_simple_coef_max_by_min == pytest.approx(4)
+    found = plane.lin_simple_adj_r2, plane.lin_simple_intercept, plane.lin_simple_coef_max_by_min
+    assert found == pytest.approx((1, 7, 4))
     product = MetaModels.of(x, (x[:, 0] - 0.5) * (x[:, 1] - 0.5))
     assert product.quad_simple_adj_r2 < 0.1 < 0.9 < product.lin_w_interact_adj_r2
-
-
-def test_models_with_too_many_coefficients_are_not_determined() -> None:
-    """With all products 2 d^2 + d coefficients, at 50 d points: too many from 25 parameters on."""
     assert math.isfinite(MetaModels.of(points(24), points(24).sum(axis=1)).quad_w_interact_adj_r2)
     many = MetaModels.of(points(25), np.square(points(25)).sum(axis=1))
     assert math.isnan(many.quad_w_interact_adj_r2)
     assert many.quad_simple_adj_r2 == pytest.approx(1)
 
 
-def test_a_cone_has_a_fitness_distance_correlation_of_one() -> None:
-    x = points(2)
-    away = np.linalg.norm(x - x[17], axis=1)
-    assert FitnessDistance.of(x, away, 1.0).fd_correlation == pytest.approx(1)
-    noise = np.random.default_rng(0).normal(size=100)
+def test_a_cone_and_one_funnel_are_told_from_noise() -> None:
+    x, noise = points(2), np.random.default_rng(0).normal(size=100)
+    assert FitnessDistance.of(x, np.linalg.norm(x - x[17], axis=1), 1.0).fd_correlation == pytest.approx(1)
     assert abs(FitnessDistance.of(x, noise, 1.0).fd_correlation) < 0.3
+    bowl, rough = (NearestBetter.of(distances_of(x), y) for y in (np.square(x - 0.5).sum(axis=1), noise))
+    assert bowl.nn_nb_mean_ratio > 0.8 > rough.nn_nb_mean_ratio
 
 
 def test_information_content_of_a_ramp_and_of_alternation() -> None:
@@ -112,26 +108,17 @@ def test_information_content_of_a_ramp_and_of_alternation() -> None:
     assert saw.eps_s == pytest.approx(0, abs=0.03)  # all steps are 1 long and 1 high
 
 
-def test_a_level_set_behind_a_plane_and_one_within_a_circle() -> None:
+def test_level_sets_lie_behind_a_plane_or_within_a_circle() -> None:
+    """Of 200 points in 40 parameters a tenth is low: fewer than a quadratic discriminant takes."""
     x = points(2)
     plane, circle = LevelSets.of(x, x @ [1.0, 2.0]), LevelSets.of(x, np.square(x - 0.5).sum(axis=1))
     assert plane.mmce_lda_50 < 0.1
     assert circle.mmce_qda_50 < 0.15 < 0.35 < circle.mmce_lda_50
-
-
-def test_a_class_with_fewer_points_than_parameters_has_no_quadratic_discriminant() -> None:
-    """Of 200 points in 40 parameters a tenth is low; the linear discriminant has the covariance of all."""
-    x = sobol(200, 40, seed=0).numpy()
-    found = LevelSets.of(x, x[:, 0])
-    assert math.isnan(found.mmce_qda_10)
-    assert math.isfinite(found.mmce_lda_10)
-    assert found.mmce_qda_50 > found.mmce_lda_50
-
-
-def test_one_funnel_attracts_more_than_noise() -> None:
-    x, noise = points(2), np.random.default_rng(0).normal(size=100)
-    bowl, rough = (NearestBetter.of(distances_of(x), y) for y in (np.square(x - 0.5).sum(axis=1), noise))
-    assert bowl.nn_nb_mean_ratio > 0.8 > rough.nn_nb_mean_ratio
+    many = sobol(200, 40, seed=0).numpy()
+    few = LevelSets.of(many, many[:, 0])
+    assert math.isnan(few.mmce_qda_10)
+    assert math.isfinite(few.mmce_lda_10)
+    assert few.mmce_qda_50 > few.mmce_lda_50
 
 
 def test_intervals_are_as_wide_as_the_scatter_of_samples() -> None:

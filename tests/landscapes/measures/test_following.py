@@ -58,17 +58,21 @@ def test_gradients_of_a_ripple_follow_it_and_not_the_bowl_that_it_is_on() -> Non
     assert "0.1 %: 1.00, follow; 1 %: " in finer.reasons["gradients do not follow"]
 
 
-@pytest.mark.parametrize("angle", [0.2, 0.8, 1.4])
-def test_the_mean_cosine_is_that_of_the_angle_by_which_gradients_are_turned(angle: float) -> None:
+@pytest.mark.parametrize(
+    ("angle", "grade", "word"),
+    [
+        (0.2, "follow", "gradients follow"),
+        (0.8, "loosely", "gradients follow loosely"),
+        (1.4, "not", "gradients do not follow"),
+    ],
+)
+def test_the_mean_cosine_is_that_of_the_angle_of_gradients(angle: float, grade: str, word: str) -> None:
     turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
     found = following(with_gradient(lambda x, slope: slope @ turn.T))
     for one in found.scales:
         assert one.cosine.value == pytest.approx(math.cos(angle))
-    assert grades(found) == [{0.2: "follow", 0.8: "loosely", 1.4: "not"}[angle]] * 3
-    assert (
-        found.words[0]
-        == {0.2: "gradients follow", 0.8: "gradients follow loosely", 1.4: "gradients do not follow"}[angle]
-    )
+    assert grades(found) == [grade] * 3
+    assert found.words[0] == word
 
 
 def test_a_grade_whose_interval_straddles_a_threshold_is_not_resolved_but_the_number_stands() -> None:
@@ -83,69 +87,58 @@ def test_a_grade_whose_interval_straddles_a_threshold_is_not_resolved_but_the_nu
     assert "not resolved" in found.sentence
 
 
-def test_opposite_gradients_do_not_follow() -> None:
-    found = following(with_gradient(lambda x, slope: -slope))
-    assert found.words == ("gradients do not follow", "gradients opposite")
-    assert [one.uphill.value for one in found.scales] == [1, 1, 1]
+SAID = {
+    "opposite": (with_gradient(lambda x, slope: -slope), "do not follow", "opposite"),
+    "random": (
+        with_gradient(lambda x, slope: np.random.default_rng(0).normal(size=x.shape)),
+        "do not follow",
+        "biased",
+    ),
+    "zero": (with_gradient(lambda x, slope: 0 * slope), "zero"),
+    "to rounding": (with_gradient(lambda x, slope: 1e-11 * slope), "zero"),
+    "zero in a half": (with_gradient(lambda x, slope: slope * (x[:, :1] > 0)), "zero"),  # where they are stuck
+    "plateau": (from_torch(lambda x: bowl(x).clamp(min=0.5), SPACE), "follow", "zero"),
+    "flat": (from_torch(lambda x: 1 + 0 * x.sum(1), SPACE), "zero"),
+    "a million times": (with_gradient(lambda x, slope: 1e6 * slope), "follow", "exploding"),
+    "steep": (from_torch(lambda x: torch.tanh(50 * x[:, 0]) + 0 * x[:, 1], SPACE), "zero"),
+    "missing": (with_gradient(lambda x, slope: np.where(x[:, :1] > 0.2, np.nan, slope)), "missing"),
+    "few are missing": (with_gradient(lambda x, slope: np.where(x[:, :1] > 0.98, np.nan, slope)), "follow"),
+    "failed": (from_torch(lambda x: torch.where(x[:, 0] > 0.2, torch.nan, bowl(x)), SPACE), "follow"),
+    # Steps finer than the Gaussian double the slope of the smoothed loss; the gradient sees none of them.
+    "stairs": (from_torch(lambda x: x.sum(1) + torch.floor(60 * x).sum(1) / 60, SPACE), "follow", "biased"),
+    "one step": (from_torch(lambda x: bowl(x) + 0.5 * (x[:, 0] > 0.2371), SPACE), "follow"),
+}
 
 
-def test_random_gradients_are_not_opposite() -> None:
-    rng = np.random.default_rng(0)
-    found = following(with_gradient(lambda x, slope: rng.normal(size=x.shape)), smoothed=0)
-    assert found.words == ("gradients do not follow",)
-    assert math.isnan(found.biased.value)
+@pytest.mark.parametrize("name", SAID)
+def test_each_fault_of_gradients_has_its_words(name: str) -> None:
+    objective, *words = SAID[name]
+    assert following(objective).words == tuple(f"gradients {word}" for word in words)
 
 
-def test_gradients_of_zero_have_a_word_and_no_cosine() -> None:
-    found = following(with_gradient(lambda x, slope: 0 * slope))
-    assert found.words == ("gradients zero",)
-    assert (found.zero.value, found.stuck.value) == (1, 1)
-    assert all(one.points == 0 and math.isnan(one.cosine.value) for one in found.scales)
-    tiny = following(with_gradient(lambda x, slope: 1e-11 * slope))
-    assert tiny.words == found.words
-    half = following(with_gradient(lambda x, slope: slope * (x[:, :1] > 0)))
-    assert half.words == ("gradients zero",)  # they do not follow where they are stuck
+def test_shares_and_cosines_are_those_of_the_points_where_gradients_are_of_no_use() -> None:
+    opposite, zero, half, plateau, missing, failed, stairs = (
+        following(SAID[name][0])
+        for name in ("opposite", "zero", "zero in a half", "plateau", "missing", "failed", "stairs")
+    )
+    assert [one.uphill.value for one in opposite.scales] == [1, 1, 1]
+    assert (zero.zero.value, zero.stuck.value) == (1, 1)
+    assert all(one.points == 0 and math.isnan(one.cosine.value) for one in zero.scales)
     assert half.stuck.low < 0.5 < half.stuck.high
-
-
-def test_gradients_of_zero_on_a_plateau_are_right_and_follow_elsewhere() -> None:
-    found = following(from_torch(lambda x: bowl(x).clamp(min=0.5), SPACE))
-    assert found.words == ("gradients follow", "gradients zero")
-    assert found.zero.low < 0.5 * math.pi / 4 / 0.95**2 < found.zero.high  # of the box without its border
-    assert found.stuck.value < 0.05
-
-
-def test_gradients_a_million_times_too_large_explode_though_their_direction_is_right() -> None:
-    found = following(with_gradient(lambda x, slope: 1e6 * slope))
-    assert found.words == ("gradients follow", "gradients exploding")
+    assert plateau.zero.low < 0.5 * math.pi / 4 / 0.95**2 < plateau.zero.high  # of the box without its border
+    assert plateau.stuck.value < 0.05
     some = following(with_gradient(lambda x, slope: slope * np.where(np.sin(1e4 * x[:, :1]) > 0.9, 1e6, 1)))
     assert some.exploding.low < math.acos(0.9) / math.pi < some.exploding.high
     assert "gradients exploding" in some.words
-    steep = following(from_torch(lambda x: torch.tanh(50 * x[:, 0]) + 0 * x[:, 1], SPACE))
-    assert "gradients exploding" not in steep.words
+    assert missing.missing.low < 0.4 < missing.missing.high
+    assert failed.missing.value == 0
+    assert stairs.biased.value == pytest.approx(1, abs=0.2)
+    assert math.isnan(following(SAID["random"][0], smoothed=0).biased.value)
 
 
-def test_missing_gradients_are_counted_beside_a_loss() -> None:
-    found = following(with_gradient(lambda x, slope: np.where(x[:, :1] > 0.2, np.nan, slope)))
-    assert found.words == ("gradients missing",)
-    assert found.missing.low < 0.4 < found.missing.high
-    few = following(with_gradient(lambda x, slope: np.where(x[:, :1] > 0.98, np.nan, slope)))
-    assert few.words == ("gradients follow",)
-
-
-def test_failed_points_miss_no_gradient() -> None:
-    failing = from_torch(lambda x: torch.where(x[:, 0] > 0.2, torch.nan, bowl(x)), SPACE)
-    found = following(failing)
-    assert (found.missing.value, found.words) == (0, ("gradients follow",))
-
-
-def test_gradients_of_the_ramp_between_steps_are_biased() -> None:
-    """Steps finer than the Gaussian double the slope of the smoothed loss; the gradient sees none of them."""
-    found = following(from_torch(lambda x: x.sum(1) + torch.floor(60 * x).sum(1) / 60, SPACE))
-    assert found.words == ("gradients follow", "gradients biased")
-    assert found.biased.value == pytest.approx(1, abs=0.2)
-    single = following(from_torch(lambda x: bowl(x) + 0.5 * (x[:, 0] > 0.2371), SPACE))
-    assert single.words == ("gradients follow",)
+def test_a_line_is_followed_forwards_or_backwards() -> None:
+    line = Plane.through(SPACE, SPACE.center, (0,), resolution=24)
+    assert following(from_torch(lambda x: x[:, 0] ** 3 + 0 * x[:, 1], SPACE), line).words == ("gradients follow",)
 
 
 def test_nothing_is_said_of_slopes_below_the_noise() -> None:
@@ -159,15 +152,17 @@ def test_nothing_is_said_of_slopes_below_the_noise() -> None:
     )
     assert found.scales[2].grade == "follow"
     assert min(one.quartiles[0] for one in found.scales[1:]) > 0.9
-    assert following(from_torch(lambda x: 1 + 0 * x.sum(1), SPACE)).words == ("gradients zero",)
 
 
-def test_the_words_are_the_same_whatever_the_samples_are() -> None:
+def test_nothing_depends_on_the_samples_and_it_comes_back_from_json() -> None:
     rippled = from_torch(lambda x: bowl(x) + 0.01 * torch.sin(400 * math.pi * x).sum(1), SPACE)
-    found = [
-        following(rippled, Plane.through(SPACE, SPACE.center, (0, 1), resolution=resolution)) for resolution in (12, 96)
-    ]
-    assert found[0] == found[1]
+    coarse, fine = (
+        following(rippled, Plane.through(SPACE, SPACE.center, (0, 1), resolution=resolution), smoothed=36)
+        for resolution in (12, 96)
+    )
+    assert coarse == fine
+    assert to_json(fine)["words"] == ["gradients do not follow"]
+    assert from_json(Following, to_json(fine)).reasons == fine.reasons
 
 
 def test_several_planes_are_measured_in_one_batch_as_each_would_be_alone() -> None:
@@ -227,26 +222,8 @@ def test_a_stored_slice_has_the_scales_that_its_samples_allow(resolution: int, s
 
 
 def test_a_stored_slice_says_what_its_gradients_are() -> None:
-    turned = follow_samples(sliced(with_gradient(lambda x, slope: -slope), 192))
-    assert turned is not None
-    assert turned.words == ("gradients do not follow", "gradients opposite")
-    missing = follow_samples(sliced(with_gradient(lambda x, slope: np.where(x[:, :1] > 0.2, np.nan, slope)), 24))
-    assert missing is not None
-    assert missing.words == ("gradients missing",)
+    assert follow_samples(sliced(SAID["opposite"][0], 192)).words == ("gradients do not follow", "gradients opposite")
+    assert follow_samples(sliced(SAID["missing"][0], 24)).words == ("gradients missing",)
     some = follow_samples(sliced(from_torch(bowl, SPACE), 48, gradients=4))
-    assert some is not None
     assert (some.points, some.missing.value) == (100, 0)
     assert follow_samples(sliced(from_torch(bowl, SPACE), 24, gradients=0)) is None
-
-
-def test_a_line_is_followed_forwards_or_backwards() -> None:
-    line = Plane.through(SPACE, SPACE.center, (0,), resolution=24)
-    found = following(from_torch(lambda x: x[:, 0] ** 3 + 0 * x[:, 1], SPACE), line)
-    assert found.words == ("gradients follow",)
-
-
-def test_it_comes_back_from_json_with_its_words() -> None:
-    found = following(with_gradient(lambda x, slope: -slope), smoothed=0)
-    stored = to_json(found)
-    assert stored["words"] == ["gradients do not follow", "gradients opposite"]
-    assert from_json(Following, stored).reasons == found.reasons

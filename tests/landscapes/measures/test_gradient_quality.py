@@ -8,40 +8,35 @@ import torch
 
 from gradscape import ParameterSpace, Plane, from_numpy, from_torch, sample
 from gradscape.landscapes.measures import gradient_quality as gradients
+from gradscape.landscapes.objective import Objective
 
 SPACE = ParameterSpace.box(("x", "y"), -1.0, 3.0)
 PLANE = Plane.through(SPACE, SPACE.center, (0, 1), resolution=12)
 
 
-def test_subgrid_lies_within_the_box_with_u_fastest() -> None:
-    places = gradients.subgrid(PLANE, 2)
-    assert places.tolist() == [[0, 0], [2, 0], [0, 2], [2, 2]]
+def rows_of(objective: Objective, points: int) -> dict[float, gradients.ScaleRow]:
+    found = gradients.compare_differences(objective, PLANE, gradients.subgrid(PLANE, points))
+    return {row.scale: row for row in gradients.scale_table(found)}
 
 
-def test_a_quadratic_agrees_at_every_scale() -> None:
+def test_a_quadratic_agrees_at_every_scale_and_at_the_samples_that_have_neighbours() -> None:
+    assert gradients.subgrid(PLANE, 2).tolist() == [[0, 0], [2, 0], [0, 2], [2, 2]]  # u fastest
     objective = from_torch(lambda x: (x[:, 0] - 0.3) ** 2 + 5 * x[:, 1] ** 2, SPACE)
-    found = gradients.compare_differences(objective, PLANE, gradients.subgrid(PLANE, 3))
-    np.testing.assert_allclose(found["cosine"], 1)
-    assert float(found["error"].max()) < 1e-7
-    free = gradients.compare_samples(sample(objective, PLANE))
-    np.testing.assert_allclose(free["cosine"].sel(scale=2 / 11)[1:-1, 1:-1], 1)
-    assert bool(free["cosine"].sel(scale=2 / 11)[0].isnull().all())  # no neighbour to differ from
+    for row in rows_of(objective, 3).values():
+        assert row.cosine.value == pytest.approx(1)
+        assert row.error < 1e-7
+    free = gradients.compare_samples(sample(objective, PLANE))["cosine"].sel(scale=2 / 11)
+    np.testing.assert_allclose(free[1:-1, 1:-1], 1)
+    assert bool(free[0].isnull().all())
 
 
-def test_a_gradient_of_the_wrong_sign_points_uphill() -> None:
-    wrong = from_numpy(lambda x: ((x**2).sum(axis=1), -2 * x), SPACE)
-    for row in gradients.scale_table(gradients.compare_differences(wrong, PLANE, gradients.subgrid(PLANE, 4))):
-        assert row.cosine.value == pytest.approx(-1)
+def test_wrong_signs_point_uphill_and_fine_ripples_mislead_at_the_scale_of_a_picture() -> None:
+    for row in rows_of(from_numpy(lambda x: ((x**2).sum(axis=1), -2 * x), SPACE), 4).values():
+        assert (row.cosine.value, row.error) == pytest.approx((-1, 2))
         assert (row.uphill.value, row.sign.value) == (1, 0)
-        assert row.error == pytest.approx(2)
-
-
-def test_fine_ripples_agree_closely_and_mislead_at_the_scale_of_a_picture() -> None:
-    rippled = from_torch(lambda x: (x**2 + 1e-2 * torch.sin(1e4 * x)).sum(1), SPACE)
-    rows = gradients.scale_table(gradients.compare_differences(rippled, PLANE, gradients.subgrid(PLANE, 5)))
-    by_scale = {row.scale: row.cosine.value for row in rows}
-    assert by_scale[1e-6] == pytest.approx(1, abs=1e-3)
-    assert abs(by_scale[1e-2]) < 0.5
+    rippled = rows_of(from_torch(lambda x: (x**2 + 1e-2 * torch.sin(1e4 * x)).sum(1), SPACE), 5)
+    assert rippled[1e-6].cosine.value == pytest.approx(1, abs=1e-3)
+    assert abs(rippled[1e-2].cosine.value) < 0.5
 
 
 def test_slopes_below_the_noise_are_not_judged() -> None:
@@ -56,20 +51,17 @@ def test_slopes_below_the_noise_are_not_judged() -> None:
     assert (unseen["cosine"][0], unseen["error"][0]) == (0, 1)
 
 
-def test_both_orders_are_exact_on_a_linear_function() -> None:
+def test_both_orders_are_exact_on_a_linear_function_and_zeroth_order_has_its_known_variance() -> None:
     linear = from_torch(lambda x: 2 * x[:, 0] - x[:, 1], SPACE)
     found = gradients.smoothed_slopes(linear, PLANE, gradients.subgrid(PLANE, 2))
     for name in ("first", "zeroth"):
         np.testing.assert_allclose(found[name], np.broadcast_to([8, -4], found[name].shape))  # per side of the box
     np.testing.assert_allclose(found["first_variance"], 0, atol=1e-20)
     assert not bool(gradients.find_bias(found).any())
-
-
-def test_zeroth_order_has_its_known_variance() -> None:
     line = ParameterSpace.box(("x",), 0.0, 1.0)
     plane = Plane.through(line, line.center, (0,), resolution=3)
-    linear = from_torch(lambda x: 3 * x[:, 0], line)
-    found = gradients.smoothed_slopes(linear, plane, torch.tensor([[0.5]]).double(), pairs=20000)
+    slope = from_torch(lambda x: 3 * x[:, 0], line)
+    found = gradients.smoothed_slopes(slope, plane, torch.tensor([[0.5]]).double(), pairs=20000)
     np.testing.assert_allclose(found["zeroth_variance"], 2 * 3**2, rtol=0.06)  # of 3 w^2
 
 

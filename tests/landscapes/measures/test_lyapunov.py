@@ -13,6 +13,7 @@ from gradscape.landscapes.convert import from_json, to_json
 from gradscape.landscapes.measures.lyapunov import GradientGrowth, Shape, measure_growth
 
 TIME = np.array([0.4, 0.8, 1.2, 1.6, 2.0])
+COUNT = 100  # curves of a kind
 
 
 def test_the_logistic_map_diverges_by_ln_2_a_step() -> None:
@@ -26,29 +27,21 @@ def test_the_logistic_map_diverges_by_ln_2_a_step() -> None:
             state, done = 4 * state * (1 - state), done + 1
         norm.append(torch.autograd.grad(state.sum(), start, retain_graph=True)[0].abs().numpy())
     found = measure_growth(steps.astype(float), np.array(norm))
-    assert found.is_exponential
+    assert found.shape is Shape.EXPONENTIAL
     assert found.rate.low <= math.log(2) <= found.rate.high
     assert found.rate.value == pytest.approx(math.log(2), abs=0.02)
     assert "exp(0.69" in found.describe()
 
 
-@pytest.mark.parametrize("rate", [3.0, 0.5])
-def test_a_linear_motion_grows_by_its_own_rate(rate: float) -> None:
-    scale = np.linspace(1, 5, 16)
-    found = measure_growth(TIME, np.exp(rate * TIME)[:, None] * scale)
-    assert found.is_exponential
-    assert found.rate.value == pytest.approx(rate)
-    assert (found.known, found.points) == (16, 16)
-    assert found.norm[0] == pytest.approx(3 * math.exp(0.4 * rate))
-
-
-@pytest.mark.parametrize("power", [1.0, 2.0, 4.0])
-def test_a_flight_grows_by_a_power_of_time_and_does_not_diverge(power: float) -> None:
+@pytest.mark.parametrize(("rate", "power"), [(3.0, 0.0), (0.5, 0.0), (0.0, 1.0), (0.0, 2.0), (0.0, 4.0)])
+def test_a_motion_grows_by_its_own_rate_or_power(rate: float, power: float) -> None:
     noise = np.exp(0.01 * np.random.default_rng(0).standard_normal((5, 16)))
-    found = measure_growth(TIME, TIME[:, None] ** power * noise)
-    assert not found.is_exponential
-    assert found.power.value == pytest.approx(power, abs=0.05)
-    assert f"t^{power:.2g}" in found.describe()
+    found = measure_growth(TIME, (np.exp(rate * TIME) * TIME**power)[:, None] * (np.linspace(1, 5, 16) * noise))
+    assert found.shape is (Shape.EXPONENTIAL if rate else Shape.POWER)
+    assert (found.rate if rate else found.power).value == pytest.approx(rate or power, abs=0.05)
+    assert (found.known, found.points) == (16, 16)
+    assert found.norm[0] == pytest.approx(3 * math.exp(0.4 * rate) * 0.4**power, rel=0.15)
+    assert (f"exp({rate:.0g}" if rate == 3 else "exp(0.5" if rate else f"t^{power:.2g}") in found.describe()
 
 
 def test_what_stays_or_shrinks_does_not_diverge() -> None:
@@ -59,7 +52,7 @@ def test_what_stays_or_shrinks_does_not_diverge() -> None:
     assert level.describe().startswith("gradients stay bounded")
 
 
-def shapes(draw: Callable[[np.random.Generator], np.ndarray], count: int = 300) -> Counter[Shape]:
+def shapes(draw: Callable[[np.random.Generator], np.ndarray], count: int = COUNT) -> Counter[Shape]:
     """Count the answers for many curves of shape (horizon,). Each has 16 points, which differ from it by a third."""
     rng = np.random.default_rng(2)
     apart = (np.exp(0.3 * rng.standard_normal((5, 16))) for _ in range(count))
@@ -77,17 +70,17 @@ def test_a_linear_oscillation_is_not_called_exponential_however_many_points_swin
 
     for draw in (swing, stiffness):
         found = shapes(draw)
-        assert found[Shape.EXPONENTIAL] <= 0.05 * 300
-        assert found[Shape.UNDECIDED] + found[Shape.BOUNDED] > 150
+        assert found[Shape.EXPONENTIAL] <= 0.05 * COUNT
+        assert found[Shape.UNDECIDED] + found[Shape.BOUNDED] > COUNT / 2
     whole = np.abs(np.cos(np.array([1.47, 1.3, 1.1, 0.9, 0.6])))[:, None] * np.ones(16)  # a quarter of a swing, rising
-    assert not measure_growth(TIME, whole).is_exponential
+    assert measure_growth(TIME, whole).shape is not Shape.EXPONENTIAL
 
 
 def test_growth_that_ends_is_bounded() -> None:
     found = measure_growth(TIME, (1 - np.exp(-TIME / 0.4))[:, None] * np.linspace(1, 2, 16))
     assert found.shape is Shape.BOUNDED
     noisy = shapes(lambda rng: (1 - np.exp(-TIME / 0.3)) * np.exp(0.05 * rng.standard_normal(5)))
-    assert noisy[Shape.EXPONENTIAL] <= 0.05 * 300
+    assert noisy[Shape.EXPONENTIAL] <= 0.05 * COUNT
 
 
 @pytest.mark.parametrize("noise", [0.05, 0.2, 1.0])
@@ -95,11 +88,11 @@ def test_shapes_are_told_as_far_as_noise_that_all_points_share_lets_them(noise: 
     """The wrong one of exponential and power is rare at any noise, and 'cannot tell' takes over as it rises."""
     exponential = shapes(lambda rng: np.exp(3 * TIME + noise * rng.standard_normal(5)))
     power = shapes(lambda rng: TIME**2 * np.exp(noise * rng.standard_normal(5)))
-    assert exponential[Shape.POWER] + power[Shape.EXPONENTIAL] <= 0.1 * 600
+    assert exponential[Shape.POWER] + power[Shape.EXPONENTIAL] <= 0.2 * COUNT
     if noise == 0.05:
-        assert min(exponential[Shape.EXPONENTIAL], power[Shape.POWER]) > 280
+        assert min(exponential[Shape.EXPONENTIAL], power[Shape.POWER]) > 0.93 * COUNT
     if noise == 1.0:
-        assert min(exponential[Shape.UNDECIDED], power[Shape.UNDECIDED]) > 120
+        assert min(exponential[Shape.UNDECIDED], power[Shape.UNDECIDED]) > 0.4 * COUNT
 
 
 def test_it_says_that_it_cannot_tell() -> None:

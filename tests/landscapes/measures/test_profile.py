@@ -8,8 +8,7 @@ import torch
 
 from gradscape import ParameterSpace, Plane, from_torch, sample
 from gradscape.landscapes.convert import to_json
-from gradscape.landscapes.measures.profile import Profile, effort, measure_profile, profile_samples
-from gradscape.landscapes.measures.verdict import WORDS, QuotedWord
+from gradscape.landscapes.measures.profile import Profile, effort, measure_profile
 from gradscape.landscapes.objective import Evaluation, Objective, Status
 
 Function = Callable[[torch.Tensor], torch.Tensor]
@@ -31,47 +30,22 @@ def scrambled(x: torch.Tensor) -> torch.Tensor:
     return mixed - mixed.floor()
 
 
-def test_a_slice_whose_function_is_gone_is_judged_from_its_samples() -> None:
-    space = ParameterSpace.box(("x", "y"), -1, 1)
-    bowl = from_torch(lambda x: x.square().sum(1), space)
-    found = profile_samples(sample(bowl, Plane.through(space, space.center, (0, 1), resolution=48)))
-    assert found.words[:1] == ("very smooth",)
-    assert (found.jumps, found.noise, found.differences, found.smoothing) == (None, None, (), ())
-    assert found.measures["Jumps"] == "not searched"
-    assert found.verdict.compare_words(["discontinuous", "rugged"]) == (
-        QuotedWord("discontinuous", None), QuotedWord("rugged", False),
-    )  # fmt: skip
-
-
 @pytest.mark.parametrize(
     ("fn", "box", "words"),
     [
-        (lambda x: x.square().sum(1), (-1, 1), {"very smooth", "gradients follow"}),
-        (
-            lambda x: (x[:, 0] ** 2 + x[:, 1] - 11) ** 2 + (x[:, 0] + x[:, 1] ** 2 - 7) ** 2,
-            (-5, 5),
-            {"smooth with local minima", "gradients follow"},
-        ),
-        (rastrigin, (-5.12, 5.12), {"rugged", "gradients follow"}),
         (scrambled, (-1, 1), {"extremely rugged", "gradients do not follow", "gradients exploding"}),
         (
             lambda x: 1.0 * (x[:, 0] > 0.1) + 0 * x.sum(1),
             (-1, 1),
             {"large flat regions", "discontinuous", "gradients zero"},
         ),
-        (
-            lambda x: -torch.relu(0.5 - x.square().sum(1)),
-            (-1, 1),
-            {"very smooth", "large flat regions", "gradients zero", "gradients follow"},
-        ),
         (lambda x: (x**2 + 1e-3 * torch.sin(3000 * x)).sum(1), (-1, 1), {"very smooth", "gradients do not follow"}),
     ],
-    ids=["bowl", "himmelblau", "rastrigin", "noise", "step", "plateau", "ripples"],
+    ids=["noise", "step", "ripples"],
 )
 def test_words_fit_functions_that_are_known(fn: Function, box: tuple[float, float], words: set[str]) -> None:
     found = profile(fn, *box)
-    assert set(found.verdict.words) == words
-    assert set(found.verdict.reasons) == words
+    assert set(found.words) == set(found.verdict.reasons) == words
 
 
 class Partly(Objective):
@@ -103,11 +77,8 @@ def test_gradients_that_are_missing_are_said_to_be_and_losses_beside_them_count(
     assert "Samples that failed" not in named
     assert half.losses.failed == 0
     whole = Partly(0.0, 0.0).profile()
-    assert (half.losses.minima, half.losses.range, half.losses.level) == (
-        whole.losses.minima,
-        whole.losses.range,
-        whole.losses.level,
-    )
+    for name in ("minima", "range", "level"):
+        assert getattr(half.losses, name) == getattr(whole.losses, name)
     assert set(whole.words) == {"very smooth", "gradients follow"}
     few = Partly(0.1, 0.0).profile()
     assert set(few.words) == {"very smooth", "gradients follow"}
@@ -124,22 +95,11 @@ def test_a_slice_that_mostly_failed_is_called_nothing_else() -> None:
     assert Partly(0.0, 1.1).profile().words == ("mostly failed",)
 
 
-def test_somebody_elses_words_are_held_against_ours() -> None:
-    verdict = profile(lambda x: x.square().sum(1), -1, 1).verdict
-    assert verdict.compare_words(("very smooth", "rugged")) == (
-        QuotedWord("very smooth", True),
-        QuotedWord("rugged", False),
-    )
-    assert list(verdict.words) == [word for word in WORDS if word in verdict.words]
-
-
 def test_a_character_is_the_same_again_and_has_plain_names() -> None:
     found = [profile(rastrigin, -2, 2) for _ in range(2)]
     assert to_json(found[0]) == to_json(found[1])
     named = found[0].measures
-    assert (
-        named["Local minima deeper than 1 % of the range"] == "25"
-    )  # and at the borders, where it is lower than inside
+    assert named["Local minima deeper than 1 % of the range"] == "25"  # and at the borders, where it is lower
     assert named["Gradient effectively zero"] == "0.0 % (0.0 % to 0.2 %)"
     assert "Jumps explained by an event" not in named
 

@@ -26,31 +26,22 @@ def rastrigin(x: np.ndarray) -> np.ndarray:
     return x**2 - 10 * np.cos(2 * np.pi * x) + 10
 
 
-def test_rastrigin_has_as_many_minima_as_whole_numbers_in_its_box() -> None:
+def test_minima_are_those_of_rastrigin_and_as_deep_as_the_climb_to_a_lower_one() -> None:
     u, v = grid(129, -5.12, 5.12)
     loss = rastrigin(u) + rastrigin(v)
     found = ruggedness.minima(loss)
-    assert found.count(0.0) == 11**2
+    assert found.count(0.0) == 11**2  # the whole numbers in its box
     assert found.sample[0] == np.argmin(loss)
     assert found.depth[0] == ruggedness.span(loss)
-    u, v = grid(90, -2.5, 1.5)  # the whole numbers -2 to 1
-    assert ruggedness.minima(rastrigin(u) + rastrigin(v)).count(1.0) == 4**2
-
-
-def test_depth_of_a_minimum_is_the_climb_to_a_lower_one() -> None:
-    loss = np.array([3.0, 1.0, 4.0, 0.5, 9.0, 8.0, 8.5])
-    found = ruggedness.minima(loss)
-    np.testing.assert_array_equal(found.sample, [3, 1, 5])
-    np.testing.assert_allclose(found.depth, [8.5, 3.0, 1.0])
-    assert [found.count(depth) for depth in (0.0, 2.0, 3.0)] == [3, 2, 1]
-
-
-def test_a_diagonal_valley_is_one_minimum_and_a_failure_is_no_hill() -> None:
-    loss = np.full((9, 9), 5.0)
-    np.fill_diagonal(loss, 1.0 + np.arange(9) / 100)
-    assert ruggedness.minima(loss).count(0.0) == 1
-    loss[4, 4] = np.nan
-    assert ruggedness.minima(loss).count(0.0) == 2  # nothing is known of what lies between them
+    line = ruggedness.minima(np.array([3.0, 1.0, 4.0, 0.5, 9.0, 8.0, 8.5]))
+    np.testing.assert_array_equal(line.sample, [3, 1, 5])
+    np.testing.assert_allclose(line.depth, [8.5, 3.0, 1.0])
+    assert [line.count(depth) for depth in (0.0, 2.0, 3.0)] == [3, 2, 1]
+    valley = np.full((9, 9), 5.0)
+    np.fill_diagonal(valley, 1.0 + np.arange(9) / 100)
+    assert ruggedness.minima(valley).count(0.0) == 1  # though it is diagonal
+    valley[4, 4] = np.nan
+    assert ruggedness.minima(valley).count(0.0) == 2  # nothing is known of what lies between them
     assert ruggedness.minima(np.full((3, 3), np.nan)).count(0.0) == 0
 
 
@@ -59,8 +50,7 @@ def weierstrass(u: np.ndarray, a: float, b: float) -> np.ndarray:
     return sum(a**n * np.cos(b**n * np.pi * u + n) for n in range(40) if b**n < 4 / abs(u[1] - u[0]))
 
 
-@pytest.mark.parametrize(("a", "b"), [(0.5, 4.0), (0.5, 3.0), (0.7, 3.0), (0.8, 2.0)])
-@pytest.mark.parametrize("scale", [1.0, 1e-6])
+@pytest.mark.parametrize(("a", "b", "scale"), [(0.5, 4.0, 1.0), (0.5, 3.0, 1e-6), (0.7, 3.0, 1.0), (0.8, 2.0, 1e-6)])
 def test_the_exponent_of_weierstrass_function_is_its_own(a: float, b: float, scale: float) -> None:
     u = np.linspace(0, 1, 1025)
     wanted = -math.log(a) / math.log(b)
@@ -70,11 +60,18 @@ def test_the_exponent_of_weierstrass_function_is_its_own(a: float, b: float, sca
     assert ruggedness.holder_exponent(plane, 0, 0.0) == pytest.approx(wanted, abs=0.1)
 
 
-def test_the_exponent_of_what_is_smooth_is_one_and_of_a_jump_a_half() -> None:
-    u = np.linspace(-1, 1, 513)
-    assert ruggedness.holder_exponent(3 * u, 0, 0.0) == pytest.approx(1.0)
-    assert ruggedness.holder_exponent(u**2, 0, 0.0) == pytest.approx(1.0, abs=0.1)
-    assert ruggedness.holder_exponent((u > 0.1).astype(float), 0, 0.0) == pytest.approx(0.5, abs=0.03)
+def test_the_exponent_of_what_is_smooth_is_one_and_none_comes_from_too_few_distances_or_noise() -> None:
+    u, exponent = np.linspace(-1, 1, 513), ruggedness.holder_exponent
+    assert exponent(3 * u, 0, 0.0) == pytest.approx(1.0)
+    assert exponent(u**2, 0, 0.0) == pytest.approx(1.0, abs=0.1)
+    assert exponent((u > 0.1).astype(float), 0, 0.0) == pytest.approx(0.5, abs=0.03)
+    for nothing in (u[:12], np.zeros(99), np.full(99, np.nan)):  # of the first, 1 and 2 steps
+        assert math.isnan(exponent(nothing, 0, 0.0))
+    torn = u.copy()
+    torn[::7] = np.nan
+    assert exponent(torn, 0, 0.0) == pytest.approx(1.0)
+    quiet = 1e-3 * u + 1e-5 * np.random.default_rng(0).standard_normal(513)
+    assert exponent(quiet, 0, 0.0) < 0.9 < exponent(quiet, 0, 6e-5)
 
 
 @pytest.mark.parametrize("exponent", [0.3, 0.5, 0.8])
@@ -106,55 +103,44 @@ def test_beyond_the_correlation_length_differences_grow_no_more_and_say_nothing(
     assert math.isnan(ruggedness.holder_exponent(noise, 0, 0.0))
 
 
-def test_no_exponent_comes_from_too_few_distances_failures_or_noise() -> None:
-    u = np.linspace(-1, 1, 513)
-    assert math.isnan(ruggedness.holder_exponent(u[:12], 0, 0.0))  # 1 and 2 steps
-    assert math.isnan(ruggedness.holder_exponent(np.zeros(99), 0, 0.0))
-    assert math.isnan(ruggedness.holder_exponent(np.full(99, np.nan), 0, 0.0))
-    torn = u.copy()
-    torn[::7] = np.nan
-    assert ruggedness.holder_exponent(torn, 0, 0.0) == pytest.approx(1.0)
-    quiet = 1e-3 * u + 1e-5 * np.random.default_rng(0).standard_normal(513)
-    assert ruggedness.holder_exponent(quiet, 0, 0.0) < 0.9 < ruggedness.holder_exponent(quiet, 0, 6e-5)
-
-
-def test_basins_are_the_parts_that_drain_to_each_minimum() -> None:
+def test_basins_drain_to_their_minima_and_noise_makes_none_above_its_floor() -> None:
     u = np.linspace(0, 1, 101)
     loss = np.minimum((u - 0.2) ** 2, 0.01 + (u - 0.7) ** 2)  # they meet at 0.46
-    found = ruggedness.minima(loss)
-    np.testing.assert_allclose(ruggedness.basins(loss, found.sample), [0.46, 0.54], atol=0.01)
-
-
-def test_noise_on_a_bowl_makes_minima_and_none_above_its_floor() -> None:
+    np.testing.assert_allclose(ruggedness.basins(loss, ruggedness.minima(loss).sample), [0.46, 0.54], atol=0.01)
     u, v = grid(48)
-    loss = 0.02 * (u**2 + v**2) + 1e-3 * np.random.default_rng(0).normal(size=u.shape)
-    floor = 2 * 1e-3 * math.sqrt(2 * math.log(loss.size))
-    found = ruggedness.minima(loss)
+    found = ruggedness.minima(0.02 * (u**2 + v**2) + 1e-3 * np.random.default_rng(0).normal(size=u.shape))
     assert found.count(0.0) > 50
-    assert found.count(floor) == 1
+    assert found.count(2 * 1e-3 * math.sqrt(2 * math.log(48**2))) == 1
 
 
-@pytest.mark.parametrize("periods", [10, 20])
-def test_correlation_length_of_a_sine_is_in_closed_form(periods: int) -> None:
+def test_measures_of_lines_are_in_closed_form() -> None:
     u, v = grid(401, 0, 1)
-    loss = np.sin(2 * np.pi * periods * u) + 100 * v
-    wanted = math.acos(1 / math.e) / (2 * math.pi * periods)  # the autocorrelation is a cosine
-    assert ruggedness.correlation_length(loss, axis=1) == pytest.approx(wanted, rel=0.03)
-
-
-def test_total_variation_counts_the_times_a_line_goes_through_its_range() -> None:
+    for periods in (10, 20):
+        loss = np.sin(2 * np.pi * periods * u) + 100 * v
+        wanted = math.acos(1 / math.e) / (2 * math.pi * periods)  # the autocorrelation is a cosine
+        assert ruggedness.correlation_length(loss, axis=1) == pytest.approx(wanted, rel=0.03)
     u, v = grid(41)
     assert ruggedness.total_variation(np.exp(u) + 0 * v, axis=1) == pytest.approx(1)
     assert ruggedness.total_variation(u**2 + v, axis=1) == pytest.approx(2)
     assert math.isnan(ruggedness.total_variation(u, axis=0))
-
-
-def test_turns_are_seen_however_finely_a_line_is_sampled() -> None:
     assert ruggedness.turns(np.linspace(0, 1, 50) ** 3) == 0
     assert ruggedness.turns(np.array([0.0, 1.0] * 25)) == pytest.approx(48 / 49)
     for points in (100, 1000):
         waves = np.sin(np.linspace(0, 6 * np.pi, points))
         assert ruggedness.turns(waves) == pytest.approx(6 / (points - 1))
+        assert ruggedness.turns(waves, floor=2.1) == 0
+
+
+def test_measures_of_places_tell_one_valley_from_two() -> None:
+    u, v = grid(41)
+    assert ruggedness.dispersion(u**2 + v**2) < 0.3
+    assert ruggedness.dispersion(-((u + v) ** 2)) > 1
+    assert ruggedness.dispersion(np.random.default_rng(0).random((41, 41))) == pytest.approx(1, abs=0.15)
+    assert ruggedness.fitness_distance(np.hypot(u, v)) == pytest.approx(1)
+    assert math.isnan(ruggedness.fitness_distance(0 * u))
+    loss = np.array([0.0, 0.0, 0.0, 0.5, 0.5, np.nan])
+    np.testing.assert_array_equal(ruggedness.level_samples(loss, 0.0), [1, 1, 0, 0, 1, np.nan])
+    assert np.nansum(ruggedness.level_samples(loss, 0.5)) == 5
 
 
 def published_information(points: np.ndarray, losses: np.ndarray) -> float:
@@ -203,26 +189,6 @@ def test_information_content_of_a_line_of_noise_of_a_ramp_and_of_what_is_level()
     assert np.isnan(ruggedness.information_content(np.ones(60))).all()
     assert np.isnan(ruggedness.information_content(np.full(60, np.nan))).all()
     assert ruggedness.information_content(line)[1] > ruggedness.information_content(np.linspace(0, 1, 400))[1]
-
-
-def test_dispersion_tells_one_valley_from_two() -> None:
-    u, v = grid(41)
-    assert ruggedness.dispersion(u**2 + v**2) < 0.3
-    assert ruggedness.dispersion(-((u + v) ** 2)) > 1
-    scattered = np.random.default_rng(0).random((41, 41))
-    assert ruggedness.dispersion(scattered) == pytest.approx(1, abs=0.15)
-
-
-def test_fitness_distance_correlation_of_a_cone_is_one() -> None:
-    u, v = grid(41)
-    assert ruggedness.fitness_distance(np.hypot(u, v)) == pytest.approx(1)
-    assert math.isnan(ruggedness.fitness_distance(0 * u))
-
-
-def test_level_samples_are_those_like_their_neighbours() -> None:
-    loss = np.array([0.0, 0.0, 0.0, 0.5, 0.5, np.nan])
-    np.testing.assert_array_equal(ruggedness.level_samples(loss, 0.0), [1, 1, 0, 0, 1, np.nan])
-    assert np.nansum(ruggedness.level_samples(loss, 0.5)) == 5
 
 
 def test_a_plateau_is_flat_where_it_is_and_failures_count_as_nothing() -> None:

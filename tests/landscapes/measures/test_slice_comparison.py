@@ -36,67 +36,44 @@ def compare(one: Function, other: Function, **how):
     return compare_slices(cut(one, **how), cut(other, **how))
 
 
-def test_a_constant_changes_losses_alone() -> None:
-    found = compare(bowl, lambda x: bowl(x) + 0.5)
-    assert found.points == found.compared == 441
-    for value in (found.loss.median.value, found.loss.p95.value, found.loss.largest.value):
-        assert value == pytest.approx(0.5)
-    assert found.loss.range == pytest.approx(2.0)
-    assert found.loss.shares["p95"].value == pytest.approx(0.25)
-    assert found.spearman.value == pytest.approx(
-        1.0, abs=1e-4
-    )  # losses that are the same but for rounding change ranks
-    assert (found.slopes.cosine.value, found.slopes.opposing.value) == (pytest.approx(1.0), 0.0)
-    assert found.slopes.ratio.value == 1.0
+WIDE = ParameterSpace(("x", "y"), SPACE.lower, torch.tensor([1.0, 199.0]).double(), ("m", "m"))
 
 
-def test_a_factor_changes_lengths_and_not_directions_and_parts_in_a_corner() -> None:
+@pytest.mark.parametrize(
+    ("one", "other", "how", "spearman", "cosine", "opposing", "ratio", "largest"),
+    [
+        (bowl, lambda x: bowl(x) + 0.5, {}, 1.0, 1.0, 0.0, 1.0, 0.5),
+        (bowl, lambda x: 3 * bowl(x), {}, 1.0, 1.0, 0.0, 3.0, 4.0),
+        (bowl, lambda x: -bowl(x), {"resolution": 17}, -1.0, -1.0, 288 / 289, 1.0, 4.0),  # both are zero at the bottom
+        (lambda x: x[0], lambda x: x[1], {}, 0.0, 0.0, None, 1.0, 2.0),
+        (lambda x: x[0] + x[1] / 100, lambda x: x[0] - x[1] / 100, {"space": WIDE}, None, 0.0, None, 1.0, 3.98),
+        # Two valleys disagree between their bottoms: at -0.3, -0.2, ..., 0.3 of 21 columns.
+        (lambda x: (x[0] + 0.35) ** 2, lambda x: (x[0] - 0.35) ** 2, {}, None, 1.0, 7 / 21, None, 1.4),
+        (lambda x: (x[0] + 0.35) ** 2, lambda x: (x[0] - 0.35) ** 2, {"dims": ("x",)}, None, 1.0, 7 / 21, None, 1.4),
+    ],
+    ids=["constant", "factor", "upside down", "two axes", "sides count as one", "two valleys", "line"],
+)
+def test_differences_order_and_gradients_are_those_of_functions_that_are_known(
+    one, other, how, spearman, cosine, opposing, ratio, largest
+) -> None:
+    found = compare(one, other, **how)
+    told = (found.spearman, found.slopes.cosine, found.slopes.opposing, found.slopes.ratio, found.loss.largest)
+    for estimate, wanted in zip(told, (spearman, cosine, opposing, ratio, largest), strict=True):
+        assert wanted is None or estimate.value == pytest.approx(wanted, abs=1e-4)
+
+
+def test_a_comparison_says_where_and_by_how_much_slices_part() -> None:
     found = compare(bowl, lambda x: 3 * bowl(x))
-    assert found.slopes.ratio.value == pytest.approx(3.0)
+    assert found.points == found.compared == 441
+    assert found.loss.range == pytest.approx(2.0)
     assert (found.slopes.ratio.low, found.slopes.ratio.high) == (pytest.approx(3.0), pytest.approx(3.0))
-    assert found.spearman.value == pytest.approx(1.0)
-    assert {abs(value) for value in found.parting.place.values()} == {1.0}
-    assert set(found.parting.place) == {"x [m]", "y [m]"}
+    assert {name: abs(at) for name, at in found.parting.place.items()} == {"x [m]": 1.0, "y [m]": 1.0}
     assert (found.parting.a, found.parting.b) == (pytest.approx(2.0), pytest.approx(6.0))
-    assert found.loss.largest.value == pytest.approx(4.0)
-
-
-def test_a_bowl_upside_down_reverses_order_and_gradients() -> None:
-    found = compare(bowl, lambda x: -bowl(x), resolution=17)
-    assert found.spearman.value == pytest.approx(-1.0)
-    assert found.slopes.cosine.value == pytest.approx(-1.0)
-    assert found.slopes.opposing.value == pytest.approx(288 / 289)  # at the bottom both are zero, and agree
-    np.testing.assert_allclose(found.cosine.sel(u=0, v=0), 1.0)
-
-
-def test_slopes_along_two_axes_have_nothing_to_do_with_each_other() -> None:
-    found = compare(lambda x: x[0], lambda x: x[1])
-    assert found.spearman.value == pytest.approx(0.0, abs=1e-12)
-    assert found.slopes.cosine.value == pytest.approx(0.0, abs=1e-12)
-    np.testing.assert_allclose(found.difference, found.data[0]["v"] - found.data[0]["u"], atol=1e-12)
-    assert found.loss.largest.value == pytest.approx(2.0)
-
-
-def test_two_valleys_disagree_between_their_bottoms() -> None:
-    found = compare(lambda x: (x[0] + 0.35) ** 2, lambda x: (x[0] - 0.35) ** 2)
-    assert found.slopes.opposing.value == pytest.approx(7 / 21)  # -0.3, -0.2, ..., 0.3 of 21 columns
-    between = np.abs(found.cosine["u"]) < 0.35
-    np.testing.assert_allclose(found.cosine, np.tile(np.where(between, -1.0, 1.0), (21, 1)))
-    np.testing.assert_allclose(found.difference, np.tile(-1.4 * found.data[0]["u"], (21, 1)), atol=1e-12)
-    assert found.loss.median.value == pytest.approx(1.4 * 0.5)
-
-
-def test_sides_of_the_plane_count_as_one() -> None:
-    wide = ParameterSpace(("x", "y"), SPACE.lower, torch.tensor([1.0, 199.0]).double(), ("m", "m"))
-    found = compare(lambda x: x[0] + x[1] / 100, lambda x: x[0] - x[1] / 100, space=wide, window=None)
-    np.testing.assert_allclose(found.cosine, 0.0, atol=1e-12)
-
-
-def test_on_a_line_gradients_agree_or_oppose() -> None:
-    found = compare(lambda x: (x[0] + 0.35) ** 2, lambda x: (x[0] - 0.35) ** 2, dims=("x",))
-    assert found.slopes.opposing.value == pytest.approx(7 / 21)
-    assert found.difference.dims == ("u",)
-    assert {abs(value) for value in found.parting.place.values()} == {1.0}
+    valleys = compare(lambda x: (x[0] + 0.35) ** 2, lambda x: (x[0] - 0.35) ** 2)
+    between = np.abs(valleys.cosine["u"]) < 0.35
+    np.testing.assert_allclose(valleys.cosine, np.tile(np.where(between, -1.0, 1.0), (21, 1)))
+    np.testing.assert_allclose(valleys.difference, np.tile(-1.4 * valleys.data[0]["u"], (21, 1)), atol=1e-12)
+    assert valleys.loss.median.value == pytest.approx(1.4 * 0.5)
 
 
 def test_intervals_hold_what_blocks_of_the_plane_say_and_the_same_everywhere_is_certain() -> None:
@@ -120,40 +97,26 @@ def test_what_failed_is_counted_and_compared_nowhere() -> None:
     assert found.loss.largest.value == pytest.approx(1.0)
     assert found.slopes.cosine.value == pytest.approx(1.0)
     assert np.isnan(found.cosine.sel(u=1.0)).all()
-    both = compare(failing(bowl), failing(bowl))
-    assert both.statuses == ()
-
-
-def test_where_nothing_is_left_nothing_is_said() -> None:
-    found = compare(bowl, lambda x: bowl(x) * torch.nan)
-    assert (found.compared, found.parting) == (0, None)
-    record = to_json(found)
+    assert compare(failing(bowl), failing(bowl)).statuses == ()
+    nothing = compare(bowl, lambda x: bowl(x) * torch.nan)
+    assert (nothing.compared, nothing.parting) == (0, None)
+    record = to_json(nothing)
     assert record["loss"]["median"]["value"] is record["spearman"]["value"] is record["parting"] is None
     assert json.loads(json.dumps(record, allow_nan=False)) == record
 
 
-def test_the_same_slice_twice_differs_nowhere() -> None:
+def test_the_same_a_flat_and_a_slice_without_gradients_have_less_to_say() -> None:
     one = cut(bowl)
-    found = compare_slices(one, one)
-    assert (found.loss.largest.value, found.differing, found.statuses) == (0.0, {}, ())
-    assert found.a == found.b
-
-
-def test_a_flat_slice_has_no_order_and_no_range() -> None:
-    found = compare(lambda x: 0 * x[0], bowl)
-    assert np.isnan(found.spearman.value)
-    assert np.isnan(found.loss.shares["median"].value)
-    assert found.slopes.ratio.value == np.inf
-    assert to_json(found)["slopes"]["ratio"]["value"] is None
-
-
-def test_without_gradients_losses_alone_are_compared() -> None:
-    found = compare_slices(cut(bowl), cut(bowl, grad=False))
-    assert found.slopes is None
-    assert "gradients" not in "".join(found.table().index)
-    assert to_json(found)["slopes"] is None
-    assert found.differing == {"gradients": ("True", "False")}
-    assert found.cosine is None
+    same = compare_slices(one, one)
+    assert (same.loss.largest.value, same.differing, same.statuses, same.a) == (0.0, {}, (), same.b)
+    flat = compare(lambda x: 0 * x[0], bowl)
+    assert np.isnan([flat.spearman.value, flat.loss.shares["median"].value]).all()
+    assert flat.slopes.ratio.value == np.inf
+    assert to_json(flat)["slopes"]["ratio"]["value"] is None
+    alone = compare_slices(one, cut(bowl, grad=False))
+    assert alone.slopes is alone.cosine is to_json(alone)["slopes"] is None
+    assert "gradients" not in "".join(alone.table().index)
+    assert alone.differing == {"gradients": ("True", "False")}
 
 
 def interpolated(dataset: xr.Dataset, stride: int) -> xr.Dataset:
@@ -200,37 +163,32 @@ def test_a_table_has_a_row_for_each_number() -> None:
     assert table.loc["loss in both", "value"] == 1.0
 
 
+OTHER = ParameterSpace(("x", "z"), SPACE.lower, SPACE.upper, ("m", "m"))
+LARGER = ParameterSpace(("x", "y", "z"), torch.zeros(3).double(), torch.ones(3).double(), ("m", "m", "m"))
+PLANES = "give the name of an environment as B"
+
+
 @pytest.mark.parametrize(
-    ("how", "said"),
+    ("a", "b", "said"),
     [
-        ({"resolution": 20}, "A has 21 x 21 and B 20 x 20"),
-        ({"window": (-0.5, 1.0)}, "lower ends differ: number 0 is -1 in A and -0.5 in B"),
-        ({"dims": ("y", "x")}, "directions differ: A is along x, y and B is along y, x"),
-        ({"dims": ("x",)}, "A has 21 x 21 and B 21"),
+        ({}, {"resolution": 20}, f"A has 21 x 21 and B 20 x 20.*{PLANES}"),
+        ({}, {"window": (-0.5, 1.0)}, f"lower ends differ: number 0 is -1 in A and -0.5 in B.*{PLANES}"),
+        ({}, {"dims": ("y", "x")}, f"directions differ: A is along x, y and B is along y, x.*{PLANES}"),
+        ({}, {"dims": ("x",)}, f"A has 21 x 21 and B 21.*{PLANES}"),
+        ({"dims": ("x",)}, {"dims": ("x",), "at": (0.0, 0.5)}, r"go through differ: number 1 is 0 in A and 0\.5 in B"),
+        ({}, {"space": OTHER, "dims": ("x", "z")}, "A has y where B has z"),
+        ({}, {"space": LARGER, "at": (0.5, 0.5, 0.5)}, "A has 2 of them where B has 3"),
     ],
 )
-def test_slices_of_other_planes_are_refused(how: dict[str, object], said: str) -> None:
-    with pytest.raises(ValueError, match=f"{said}.*give the name of an environment as B"):
-        compare_slices(cut(bowl), cut(bowl, **how))
-
-
-def test_lines_through_other_points_and_other_spaces_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"points they go through differ: number 1 is 0 in A and 0\.5 in B"):
-        compare_slices(cut(bowl, dims=("x",)), cut(bowl, dims=("x",), at=(0.0, 0.5)))
-    other = ParameterSpace(("x", "z"), SPACE.lower, SPACE.upper, ("m", "m"))
-    with pytest.raises(ValueError, match="A has y where B has z"):
-        compare_slices(cut(bowl), cut(bowl, space=other, dims=("x", "z")))
-    larger = ParameterSpace(("x", "y", "z"), torch.zeros(3).double(), torch.ones(3).double(), ("m", "m", "m"))
-    three = cut(bowl, space=larger, at=(0.5, 0.5, 0.5))
-    with pytest.raises(ValueError, match="A has 2 of them where B has 3"):
-        compare_slices(cut(bowl), three)
+def test_slices_of_other_planes_and_spaces_are_refused(a, b, said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        compare_slices(cut(bowl, **a), cut(bowl, **b))
 
 
 def test_other_units_and_samples_that_are_missing_are_refused() -> None:
     one = cut(bowl)
-    metres = one.assign(loss=one["loss"].assign_attrs(units="m"))
     with pytest.raises(ValueError, match="A's is none and B's m,"):
-        compare_slices(one, metres)
+        compare_slices(one, one.assign(loss=one["loss"].assign_attrs(units="m")))
     status = one["status"].copy(deep=True)
     status.data[0, :3] = Status.MISSING
     with pytest.raises(ValueError, match="3 samples of B are missing"):

@@ -11,7 +11,6 @@ import xarray as xr
 from torch import Tensor
 
 import gradscape as gs
-from gradscape.jobs.census import open_census
 from gradscape.jobs.slice import SliceJob
 from gradscape.jobs.watch import Stopped
 from gradscape.landscapes.draw.figures.contour import landscape_figure
@@ -187,6 +186,5 @@ def test_a_census_says_the_floor_and_counts_nothing_below_it(tmp_path: Path) -> 
     assert bare.floor is None
     assert whole.floor is not None
     assert whole.floor.deviation == pytest.approx(APART)
-    assert open_census(tmp_path / "whole").floor == whole.floor
     assert "numerical floor 0.8 % of the range" in whole.plot().legends[0].get_title().get_text()
     assert [one.slices[0].measures[1] for one in (bare, whole)] == [2, 1]  # notable minima

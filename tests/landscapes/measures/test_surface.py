@@ -1,5 +1,6 @@
 """The surface in a word: counts at fixed scales, what samples do not tell, and words that are left out then."""
 
+import itertools
 import json
 import math
 
@@ -19,7 +20,6 @@ from gradscape.landscapes.measures.surface import (
     short_exponent,
     turning_points,
 )
-from gradscape.landscapes.objective import Objective
 
 SPACE = ParameterSpace.box(("x", "y"), 0.0, 1.0)
 NONE = np.zeros(0)
@@ -32,27 +32,23 @@ def data(loss: np.ndarray) -> xr.Dataset:
     return xr.Dataset({"loss": (dims, loss)}, attrs={"identity": json.dumps({"plane": plane.record()})})
 
 
-def judged(fn, resolution: int, *, alone: bool = False) -> tuple[Surface, Objective]:
+def judged(fn, resolution: int, *, alone: bool = False) -> Surface:
     objective = from_torch(fn, SPACE)
     dataset = sample(objective, Plane.through(SPACE, SPACE.center, (0, 1), resolution=resolution))
     between = None if alone else look_between(objective, [dataset], [0.0])[0]
-    return measure_surface(dataset, between=between), objective
+    return measure_surface(dataset, between=between)
 
 
-def test_a_line_turns_back_where_it_goes_by_more_than_the_depth_and_nowhere_else() -> None:
+def test_a_line_turns_back_where_it_goes_by_more_than_the_depth_however_many_samples_it_has() -> None:
     line = np.array([0.0, 1.0, 0.9, 2.0, 0.0, 0.05, np.nan, 3.0])
     assert turning_points(line, 0, 0.5) == 2  # at 2 and at 0
     assert turning_points(line, 0, 0.05) == 4  # at 1 and 0.9, too
     assert turning_points(line[::-1].copy(), 0, 0.5) == 2
     assert turning_points(np.stack([line, np.arange(8.0)]), 1, 0.5) == 1  # the mean of two lines
     assert math.isnan(turning_points(np.full(8, np.nan), 0, 0.5))
-
-
-@pytest.mark.parametrize("periods", [2, 5])
-@pytest.mark.parametrize("points", [40, 41, 160])
-def test_turns_are_those_of_a_side_however_many_samples_it_has(periods: int, points: int) -> None:
-    line = np.sin(2 * np.pi * periods * np.linspace(0, 1, points))
-    assert turning_points(line, 0, 0.02) == 2 * periods
+    for periods, points in itertools.product((2, 5), (40, 41, 160)):
+        waves = np.sin(2 * np.pi * periods * np.linspace(0, 1, points))
+        assert turning_points(waves, 0, 0.02) == 2 * periods
 
 
 def test_a_plateau_fills_the_share_of_the_box_that_it_has() -> None:
@@ -81,13 +77,12 @@ def test_a_narrow_valley_has_one_minimum_though_its_samples_have_several() -> No
     def valley(x: torch.Tensor) -> torch.Tensor:
         return (x[:, 0] + 0.4 * x[:, 1] - 0.6).abs()
 
-    found, objective = judged(valley, 24)
+    found = judged(valley, 24)
     assert (found.minima.value, found.word) == (1, "very smooth")
-    alone, _ = judged(valley, 24, alone=True)
+    alone = judged(valley, 24, alone=True)
     assert alone.minima.value > 1
     assert alone.word is None
     assert "minima" in alone.unresolved
-    del objective
 
 
 def test_what_lies_between_samples_is_seen_and_the_word_left_out() -> None:
@@ -97,12 +92,12 @@ def test_what_lies_between_samples_is_seen_and_the_word_left_out() -> None:
         return x[:, 0] + 0.3 * torch.cos(2 * math.pi * 23 * x[:, 0]) + 0 * x[:, 1]
 
     for alone in (False, True):
-        found, _ = judged(waves, 24, alone=alone)
+        found = judged(waves, 24, alone=alone)
         assert found.word != "rugged"
         if not alone:
             assert (found.word, found.probed) == (None, True)
             assert found.off.low > 0.5
-    fine, _ = judged(waves, 96)
+    fine = judged(waves, 96)
     assert fine.word == "rugged"
     assert fine.turns[0].value == pytest.approx(46, abs=1)  # u first
     assert fine.turns[1].value == 0
@@ -128,18 +123,12 @@ def test_what_ranges_over_no_more_than_noise_or_rounding_or_the_whole_is_flat() 
     assert rounding(np.full(3, np.nan)) == 0
 
 
-def test_lines_have_a_word_too() -> None:
-    u = np.linspace(-1, 1, 40)
+def test_lines_have_a_word_too_and_noise_hides_what_is_below_it() -> None:
+    u, fine = np.linspace(-1, 1, 40), np.linspace(-1, 1, 160)
+    wells = data((u**2 - 0.4) ** 2)
     assert measure_surface(data(u**2)).word == "very smooth"
-    assert measure_surface(data((u**2 - 0.4) ** 2)).word == "smooth with local minima"
-    fine = np.linspace(-1, 1, 160)
-    step = measure_surface(data(fine**2 + (fine > 0.3)))
-    assert step.word is None
+    assert measure_surface(wells).word == "smooth with local minima"
+    step, noisy = measure_surface(data(fine**2 + (fine > 0.3))), measure_surface(wells, floor=0.1)
+    assert step.word is noisy.word is None
     assert "may be a jump, of " in step.unresolved
-
-
-def test_noise_hides_what_is_below_it() -> None:
-    u = np.linspace(-1, 1, 40)
-    found = measure_surface(data((u**2 - 0.4) ** 2), floor=0.1)
-    assert found.word is None
-    assert found.unresolved == "noise or numerics hide what is below 28 % of the range"
+    assert noisy.unresolved == "noise or numerics hide what is below 28 % of the range"
