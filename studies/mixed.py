@@ -12,6 +12,7 @@ import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -21,19 +22,10 @@ from ..landscapes.sampling.memory import free_memory
 from . import samples
 from .claims import CLAIMS, Choice, Claim, Shortfall, choose, fronts, nearness, surely_beaten
 from .fidelity import FidelityRecord, FidelityStudy, MeasuredVariant
-from .samples import Sample
-from .variants import (
-    Refused,
-    Study,
-    StudyRecord,
-    Variant,
-    expected_work,
-    read_positive,
-    seconds_with_gradient,
-)
+from .samples import Sample, interval_columns
+from .variants import Refused, Study, StudyRecord, Variant, expected_work, read_positive, seconds_with_gradient
 
 if TYPE_CHECKING:
-    import pandas as pd
     from torch import Tensor
 
     from ..envs.base import Environment
@@ -64,6 +56,7 @@ class MixedRecord(StudyRecord):
     """
 
     kind: ClassVar[str] = MIXED
+    index: ClassVar[tuple[str, ...]] = ("claim", "which")
 
     measured: FidelityRecord
     choices: tuple[Choice, ...]
@@ -85,17 +78,15 @@ class MixedRecord(StudyRecord):
         """Return a measured variant by its name."""
         return self.measured.variant(name)
 
-    def table(self) -> pd.DataFrame:
-        """Return two rows for each claim: the variant that bears its name `today`, and the one `chosen`.
+    def rows(self) -> Iterator[dict[str, Any]]:
+        """Yield two rows for each claim: the variant that bears its name `today`, and the one `chosen`.
 
         Columns: `variant`; `rank`, `cosine` and `error`, the 95th percentile of loss errors as a share of the spread,
         each with the ends of its 95 % interval; `seconds` per episode with gradient, on `device`; `shortfall`, the
         largest lack as a ratio to what the claim allows, and `kept`, whether that is at most 1.
         """
-        import pandas as pd
-
-        rows = [row for one in self.choices for row in self._rows(one)]
-        return pd.DataFrame(rows).set_index(["claim", "which"])
+        for one in self.choices:
+            yield from self._rows(one)
 
     def _rows(self, one: Choice) -> Iterator[dict[str, Any]]:
         today = ("today", one.claim.name, one.today_seconds, one.today_shortfall)
@@ -104,10 +95,9 @@ class MixedRecord(StudyRecord):
                 continue
             found = self.variant(name).comparison
             parts = {"rank": found.spearman, "cosine": found.gradient.cosine, "error": found.loss_error.p95_relative}
-            ends = {"": "value", "_low": "low", "_high": "high"}
+            ends = [interval_columns(part, value).items() for part, value in parts.items()]
             yield {
-                **{"claim": one.claim.name, "which": which, "variant": name},
-                **{part + end: getattr(value, of) for part, value in parts.items() for end, of in ends.items()},
+                **{"claim": one.claim.name, "which": which, "variant": name, **dict(chain.from_iterable(ends))},
                 **{"seconds": seconds, "device": self.cost_device[one.claim.name]},
                 **{"shortfall": shortfall, "kept": shortfall is not None and shortfall <= 1},
             }
