@@ -347,11 +347,7 @@ class MixedStudy(FidelityStudy):
     def _time_again(self, say: Callable[[str], None]) -> None:
         """Time those in turn that may be chosen, and the named ones, so that no busy moment decides between them."""
         names = sorted({name for claim in CLAIMS for name in self._contenders(claim, self._costs())})
-        kept = self._load_seconds(TIMED_AGAIN)
-        if set(kept) != set(names):
-            kept = self._rounds(names, say)
-            self._save_seconds(TIMED_AGAIN, kept)
-        for name, seconds in kept.items():
+        for name, seconds in self._keep_seconds(TIMED_AGAIN, names, lambda: self._rounds(names, say)).items():
             sample = self.samples[name]
             self._accept(self._named(name), replace(sample, with_gradient=min(seconds, sample.with_gradient)))
 
@@ -383,12 +379,16 @@ class MixedStudy(FidelityStudy):
         env.evaluate(batch, grad=True)
         return (time.perf_counter() - began) / rows
 
-    def _load_seconds(self, part: str) -> dict[str, float]:
-        arrays = self.checkpoint.load(part) or {"names": np.array([]), "seconds": np.array([])}
-        return dict(zip(map(str, arrays["names"]), map(float, arrays["seconds"]), strict=True))
-
-    def _save_seconds(self, part: str, seconds: Mapping[str, float]) -> None:
-        self.checkpoint.save(part, names=np.array(list(seconds)), seconds=np.array(list(seconds.values())))
+    def _keep_seconds(
+        self, part: str, names: Sequence[str], time_them: Callable[[], dict[str, float]]
+    ) -> dict[str, float]:
+        """Return the seconds of variants by name that a part keeps; they are timed where it is of others."""
+        arrays = self.checkpoint.load(part)
+        if arrays is not None and set(map(str, arrays["names"])) == set(names):
+            return dict(zip(map(str, arrays["names"]), map(float, arrays["seconds"]), strict=True))
+        found = time_them()
+        self.checkpoint.save(part, names=np.array(list(found)), seconds=np.array(list(found.values())))
+        return found
 
     def _final_costs(self, say: Callable[[str], None]) -> Costs:
         """Return the costs that decide: a draft's, measured on a GPU, are timed on the CPU of those that may be it.
@@ -399,10 +399,7 @@ class MixedStudy(FidelityStudy):
         if self.env.device == "cpu" or "cpu" not in self.env.devices:
             return costs
         names = [name for name in dict.fromkeys(self._contenders(CLAIMS[0], costs)) if name != "standard"]
-        timed = self._load_seconds(TIMED_ON_CPU)
-        if set(timed) != set(names):
-            timed = {name: self._cpu_seconds(name, say) for name in names}
-            self._save_seconds(TIMED_ON_CPU, timed)
+        timed = self._keep_seconds(TIMED_ON_CPU, names, lambda: {name: self._cpu_seconds(name, say) for name in names})
         rate = timed["draft"] / costs["draft"]["draft"]
         return costs | {"draft": {name: rate * cost for name, cost in costs["draft"].items()} | timed}
 

@@ -62,11 +62,6 @@ def test_a_claim_is_kept_at_its_limit_and_broken_just_beyond(claim: Claim, what:
     assert broken.by == what
 
 
-def test_the_claims_are_those_of_the_docs() -> None:
-    assert Claim("draft", rank=0.95, cosine=0.9, error=0.1) == DRAFT
-    assert Claim("standard", rank=0.99, cosine=0.98, error=0.03) == STANDARD
-
-
 @pytest.mark.parametrize(
     "lost", [{"failed": 1 / 64}, {"failed": None}, {"rank": None}, {"error": None}, {"cosine": None}]
 )
