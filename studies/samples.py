@@ -113,11 +113,7 @@ def evaluate_parts(objective: Objective, x: Float[Tensor, "point dim"], follow: 
 
 
 def evaluate_points(
-    objective: Objective,
-    x: Float[Tensor, "point dim"],
-    follow: Follow = ignore,
-    *,
-    by: Evaluate = evaluate_parts,
+    objective: Objective, x: Float[Tensor, "point dim"], follow: Follow = ignore, *, by: Evaluate = evaluate_parts
 ) -> Sample:
     """Evaluate losses and gradients in the batches that an objective prefers; seconds are those of the best batch."""
     found, each = by(objective, x, follow)

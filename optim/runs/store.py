@@ -49,15 +49,7 @@ from ...landscapes.objective import Evaluation, Status, failed
 from ...landscapes.plain import plain_json
 from ...landscapes.space import ParameterSpace
 from ...landscapes.storage.arrays import FILL, consolidate, create_array, flags, open_group
-from ...landscapes.storage.files import (
-    check_ours,
-    clear_halves,
-    lost_root,
-    placing,
-    replacing,
-    resolve,
-    store_files,
-)
+from ...landscapes.storage.files import check_ours, clear_halves, lost_root, placing, replacing, resolve, store_files
 from ..base import Kind
 from . import RUN as RUN
 from .run import Run

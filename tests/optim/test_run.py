@@ -150,8 +150,7 @@ def test_a_missing_row_is_damage_not_data(tmp_path: Path) -> None:
     run.save(lambda: {})
     (tmp_path / "run.zarr/status/c/1").unlink()
     with pytest.raises(
-        StoreError,
-        match=f"rows {CHUNK + 1} to {2 * CHUNK} are not what was written; .* begin the run again",
+        StoreError, match=f"rows {CHUNK + 1} to {2 * CHUNK} are not what was written; .* begin the run again"
     ):
         RunStore.open(tmp_path / "run.zarr")
 

@@ -7,16 +7,7 @@ import pytest
 
 from gradscape.envs.records import Fidelity
 from gradscape.landscapes.convert import from_json, to_json
-from gradscape.studies.claims import (
-    CLAIMS,
-    Choice,
-    Claim,
-    Shortfall,
-    choose,
-    fronts,
-    nearness,
-    surely_beaten,
-)
+from gradscape.studies.claims import CLAIMS, Choice, Claim, Shortfall, choose, fronts, nearness, surely_beaten
 from gradscape.studies.fidelity import MeasuredVariant
 from gradscape.studies.samples import Bootstrap, Comparison, GradientError, LossError, Seconds
 

@@ -160,8 +160,7 @@ def assert_bracketed(limit: Limit, truth: float) -> None:
 
 
 @pytest.mark.parametrize(
-    ("kind", "step", "stiffness"),
-    [(Spring, 2 / math.sqrt(100.0), 4 / 0.02**2), (Decay, 2 / 100.0, 2 / 0.02)],
+    ("kind", "step", "stiffness"), [(Spring, 2 / math.sqrt(100.0), 4 / 0.02**2), (Decay, 2 / 100.0, 2 / 0.02)]
 )
 def test_the_largest_step_and_stiffness_are_those_of_the_closed_form(
     kind: type[Environment], step: float, stiffness: float, tmp_path: Path

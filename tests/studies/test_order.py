@@ -6,14 +6,7 @@ from numpy.typing import NDArray
 
 from gradscape.envs.records import Fidelity
 from gradscape.studies import samples
-from gradscape.studies.convergence import (
-    Level,
-    Levels,
-    Scale,
-    conclude,
-    estimate_remainders,
-    judge,
-)
+from gradscape.studies.convergence import Level, Levels, Scale, conclude, estimate_remainders, judge
 from gradscape.studies.order import (
     choose_order,
     extrapolate,
