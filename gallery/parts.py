@@ -23,7 +23,7 @@ from ..jobs.report import ReportedSlice, ReportJob
 from ..jobs.scene import SceneSpec
 from ..jobs.slice import SliceJob
 from ..jobs.study import StudyJob
-from ..jobs.sweep import SweepJob
+from ..jobs.sweep import SMOOTHING, SweepJob
 from ..jobs.watch import Watch
 from ..landscapes.convert import to_json
 from ..landscapes.cost import episode_cost
@@ -270,13 +270,11 @@ class SweepPart(FigurePart):
 
     def label(self) -> str:
         """Return the command that makes it."""
-        return self.figure.sweep_command(
-            frames=SWEEP_FRAMES,
-            resolution=SWEEP_RESOLUTION,
-            gradients=SWEEP_GRADIENTS,
-            fidelity=SWEEP_FIDELITY,
-            device=self.device,
-        )
+        figure, size = self.figure, ["--frames", SWEEP_FRAMES, "--resolution", SWEEP_RESOLUTION]
+        words = ["landscape", "sweep", figure.env, "--dims", *figure.dims, "--over", figure.over, *size]
+        words += ["--fidelity", SWEEP_FIDELITY, "--through", figure.through]
+        words += ["--gradients", SWEEP_GRADIENTS] if figure.over != SMOOTHING else []  # of smoothed losses are none
+        return shlex.join(map(str, [*words, *figure.set_options, "--device", self.device]))
 
     def count_left(self) -> int:
         """Return 1 where there is no film of these settings yet."""
@@ -381,7 +379,9 @@ class SearchPart(FigurePart):
 
     def label(self) -> str:
         """Return the command that races them."""
-        return self.figure.race_command(METHODS, budget=BUDGET, device=self.device)
+        how = ["--methods", ",".join(METHODS), "--budget", str(BUDGET), "--seeds", "1"]
+        how += ["--fidelity", self.figure.fidelity, *self.figure.set_options, "--device", self.device]
+        return shlex.join(["landscape", "race", self.figure.env, *how])
 
     def count_left(self) -> int:
         """Count the runs not made at this fidelity."""

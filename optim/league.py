@@ -201,13 +201,9 @@ class SceneStandings:
 
 
 @dataclass(frozen=True)
-class OverallRank:
+class OverallRank(MeanRank):
     """The mean of a method's mean ranks over the `scenes` it ran in, with its interval by resampling these."""
 
-    method: str
-    rank: float
-    low: float
-    high: float
     scenes: int
 
 

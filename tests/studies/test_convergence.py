@@ -60,14 +60,11 @@ class Wild(Second):
 
 
 @pytest.fixture(autouse=True)
-def own_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Keep measurements in a folder of the test's own."""
-    monkeypatch.setattr("gradscape.studies.own_folder.user_data_path", lambda name: tmp_path / "data" / name)
-    for name, value in (("RESAMPLES", 99), ("REPETITION", 0.002), ("LARGEST", 0.002)):
+def registered(few_resamples: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value in (("REPETITION", 0.002), ("LARGEST", 0.002)):
         monkeypatch.setattr(samples, name, value)
     for kind in (Second, Wild):
         monkeypatch.setitem(registry.entries(), kind.name, registry.Entry(kind.name, f"{__name__}:{kind.__name__}"))
-    return tmp_path / "data"
 
 
 def study(scene: str, *more: str) -> list[str]:

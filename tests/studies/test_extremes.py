@@ -24,12 +24,8 @@ WIDTH = 0.05
 
 
 @pytest.fixture(autouse=True)
-def own_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Keep margins in a folder of the test's own; foretell what a job takes by one episode."""
-    monkeypatch.setattr("gradscape.studies.own_folder.user_data_path", lambda name: tmp_path / "data" / name)
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("gradscape.landscapes.draw.figures.page.save", lambda figure, path: path.touch())
-    for name in ("MOMENT", "ENOUGH", "WARM_UP"):
-        monkeypatch.setattr(f"gradscape.landscapes.cost.{name}", 0.0)
 
 
 @dataclass(frozen=True)
