@@ -212,10 +212,10 @@ class StudyRecord(abc.ABC):
 
     @abc.abstractmethod
     def rows(self) -> Iterable[Mapping[str, Any]]:
-        """Return what was measured, a row each."""
+        """Return what was measured, a row each, in the columns of the table."""
 
     def table(self) -> pd.DataFrame:
-        """Return what was measured as a table, the `rows`."""
+        """Return what was measured as a table; `rows` says which columns it has."""
         import pandas as pd
 
         rows, index = list(self.rows()), list(self.index)
