@@ -63,7 +63,7 @@ class Figure:
             axis = ["slice", self.env, "--dims", *map(str, self.dims)]
         how = ["--resolution", str(self.resolution), "--fidelity", self.fidelity, "--through", self.through]
         how += ["--gradients", str(self.gradients)] if self.gradients > 1 else []
-        return shlex.join(["landscape", *axis, *how, *self._set, "--device", device])
+        return shlex.join(["landscape", *axis, *how, *self.set_options, "--device", device])
 
     def python(self, device: str) -> str:
         """Return the lines of Python that make this slice alone, draw it and say what it is like."""
@@ -74,22 +74,9 @@ class Figure:
         lines = ["import gradscape as gs", "", f"s = gs.slice({self.env!r}, {self.dims!r}, {said})"]
         return "\n".join([*lines, "s.plot()", "print(s.report().words)"])
 
-    def sweep_command(self, *, frames: int, resolution: int, gradients: int, fidelity: str, device: str) -> str:
-        """Return the command that makes its sweep; of smoothed losses there are no gradients."""
-        from ..jobs.sweep import SMOOTHING
-
-        axes = ["--dims", *map(str, self.dims), "--over", self.over, "--frames", str(frames)]
-        how = ["--resolution", str(resolution), "--fidelity", fidelity, "--through", self.through]
-        how += ["--gradients", str(gradients)] if self.over != SMOOTHING else []
-        return shlex.join(["landscape", "sweep", self.env, *axes, *how, *self._set, "--device", device])
-
-    def race_command(self, methods: Sequence[str], *, budget: int, device: str) -> str:
-        """Return the command that searches its environment by several methods."""
-        how = ["--methods", ",".join(methods), "--budget", str(budget), "--seeds", "1", "--fidelity", self.fidelity]
-        return shlex.join(["landscape", "race", self.env, *how, *self._set, "--device", device])
-
     @property
-    def _set(self) -> list[str]:
+    def set_options(self) -> list[str]:
+        """The words of a command that set the scene's options."""
         return [word for name, value in self.options.items() for word in ("--set", f"{name}={value}")]
 
 

@@ -23,7 +23,7 @@ from ..jobs.report import ReportedSlice, ReportJob
 from ..jobs.scene import SceneSpec
 from ..jobs.slice import SliceJob
 from ..jobs.study import StudyJob
-from ..jobs.sweep import SweepJob
+from ..jobs.sweep import SMOOTHING, SweepJob
 from ..jobs.watch import Watch
 from ..landscapes.convert import to_json
 from ..landscapes.cost import episode_cost
@@ -38,26 +38,8 @@ from ..landscapes.storage.store import SliceStore, open_slice
 from ..optim.registry import optimizer_class
 from ..studies.fidelity import SETTINGS
 from ..studies.variants import StudyOptions
+from . import files
 from .figures import Figure
-from .files import (
-    COMPANION_PICTURE,
-    COMPANIONS,
-    DEVICES,
-    EPISODE_KINDS,
-    EPISODES,
-    MEASURES,
-    PICTURE,
-    QUALITY,
-    QUALITY_ARRAYS,
-    REPORT,
-    RUN_SUFFIX,
-    RUNS,
-    STORE,
-    SWEEP_FILM,
-    SWEEP_RECORD,
-    StudyFiles,
-    is_of_episode,
-)
 from .paper import read_paper
 from .records import (
     Companion,
@@ -194,7 +176,7 @@ class SlicePart(FigurePart):
 
     def state(self) -> State:
         """Look at the data without making an environment; who sampled it, and on what device, does not matter."""
-        points, store = self.figure.resolution ** len(self.figure.dims), self.folder / STORE
+        points, store = self.figure.resolution ** len(self.figure.dims), self.folder / files.STORE
         if not is_slice(store) and not has_lost_root(store):
             return State(points, 0)
         stored = SliceStore.open(store)
@@ -211,11 +193,11 @@ class SlicePart(FigurePart):
         """Sample the slice."""
         outcome = self._open().run(watch).outcome()
         if len(self.figure.dims) == 2:
-            (self.folder / PICTURE).unlink()  # `landscape gallery build` draws planes; a line's events need episodes
+            # `landscape gallery build` draws planes; events of a line need episodes
+            (self.folder / files.PICTURE).unlink()
         return outcome
 
     def _open(self) -> SliceJob:
-
         env = self.scene().make()
         return SliceJob.of(
             env,
@@ -224,7 +206,7 @@ class SlicePart(FigurePart):
             command=self.label(),
             out=self.folder,
             # nothing is lost of a store made by another model or for another device
-            force=is_slice(self.folder / STORE) and self.state().done == 0,
+            force=is_slice(self.folder / files.STORE) and self.state().done == 0,
             executor=self.executor,
         )
 
@@ -241,7 +223,7 @@ class CompanionPart(FigurePart):
         names, key = points_beside(self.figure), self._key()
         if not names or key is None:
             return 0
-        there = kept_key(self.folder / COMPANIONS) == key and (self.folder / COMPANION_PICTURE).exists()
+        there = kept_key(self.folder / files.COMPANIONS) == key and (self.folder / files.COMPANION_PICTURE).exists()
         return 0 if there else len(names) * self._resolution ** len(self.figure.dims)
 
     def make(self, watch: Watch) -> str:
@@ -250,7 +232,7 @@ class CompanionPart(FigurePart):
         from ..landscapes.draw.figures.page import save
         from ..landscapes.draw.film import lighten
 
-        dataset, env = open_slice(self.folder / STORE), self.scene().make()
+        dataset, env = open_slice(self.folder / files.STORE), self.scene().make()
         cuts, found = [CompanionSlice(self.figure.through, dataset["loss"].to_numpy())], list[Companion]()
         with watch.progress(self.count_left(), "episodes") as advance:
             for name in points_beside(self.figure):
@@ -260,10 +242,10 @@ class CompanionPart(FigurePart):
                 cuts.append(CompanionSlice(name, loss))
                 found.append(Companion(name, low, high, 1 - finite.size / loss.size))
                 advance(len(found) * loss.size, "")
-        save(companions_figure(cuts, dataset), self.folder / COMPANION_PICTURE)
-        lighten(self.folder / COMPANION_PICTURE)
+        save(companions_figure(cuts, dataset), self.folder / files.COMPANION_PICTURE)
+        lighten(self.folder / files.COMPANION_PICTURE)
         record = {"key": self._key(), "device": env.device, "slices": to_json(found)}
-        write_record(self.folder / COMPANIONS, record)
+        write_record(self.folder / files.COMPANIONS, record)
         said = (
             "all failed" if one.lowest is None else f"losses from {one.lowest:.4g} to {one.highest:.4g}"
             for one in found
@@ -276,7 +258,7 @@ class CompanionPart(FigurePart):
 
     def _key(self) -> dict[str, Any] | None:
         """Return what decides these slices and their picture; None where the figure has no slice yet."""
-        store = self.folder / STORE
+        store = self.folder / files.STORE
         if not is_slice(store):
             return None
         settings = {"fidelity": self.figure.fidelity, "resolution": self._resolution}
@@ -288,13 +270,11 @@ class SweepPart(FigurePart):
 
     def label(self) -> str:
         """Return the command that makes it."""
-        return self.figure.sweep_command(
-            frames=SWEEP_FRAMES,
-            resolution=SWEEP_RESOLUTION,
-            gradients=SWEEP_GRADIENTS,
-            fidelity=SWEEP_FIDELITY,
-            device=self.device,
-        )
+        figure, size = self.figure, ["--frames", SWEEP_FRAMES, "--resolution", SWEEP_RESOLUTION]
+        words = ["landscape", "sweep", figure.env, "--dims", *figure.dims, "--over", figure.over, *size]
+        words += ["--fidelity", SWEEP_FIDELITY, "--through", figure.through]
+        words += ["--gradients", SWEEP_GRADIENTS] if figure.over != SMOOTHING else []  # of smoothed losses are none
+        return shlex.join(map(str, [*words, *figure.set_options, "--device", self.device]))
 
     def count_left(self) -> int:
         """Return 1 where there is no film of these settings yet."""
@@ -312,9 +292,9 @@ class SweepPart(FigurePart):
         from ..landscapes.draw.figures.sweep import save_films
 
         drawn = self._open().sample(watch)
-        save_films(drawn, self.folder / SWEEP_FILM, None, dpi=SWEEP_DPI, loss=FILM_CRF)
+        save_films(drawn, self.folder / files.SWEEP_FILM, None, dpi=SWEEP_DPI, loss=FILM_CRF)
         record = self._record(drawn.label, drawn.values[0], drawn.values[-1], self.label())
-        write_record(self.folder / SWEEP_RECORD, to_json(record))
+        write_record(self.folder / files.SWEEP_RECORD, to_json(record))
         return f"{SWEEP_FRAMES} frames of {SWEEP_RESOLUTION} x {SWEEP_RESOLUTION} points over {drawn.label}"
 
     def _record(self, label: str, low: float, high: float, command: str) -> SweepRecord:
@@ -322,7 +302,6 @@ class SweepPart(FigurePart):
         return SweepRecord(self.figure.over, SWEEP_FIDELITY, SWEEP_FRAMES, shape, label, low, high, command)
 
     def _open(self) -> SweepJob:
-
         env = self.scene(SWEEP_FIDELITY).make()
         plane, over = self.figure.plane(env, SWEEP_RESOLUTION), self.figure.over
         job = SweepJob.of(env, plane, over, SWEEP_FRAMES, gradients=SWEEP_GRADIENTS, command=self.label())
@@ -353,15 +332,14 @@ class EpisodePart(FigurePart):
                 with watch.busy(f"{self.figure.id}: the episode of {node.why}"):
                     self._film(env, plane, node)
                 filmed.append(node)
-                write_nodes(self.folder / EPISODES, filmed)
+                write_nodes(self.folder / files.EPISODES, filmed)
         for file in self.folder.glob("episode-*"):
-            if is_of_episode(file) and file.stem not in {node.name for node in self._nodes}:
+            if files.is_of_episode(file) and file.stem not in {node.name for node in self._nodes}:
                 file.unlink()
-        write_nodes(self.folder / EPISODES, self._nodes)
+        write_nodes(self.folder / files.EPISODES, self._nodes)
         return f"{len(self._nodes)} episodes"
 
     def _film(self, env: Environment, plane: Plane, node: Node) -> None:
-
         from ..landscapes.draw.film import save_film, save_still
         from ..landscapes.draw.render import replay
 
@@ -376,20 +354,18 @@ class EpisodePart(FigurePart):
 
     @cached_property
     def _dataset(self) -> xr.Dataset:
-
-        return open_slice(self.folder / STORE)
+        return open_slice(self.folder / files.STORE)
 
     @cached_property
     def _nodes(self) -> list[Node]:
-
         return choose_nodes(self._dataset, point(make(self.figure.env, device="cpu"), self.figure.through))
 
     def _find_films(self) -> list[Node]:
         """Return the nodes whose films are there."""
-        listed = read_if_sound(read_nodes, self.folder / EPISODES) or []
+        listed = read_if_sound(read_nodes, self.folder / files.EPISODES) or []
         return [
             node for node in self._nodes
-            if node in listed and all((self.folder / f"{node.name}.{kind}").exists() for kind in EPISODE_KINDS)
+            if node in listed and all((self.folder / f"{node.name}.{kind}").exists() for kind in files.EPISODE_KINDS)
         ]  # fmt: skip
 
 
@@ -403,7 +379,9 @@ class SearchPart(FigurePart):
 
     def label(self) -> str:
         """Return the command that races them."""
-        return self.figure.race_command(METHODS, budget=BUDGET, device=self.device)
+        how = ["--methods", ",".join(METHODS), "--budget", str(BUDGET), "--seeds", "1"]
+        how += ["--fidelity", self.figure.fidelity, *self.figure.set_options, "--device", self.device]
+        return shlex.join(["landscape", "race", self.figure.env, *how])
 
     def count_left(self) -> int:
         """Count the runs not made at this fidelity."""
@@ -425,14 +403,14 @@ class SearchPart(FigurePart):
 
     @property
     def _where(self) -> Path:
-        return self.root / RUNS / "-".join([self.figure.env, *map(str, self.figure.options.values())])
+        return self.root / files.RUNS / "-".join([self.figure.env, *map(str, self.figure.options.values())])
 
     def _file(self, method: str) -> Path:
-        return self._where / f"{method}-0{RUN_SUFFIX}"
+        return self._where / f"{method}-0{files.RUN_SUFFIX}"
 
     def _missing(self) -> list[str]:
         """Return the methods without a run at the figure's fidelity that its slice's page would show."""
-        fidelity, store = self.scene().fidelity, self.folder / STORE
+        fidelity, store = self.scene().fidelity, self.folder / files.STORE
         cut = SliceStore.open(store).identity if is_slice(store) else None
 
         def fits(run: xr.Dataset) -> bool:
@@ -454,8 +432,8 @@ class ReportPart(FigurePart):
 
     def count_left(self) -> int:
         """Return 1 where there is no report of this slice."""
-        record, store = read_if_sound(read_json, self.folder / REPORT), self.folder / STORE
-        if record is None or read_if_sound(read_json, self.folder / MEASURES) is None or not is_slice(store):
+        record, store = read_if_sound(read_json, self.folder / files.REPORT), self.folder / files.STORE
+        if record is None or read_if_sound(read_json, self.folder / files.MEASURES) is None or not is_slice(store):
             return 1
         key = record.get("key")
         return int(not isinstance(key, dict) or key.get("slice") != digest_of(open_slice(store)))
@@ -471,12 +449,12 @@ class ReportPart(FigurePart):
         """Measure the slice, and replace a report of another one."""
         from ..landscapes.draw.film import lighten
 
-        for name in (REPORT, MEASURES, QUALITY, QUALITY_ARRAYS):
+        for name in (files.REPORT, files.MEASURES, files.QUALITY, files.QUALITY_ARRAYS):
             (self.folder / name).unlink(missing_ok=True)
-        subject, words = ReportedSlice(self.figure.id, self.folder / STORE), read_paper().words
+        subject, words = ReportedSlice(self.figure.id, self.folder / files.STORE), read_paper().words
         job = ReportJob([subject], self.folder, True, REPORT_POINTS, SEED, self.device, words, command=self.label())
         report = job.report(subject, watch)
-        lighten(self.folder / QUALITY)
+        lighten(self.folder / files.QUALITY)
         return ", ".join(report.words)
 
 
@@ -492,7 +470,7 @@ class FidelityPart(FigurePart):
     def count_left(self) -> int:
         """Return 1 where there is none, of an environment that has fidelities to compare."""
         some = len(environment_class(self.figure.env).fidelities) > 1
-        devices = DEVICES if self.device == "auto" else (self.device,)
+        devices = files.DEVICES if self.device == "auto" else (self.device,)
         return int(some and not any(map(self._sound, devices)))
 
     def seconds_each(self) -> float:
@@ -505,20 +483,19 @@ class FidelityPart(FigurePart):
 
         job = self._open()
         found = job.run(watch)
-        files = StudyFiles.of(self.root, self.figure.env, found.device, found.kind)
-        make_folder(files.record.parent)
-        shutil.copyfile(job.folder / job.results.picture, files.picture)
-        lighten(files.picture)
-        write_record(files.record, to_json(found))
+        placed = files.StudyFiles.of(self.root, self.figure.env, found.device, found.kind)
+        make_folder(placed.record.parent)
+        shutil.copyfile(job.folder / job.results.picture, placed.picture)
+        lighten(placed.picture)
+        write_record(placed.record, to_json(found))
         return f"{len(found.table())} variants at {found.points} points"
 
     def _sound(self, device: str) -> bool:
         """Whether there is one of a device."""
-        files = StudyFiles.of(self.root, self.figure.env, device, "fidelity")
-        return bool(read_if_sound(read_json, files.record)) and files.picture.is_file()
+        placed = files.StudyFiles.of(self.root, self.figure.env, device, "fidelity")
+        return bool(read_if_sound(read_json, placed.record)) and placed.picture.is_file()
 
     def _open(self) -> StudyJob:
-
         scene = SceneSpec(self.figure.env, device=self.device)
         options = StudyOptions(points=STUDY_POINTS, seed=SEED, settings=CHANGED)
         return StudyJob.open("fidelity", scene, options, command=self.label())

@@ -256,9 +256,10 @@ def open_run_store(
     Raises StoreMismatchError where another run is there.
     """
     identity, about = run_identity(env, optimizer), provenance(env, command)
-    if force and path.exists():
-        return RunStore.create(path, env.space, identity=identity, provenance=about, budget=budget, overwrite=True)
-    return RunStore.open_or_create(path, env.space, identity=identity, provenance=about, budget=budget)
+    replaced = force and path.exists()
+    return RunStore.open_or_create(
+        path, env.space, identity=identity, provenance=about, budget=budget, overwrite=replaced
+    )
 
 
 def run_identity(env: Environment, optimizer: Optimizer) -> dict[str, Any]:

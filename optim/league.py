@@ -14,7 +14,7 @@ import xarray as xr
 from ..landscapes.identity import current_identity
 from ..landscapes.plain import finite
 from .claims import ClaimFinding, Claims, check_claims
-from .statistics import EqualCost, Lead, MeanRank, Superiority, interval, not_told_from, times_record
+from .statistics import EqualCost, Lead, MeanRank, Superiority, interval, not_told_from, seen_from, times_record
 
 RANDOM = "random"  # the method that another has to be told from to be of use
 OF_METHOD = ("method", "method_options", "method_version", "seed")  # of a run's identity, what is not of its scene
@@ -171,8 +171,7 @@ class SceneStandings:
 
     def probabilities(self, method: str) -> dict[str, float]:
         """Return the probability that a method ends with a lesser loss than each of the others."""
-        seen = [one if one.first == method else one.reversed for one in self.pairs if method in (one.first, one.second)]
-        return {one.second: one.probability for one in seen}
+        return {one.second: one.probability for one in seen_from(method, self.pairs)}
 
     @property
     def rows(self) -> list[dict[str, Any]]:
@@ -202,13 +201,9 @@ class SceneStandings:
 
 
 @dataclass(frozen=True)
-class OverallRank:
+class OverallRank(MeanRank):
     """The mean of a method's mean ranks over the `scenes` it ran in, with its interval by resampling these."""
 
-    method: str
-    rank: float
-    low: float
-    high: float
     scenes: int
 
 

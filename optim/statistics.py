@@ -193,7 +193,7 @@ class Lead:
     def of(cls, methods: Sequence[str], pairs: Sequence[Superiority]) -> Lead:
         """Return the lead among methods, the best mean rank first."""
         best, *others = methods
-        found = {one.second: one for pair in pairs for one in (pair, pair.reversed) if one.first == best}
+        found = {one.second: one for one in seen_from(best, pairs)}
         rivals = tuple(other for other in others if found[other].better != best)
         return cls(best, rivals, max((one.corrected for one in found.values()), default=np.nan))
 
@@ -221,10 +221,14 @@ class Lead:
         return f"none is first: {self.method}, of the best mean rank, is not distinguishable from {others}"
 
 
+def seen_from(method: str, pairs: Sequence[Superiority]) -> list[Superiority]:
+    """Return how a method stands to each of the others."""
+    return [one for pair in pairs for one in (pair, pair.reversed) if one.first == method]
+
+
 def not_told_from(method: str, methods: Sequence[str], pairs: Sequence[Superiority]) -> tuple[str, ...]:
     """Return which of the methods are not distinguishable from one after the correction, in their order."""
-    seen = [one for pair in pairs for one in (pair, pair.reversed) if one.first == method]
-    undecided = {one.second for one in seen if one.better is None}
+    undecided = {one.second for one in seen_from(method, pairs) if one.better is None}
     return tuple(other for other in methods if other in undecided)
 
 

@@ -20,13 +20,11 @@ from ..landscapes.capacity import Need, require
 from ..landscapes.plain import finite
 from ..landscapes.statistics import gradient_error, median_of, p95_of
 from .divergence import Distributions, Divergence, Neighbours
-from .order import UNMOVED, Order, Shapes, Verdict, choose_order, extrapolate, find_floor, fit_order, measure_order
-from .samples import Bootstrap, Sample, loss_range
-from .variants import Expected, StudyRecord, Variant, VariantStudy, refuse_single, samples_of
+from .order import UNMOVED, Shapes, Verdict, choose_order, extrapolate, find_floor, fit_order, measure_order
+from .samples import Bootstrap, Sample, interval_columns, loss_range, percent
+from .variants import Expected, StudyRecord, Variant, VariantStudy, refuse_settings, refuse_single, samples_of
 
 if TYPE_CHECKING:
-    import pandas as pd
-
     from ..envs.base import Environment
     from ..jobs.watch import Watch
     from .variants import StudyOptions
@@ -34,7 +32,8 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 JOINT, PRECISION = "joint", "precision"
 SETTINGS = ("dt", "resolution", "particles", JOINT, PRECISION)
-DT_FACTORS, CELL_FACTORS, PARTICLE_FACTORS = (4.0, 2.0, 0.5, 0.25), (2 / 3, 1.5, 2.0), (0.5, 2.0, 4.0)
+DT_FACTORS = (4.0, 2.0, 0.5, 0.25)
+FACTORS = {"resolution": (2 / 3, 1.5, 2.0), "particles": (0.5, 2.0, 4.0)}
 ALLOWED = 0.1  # of what standard is off: a reference that moves by less is converged
 
 
@@ -93,7 +92,7 @@ class SettingConvergence:
         """Say by which order it converges, or that it does not."""
         said = [f"{self.setting}: {self.verdict}"]
         if self.verdict == "too few levels" and self.moves:
-            said.append(f"losses move by {_percent(self.moves[-1].p95.value)} (95 % of points) to the finest")
+            said.append(f"losses move by {percent(self.moves[-1].p95.value)} (95 % of points) to the finest")
         if self.order.value is not None:
             count = self.shapes
             said[0] += f", order {self.order}"
@@ -102,7 +101,7 @@ class SettingConvergence:
             match = {True: "as observed", False: "not as observed", None: "not compared"}[self.as_designed]
             said.insert(1, f"designed {self.designed:g}, {match}")
         if self.floor is not None:
-            said.append(f"differences do not fall below {_percent(self.floor)}")
+            said.append(f"differences do not fall below {percent(self.floor)}")
         if self.met_from is not None and self.verdict != "unmoved":
             said.append(f"within a tenth of standard's error from {self.met_from} on")
         return "; ".join(said)
@@ -140,7 +139,7 @@ class ConvergenceRule:
 
     def sentence(self) -> str:
         """Say it in a sentence."""
-        off, moved = (_percent(one.value if one else None) for one in (self.off, self.moved))
+        off, moved = (percent(one.value if one else None) for one in (self.off, self.moved))
         if self.met is None:
             return f"whether the reference is converged is not known: it moves by {moved}, standard is off by {off}"
         if self.met and self.moved is not None and (self.moved.value or 0.0) <= UNMOVED:
@@ -161,6 +160,7 @@ class ConvergenceRecord(StudyRecord):
     """
 
     kind: ClassVar[str] = "convergence"
+    index: ClassVar[tuple[str, ...]] = ("setting", "coarse", "fine")
 
     reference: str
     spread: float | None
@@ -170,17 +170,22 @@ class ConvergenceRecord(StudyRecord):
     divergence: Divergence | None
     distributions: Distributions | None
 
-    def table(self) -> pd.DataFrame:
-        """Return a row for each setting and refinement, indexed by `setting`, `coarse` and `fine`.
+    def rows(self) -> Iterator[dict[str, Any]]:
+        """Yield a row for each setting and refinement, told apart by `setting`, `coarse` and `fine`.
 
         Columns: `median` and `p95` of |difference| and the latter's interval, as shares of the spread; `cosine` and
         `relative_error` of gradients; `compared` points; of the setting, `order` with its interval, `designed`,
         `verdict` and `met`, whether the reference meets the rule.
         """
-        import pandas as pd
-
-        rows = [_columns(one, move) for one in self.settings for move in one.moves]
-        return pd.DataFrame(rows).set_index(["setting", "coarse", "fine"])
+        for one in self.settings:
+            for move in one.moves:
+                yield {
+                    **{"setting": one.setting, "coarse": move.coarse, "fine": move.fine, "median": move.median.value},
+                    **interval_columns("p95", move.p95),
+                    **{"cosine": move.cosine.value, "relative_error": move.relative_error.value},
+                    **{"compared": move.compared, **interval_columns("order", one.order)},
+                    **{"designed": one.designed, "verdict": one.verdict, "met": one.met},
+                }
 
     def sentences(self) -> list[str]:
         """Say what was found: by which order settings converge, whether the reference does, what is left to win."""
@@ -193,50 +198,28 @@ class ConvergenceRecord(StudyRecord):
             without = [one.setting for one in self.settings if one.verdict == "does not converge"] or ["too few levels"]
             return [f"there is no limit to extrapolate to, because of {', '.join(without)}"]
         return [
-            f"{one.name} is {_percent(one.median.value)} (median) and {_percent(one.p95.value)} (95 % of points, "
-            f"{_percent(one.p95.low)} to {_percent(one.p95.high)}) from Richardson's limit"
+            f"{one.name} is {percent(one.median.value)} (median) and {percent(one.p95.value)} (95 % of points, "
+            f"{percent(one.p95.low)} to {percent(one.p95.high)}) from Richardson's limit"
             for one in self.remainders
         ]
 
 
-def _columns(one: SettingConvergence, move: Move) -> dict[str, Any]:
-    return {
-        **{"setting": one.setting, "coarse": move.coarse, "fine": move.fine},
-        **{"median": move.median.value, "p95": move.p95.value, "p95_low": move.p95.low, "p95_high": move.p95.high},
-        **{"cosine": move.cosine.value, "relative_error": move.relative_error.value, "compared": move.compared},
-        **{"order": one.order.value, "order_low": one.order.low, "order_high": one.order.high},
-        **{"designed": one.designed, "verdict": one.verdict, "met": one.met},
-    }
+Refinements = dict[str, list[tuple[Variant, float]]]  # variants and widths by setting, from coarse to fine
 
 
-def _percent(value: float | None) -> str:
-    return "more than a number can say" if value is None else f"{100 * value:.2g} %"
-
-
-@dataclass(frozen=True)
-class Refinement:
-    """Hold the variants of a setting with their widths, from coarse to fine; one of them is the reference."""
-
-    setting: str
-    levels: tuple[tuple[Variant, float], ...]
-
-
-def find_refinements(env: Environment, settings: Sequence[str] = ()) -> list[Refinement]:
+def find_refinements(env: Environment, settings: Sequence[str] = ()) -> Refinements:
     """Return what can be refined of a scene at its reference, by default every setting that it has.
 
     Steps that do not fill a control step, and grids that the scene has no other of, are left out. Raises ValueError for
     a setting that there is not, and where the scene has none of those asked for.
     """
-    if unknown := set(settings) - set(SETTINGS):
-        raise ValueError(
-            f"--settings takes {', '.join(SETTINGS)} in a study of convergence; got {', '.join(sorted(unknown))}"
-        )
-    reference, found = Variant.of(env), list[Refinement]()
+    refuse_settings(settings, SETTINGS, " in a study of convergence")
+    reference, found = Variant.of(env), Refinements()
     for setting in settings or SETTINGS:
         every = {variant.key(): variant for variant in (*_refine(reference, setting, env), reference)}
         levels = [(variant, _width(variant.fidelity, reference.fidelity, setting)) for variant in every.values()]
         if len(levels) > 1:
-            found.append(Refinement(setting, tuple(sorted(levels, key=lambda level: -level[1]))))
+            found[setting] = sorted(levels, key=lambda level: -level[1])
     if not found:
         raise ValueError(f"{env.name} has nothing of {', '.join(settings or SETTINGS)} to refine")
     return found
@@ -260,18 +243,14 @@ def _refine(base: Variant, setting: str, env: Environment) -> Iterator[Variant]:
     if setting == "dt" and own.dt:
         steps = [own.dt * factor for factor in DT_FACTORS]
         yield from (base.with_dt(dt) for dt in steps if abs(env.nearest_dt(dt) - dt) < 1e-6 * dt)
-    elif setting == "resolution" and own.resolution:
-        yield from map(base.with_cells, CELL_FACTORS)
-    elif setting == "particles" and env.work().unit == "particle-substep":
-        yield from map(base.with_particles, PARTICLE_FACTORS)
-    elif setting == PRECISION:
-        yield base.with_other_precision()
     elif setting == JOINT and own.resolution and own.dt:
         # Grid, step and particles together, so that a wave crosses as many cells in a step (Courant's number).
-        for finer in CELL_FACTORS:
+        for finer in FACTORS["resolution"]:
             cells, dt = base.even_cells(finer), env.nearest_dt(own.dt / finer)
             count = {"particles": round(own.particles * (cells / own.resolution) ** 3)} if own.particles else {}
             yield base.refine(JOINT, f"joint-x{finer:.3g}", resolution=cells, dt=dt, **count)
+    elif setting != "dt":
+        yield from base.vary(setting, FACTORS.get(setting, ()), env)
 
 
 class ConvergenceStudy(VariantStudy):
@@ -292,12 +271,12 @@ class ConvergenceStudy(VariantStudy):
 
     def identity(self) -> dict[str, Any]:
         """Return what decides the numbers."""
-        return {**super().identity(), "settings": [one.setting for one in self.refinements]}
+        return {**super().identity(), "settings": list(self.refinements)}
 
     @cached_property
     def variants(self) -> list[Variant]:
         """What is simulated: the reference, the named fidelities, then what is refined."""
-        levels = [variant for one in self.refinements for variant, _ in one.levels]
+        levels = [variant for one in self.refinements.values() for variant, _ in one]
         unique: dict[str, Variant] = {}
         for variant in (Variant.of(self.env), *Variant.all_named(self.env), *levels):
             unique.setdefault(variant.name, variant)
@@ -324,57 +303,53 @@ class ConvergenceStudy(VariantStudy):
         samples = samples_of(self.measure_all(watch))
         name = self.variants[0].name
         reference = samples[name].loss
-        scale = self._scale(samples)
+        spread = loss_range(reference[np.isfinite(reference)]) or None
+        scale = self._scale(samples, spread or 1.0)
         refined = [one for one in self._refined(samples) if len(one.levels) > 1]
-        found = [conclude(one, name, scale) for one in refined]
-        asked = joint_or_single(refined)
-        pairs = [(one, order) for one, (_, order) in zip(refined, found, strict=True) if one in asked]
+        settings = tuple(conclude(one, name, scale) for one in refined)
+        limits = joint_or_single(list(zip(refined, settings, strict=True)))
         losses = {one: samples[one].loss for one in self.env.fidelities if one in samples}
-        settings = tuple(one for one, _ in found)
         neighbours = self._neighbours(scale.spread)
         divergence = neighbours.measure_divergence(watch)
         chaos = divergence is not None and divergence.is_chaos
         return ConvergenceRecord(
             **self.about(provenance, command),
             reference=name,
-            spread=loss_range(reference[np.isfinite(reference)]) or None,
+            spread=spread,
             settings=settings,
             rule=judge(settings, scale),
-            remainders=estimate_remainders(pairs, losses, reference, scale),
+            remainders=estimate_remainders(limits, losses, reference, scale),
             divergence=divergence,
             distributions=neighbours.measure_distributions(self._compared(), watch) if chaos else None,
         )
 
-    def _scale(self, samples: Mapping[str, Sample]) -> Scale:
-        reference = samples[self.variants[0].name].loss
-        spread = loss_range(reference[np.isfinite(reference)]) or 1.0
+    def _scale(self, samples: Mapping[str, Sample], spread: float) -> Scale:
         standard = samples.get(list(self.env.fidelities)[-2])
-        far = error(standard.loss, reference) if standard else np.empty(0)
+        far = error(standard.loss, samples[self.variants[0].name].loss) if standard else np.empty(0)
         return Scale(spread, sum_up(far, spread, self.seed)[1], self.seed)
 
     def _refined(self, samples: Mapping[str, Sample]) -> Iterator[Levels]:
-        for one in self.refinements:
-            known = [(variant, width) for variant, width in one.levels if variant.name in samples]
+        for setting, every in self.refinements.items():
+            known = [(variant, width) for variant, width in every if variant.name in samples]
             found = [samples[variant.name] for variant, _ in known]
             levels = [
                 Level(variant.name, width, variant.fidelity, sample.with_gradient)
                 for (variant, width), sample in zip(known, found, strict=True)
             ]
             losses, gradients = ([getattr(sample, name) for sample in found] for name in ("loss", "grad"))
-            yield Levels(one.setting, levels, np.array(losses), gradients, self.env.designed_order.get(one.setting))
+            yield Levels(setting, levels, np.array(losses), gradients, self.env.designed_order.get(setting))
 
     def _compared(self) -> list[Variant]:
         """Return what is compared with the reference by distributions: named fidelities, and what is refined.
 
         Of a setting it is the one step that is finer than the reference; what was refused is left out.
         """
-        named = [one for one in self.variants[1:] if one.name in self.env.fidelities]
-        finer = []
-        for one in self.refinements:
-            names = [variant.name for variant, _ in one.levels]
-            beyond = one.levels[names.index(self.variants[0].name) + 1 :]
-            finer += [variant for variant, _ in beyond[:1]]
-        return [one for one in (*named, *finer) if one.name not in self.refused]
+        found = [one for one in self.variants[1:] if one.name in self.env.fidelities]
+        for levels in self.refinements.values():
+            variants = [variant for variant, _ in levels]
+            place = [one.name for one in variants].index(self.variants[0].name)
+            found += variants[place + 1 : place + 2]
+        return [one for one in found if one.name not in self.refused]
 
 
 @dataclass(frozen=True, eq=False)
@@ -423,14 +398,14 @@ def sum_up(errors: Array, spread: float, seed: int) -> tuple[Bootstrap, Bootstra
     return median, p95
 
 
-def conclude(levels: Levels, reference: str, scale: Scale) -> tuple[SettingConvergence, Order]:
+def conclude(levels: Levels, reference: str, scale: Scale) -> SettingConvergence:
     """Say what a setting's levels show; one of them is the `reference`."""
     order = measure_order(levels.widths, levels.losses, scale=scale.spread, seed=scale.seed)
     moves = [_move(levels, place, scale) for place in range(len(levels.levels) - 1)]
     place = [level.name for level in levels.levels].index(reference)
     beyond = moves[place:]
     met = [scale.meets(move.p95.value) for move in beyond]
-    found = SettingConvergence(
+    return SettingConvergence(
         setting=levels.setting,
         levels=tuple(levels.levels),
         moves=tuple(moves),
@@ -444,7 +419,6 @@ def conclude(levels: Levels, reference: str, scale: Scale) -> tuple[SettingConve
         met=met[0] if met else None,
         met_from=next((move.coarse for move, yes in zip(beyond, met, strict=True) if yes), None),
     )
-    return found, order
 
 
 def _move(found: Levels, place: int, scale: Scale) -> Move:
@@ -476,21 +450,24 @@ def _moved(one: SettingConvergence) -> float:
     return np.inf if value is None else value
 
 
-def joint_or_single(refined: Sequence[Levels]) -> list[Levels]:
+Refined = Sequence[tuple[Levels, SettingConvergence]]
+
+
+def joint_or_single(refined: Refined) -> Refined:
     """Return the settings whose limits add up to that of the scene: the joint one alone where there is one."""
-    joint = [one for one in refined if one.setting == JOINT]
-    return joint or [one for one in refined if one.setting != PRECISION]
+    joint = [pair for pair in refined if pair[0].setting == JOINT]
+    return joint or [pair for pair in refined if pair[0].setting != PRECISION]
 
 
 def estimate_remainders(
-    refined: Sequence[tuple[Levels, Order]], named: Mapping[str, Array], reference: Array, scale: Scale
+    refined: Refined, named: Mapping[str, Array], reference: Array, scale: Scale
 ) -> tuple[Remainder, ...]:
     """Estimate how far `named` losses are from Richardson's limit, shape (point,) each.
 
     Corrections of the settings add up to leading order. Orders are measured again for each draw of the bootstrap, but
     where the designed ones are taken. Empty where some setting has no limit.
     """
-    corrections = [_Correction.of(levels, order, reference) for levels, order in refined]
+    corrections = [_Correction.of(levels, found, reference) for levels, found in refined]
     every = [one for one in corrections if one is not None]
     if not every or len(every) < len(corrections):
         return ()
@@ -527,9 +504,9 @@ class _Correction:
     reference: Array
 
     @classmethod
-    def of(cls, levels: Levels, order: Order, reference: Array) -> _Correction | None:
-        by = choose_order(order, levels.designed)
-        if order.verdict == "unmoved":
+    def of(cls, levels: Levels, found: SettingConvergence, reference: Array) -> _Correction | None:
+        by = choose_order(found.verdict, found.order, levels.designed)
+        if found.verdict == "unmoved":
             return cls(levels, None, True, reference)
         return None if by is None else cls(levels, by if by == levels.designed else None, False, reference)
 

@@ -16,16 +16,16 @@ from .stability import Cell, ask, bisect, bracket, evaluate_bound, evaluate_kept
 from .variants import Expected, Study, StudyRecord, one_line, precision_cost
 
 if TYPE_CHECKING:
-    import pandas as pd
     from torch import Tensor
 
     from ..envs.base import Environment
-    from ..jobs.watch import Advance, Watch
+    from ..jobs.watch import Watch
     from .variants import StudyOptions
 
 GRID, WIDTH, TOLERANCE = 8, 0.05, 0.1  # by default
 MAP_REACH = 2.0  # times the limit, or less by that, a map reaches; of an option, whose effect goes with its root:
 OPTION_REACH = 8.0
+Changes = Sequence[tuple[Setting, float]]
 
 
 @dataclass(frozen=True)
@@ -132,6 +132,7 @@ class ExtremesRecord(StudyRecord):
 
     kind: ClassVar[str] = "extremes"
     kept_by: ClassVar[tuple[str, ...]] = ("settings", "options", "engine")
+    index: ClassVar[tuple[str, ...]] = ("setting", "end", "precision")
 
     fidelity: str
     reference: str
@@ -145,19 +146,16 @@ class ExtremesRecord(StudyRecord):
         """The precisions that were tried, in order."""
         return list(dict.fromkeys(one.precision for one in self.limits))
 
-    def table(self) -> pd.DataFrame:
-        """Return a row for each end of each setting in each precision, indexed by `setting`, `end` and `precision`.
+    def rows(self) -> Iterator[dict[str, Any]]:
+        """Yield a row for each end of each setting in each precision, told apart by `setting`, `end` and `precision`.
 
         Columns: `base`; `stable` and `failed`, between which the limit lies; `margin`; `beyond`, what happens there;
         `accurate` and `wrong`, up to where losses are right and where no more; `islands`; `error`, at the last stable
         value.
         """
-        import pandas as pd
-
-        index = ["setting", "end", "precision"]
-        names = [*index, "base", "stable", "failed", "margin", "beyond", "accurate", "wrong", "islands"]
-        rows = [{**{name: getattr(one, name) for name in names}, "error": one.last_error} for one in self.limits]
-        return pd.DataFrame(rows).set_index(index)
+        names = (*self.index, "base", "stable", "failed", "margin", "beyond", "accurate", "wrong", "islands")
+        for one in self.limits:
+            yield {**{name: getattr(one, name) for name in names}, "error": one.last_error}
 
     def sentences(self) -> list[str]:
         """Return each limit in words."""
@@ -296,15 +294,15 @@ class ExtremesStudy(Study):
     def run(self, watch: Watch, provenance: Mapping[str, Any], command: str) -> ExtremesRecord:
         """Try what is missing and return the record."""
         count = self._count()
-        with watch.progress(count, self.what) as advance:
+        with watch.progress(count, self.what) as self._advance:
             limits = [
-                self._limit(setting, end, precision, advance)
+                self._limit(setting, end, precision)
                 for precision in self.precisions
                 for setting in self.changed
                 for end in setting.ends
             ]
-            maps = [self._map(pair, precision, advance) for precision in self.precisions for pair in self.pairs]
-            advance(count, f"{len(self.answers)} tried")
+            maps = [self._map(pair, precision) for precision in self.precisions for pair in self.pairs]
+            self._advance(count, f"{len(self.answers)} tried")
         return ExtremesRecord(
             **self.about(provenance, command),
             fidelity=self.env.fidelity.name,
@@ -315,22 +313,22 @@ class ExtremesStudy(Study):
             maps=tuple(maps),
         )
 
-    def _limit(self, setting: Setting, end: str, precision: str, advance: Advance) -> Limit:
+    def _limit(self, setting: Setting, end: str, precision: str) -> Limit:
         """Scan a setting towards an end, then bisect the first failure: what is stable beyond is not hidden by that."""
         axis = self.settings.axis(setting)
         wanted = list(dict.fromkeys(map(axis.settle, setting.grid(end))))
         scanned = [value for value in wanted if self.settings.work(setting, value) <= MAX_WORK]
-        cells = [self._cell([(setting, value)], precision, advance) for value in scanned]
+        cells = [self._cell([(setting, value)], precision) for value in scanned]
         other = "smallest" if end == "largest" else "largest"
         for value in list(dict.fromkeys(map(axis.settle, setting.grid(other))))[1:]:
             if cells[0].stable or self.settings.work(setting, value) > MAX_WORK:
                 break
-            cells.insert(0, self._cell([(setting, value)], precision, advance))
+            cells.insert(0, self._cell([(setting, value)], precision))
         values = [cell.values[0] for cell in cells]
         changed = [(setting, value) for value in values]
-        stable, failed = self._end(changed, (), cells, "stable", precision, advance)
-        accurate, wrong = self._end(changed, (), cells, "accurate", precision, advance)
-        beyond = "" if failed is None else self._cell([(setting, failed)], precision, advance).outcome
+        stable, failed = self._end(changed, (), cells, "stable", precision)
+        accurate, wrong = self._end(changed, (), cells, "accurate", precision)
+        beyond = "" if failed is None else self._cell([(setting, failed)], precision).outcome
         return Limit(
             setting=setting.name,
             unit=setting.unit,
@@ -348,13 +346,7 @@ class ExtremesStudy(Study):
         )
 
     def _end(
-        self,
-        changed: Sequence[tuple[Setting, float]],
-        fixed: Sequence[tuple[Setting, float]],
-        cells: Sequence[Cell],
-        what: str,
-        precision: str,
-        advance: Advance,
+        self, changed: Changes, fixed: Changes, cells: Sequence[Cell], what: str, precision: str
     ) -> tuple[float | None, float | None]:
         """Return the last value of a setting at which it is `what` (stable, accurate), and the first at which not.
 
@@ -366,19 +358,19 @@ class ExtremesStudy(Study):
             return last, first
 
         def holds(value: float) -> bool:
-            return bool(getattr(self._cell([(setting, value), *fixed], precision, advance), what))
+            return bool(getattr(self._cell([(setting, value), *fixed], precision), what))
 
         return bisect(last, first, holds, self.settings.axis(setting), self.width)
 
-    def _map(self, pair: Pair, precision: str, advance: Advance) -> StabilityMap:
+    def _map(self, pair: Pair, precision: str) -> StabilityMap:
         """Try a grid of two settings around their base and their limits; then bisect where each row ends."""
         x, y = (self.settings.all[name] for name in pair)
-        xs, ys = (self._map_values(setting, precision, advance) for setting in (x, y))
-        rows = [[self._cell([(x, a), (y, b)], precision, advance) for a in xs] for b in ys]
+        xs, ys = (self._map_values(setting, precision) for setting in (x, y))
+        rows = [[self._cell([(x, a), (y, b)], precision) for a in xs] for b in ys]
         found: dict[str, list[tuple[float, float, float]]] = {"stable": [], "accurate": []}
         for what, line in found.items():
             for b, row in zip(ys, rows, strict=True):
-                last, first = self._end([(x, a) for a in xs], [(y, b)], row, what, precision, advance)
+                last, first = self._end([(x, a) for a in xs], [(y, b)], row, what, precision)
                 if last is not None and first is not None and (what == "stable" or _is_fidelity(x.name)):
                     line.append((b, last, first))
         return StabilityMap(
@@ -394,12 +386,12 @@ class ExtremesStudy(Study):
             accurate_boundary=tuple(found["accurate"]),
         )
 
-    def _map_values(self, setting: Setting, precision: str, advance: Advance) -> list[float]:
+    def _map_values(self, setting: Setting, precision: str) -> list[float]:
         """Return the values of a setting that a map has: from below its base to beyond its limit."""
         axis = self.settings.axis(setting)
         if setting.linear:
             return axis.spread(setting.least, setting.most, self.grid)
-        limit = self._limit(setting, "largest", precision, advance)
+        limit = self._limit(setting, "largest", precision)
         tried = [cell.values[0] for cell in limit.scanned]
         reach = OPTION_REACH if "smallest" in setting.ends and setting.name != RESOLUTION else MAP_REACH
         ends = [end for end in (limit.failed, limit.wrong and reach * limit.wrong) if end] or [tried[-1]]
@@ -410,10 +402,12 @@ class ExtremesStudy(Study):
         dearest = max(tried) if limit.skipped else math.inf
         return axis.spread(max(low, setting.least), min(high, setting.most, dearest), self.grid)
 
-    def _cell(self, changed: Sequence[tuple[Setting, float]], precision: str, advance: Advance) -> Cell:
+    def _cell(self, changed: Changes, precision: str) -> Cell:
         """Say how values of settings ended, against the reference of the same scene."""
         values = {setting.name: value for setting, value in changed if value != setting.base}
-        advance(len(self.answers), ", ".join([precision, *(f"{name} {value:.4g}" for name, value in values.items())]))
+        self._advance(
+            len(self.answers), ", ".join([precision, *(f"{name} {value:.4g}" for name, value in values.items())])
+        )
         answer = self._answer(values, precision)
         same = {name: value for name, value in values.items() if not _is_fidelity(name)}
         reference = None if answer.refused else self._answer(same, "", self.reference)

@@ -15,18 +15,16 @@ from ..landscapes.sampling.memory import sparing_collections
 from ..landscapes.statistics import fit_line
 from . import samples
 from .samples import Comparison, Sample, compare, pareto_front, spread
-from .variants import Expected, StudyRecord, Variant, VariantStudy, refuse_single, samples_of
+from .variants import Expected, StudyRecord, Variant, VariantStudy, refuse_settings, refuse_single, samples_of
 
 if TYPE_CHECKING:
-    import pandas as pd
-
     from ..envs.base import Environment
     from ..jobs.watch import Watch
     from .samples import Follow
     from .variants import StudyOptions
 
 SETTINGS = ("dt", "resolution", "particles", "precision", "stiffness", "engine", "device")
-DT_FACTORS, CELL_FACTORS, PARTICLE_FACTORS = (0.5, 2.0, 4.0), (2 / 3, 1.5), (0.5, 2.0)
+FACTORS = {"dt": (0.5, 2.0, 4.0), "resolution": (2 / 3, 1.5), "particles": (0.5, 2.0)}
 STIFFNESS_FACTORS = (0.25, 0.5, 2.0, 4.0)
 MIN_ERRORS = 3  # that an order of convergence is fitted to
 IN_TURN = "timed-in-turn"  # the part of the checkpoint that holds these times
@@ -118,24 +116,19 @@ class FidelityRecord(StudyRecord):
         others = [row for row in self.by_time if row.name != self.reference and not row.given_up]
         return next((row for row in others if (off := row.p95(relative=True)) is not None and off <= tolerance), None)
 
-    def table(self) -> pd.DataFrame:
-        """Return a row for each variant, the quickest first, indexed by `name`.
+    def rows(self) -> Iterator[dict[str, Any]]:
+        """Yield a row for each variant, the quickest first.
 
         Columns: `changed`; `median` and `p95`, loss errors as shares of the spread, with the ends of the latter's 95 %
         interval; `spearman`, `cosine`, `relative_error`, `diverged`; `forward` and `with_gradient` [s per episode];
         `memory` [bytes per episode]; `front`, whether it is on the Pareto front.
         """
-        import pandas as pd
-
         front = set(self.front)
-        rows = [
-            {
+        for row in self.by_time:
+            yield {
                 **{"name": row.name, "changed": row.changed, **row.comparison.columns()},
                 **{**asdict(row.comparison.seconds), "memory": row.memory, "front": row.name in front},
             }
-            for row in self.by_time
-        ]
-        return pd.DataFrame(rows).set_index("name")
 
     def sentences(self) -> list[str]:
         """Return the orders of convergence in dt, and what was given up."""
@@ -253,8 +246,7 @@ def list_variants(env: Environment, settings: Sequence[str]) -> list[Variant]:
     options, and all settings are changed of the others, but precision and device of the reference too. Raises
     ValueError for a setting that there is not.
     """
-    if unknown := set(settings) - set(SETTINGS):
-        raise ValueError(f"--settings takes {', '.join(SETTINGS)}; got {', '.join(sorted(unknown))}")
+    refuse_settings(settings, SETTINGS)
     named = Variant.all_named(env)
     found = [Variant.of(env), *named]
     for setting in SETTINGS:
@@ -268,15 +260,8 @@ def list_variants(env: Environment, settings: Sequence[str]) -> list[Variant]:
 
 def _changes(base: Variant, setting: str, env: Environment) -> Iterator[Variant]:
     """Yield the variants that differ from a named fidelity in one setting."""
-    if setting == "dt" and base.fidelity.dt:
-        yield from (base.with_dt(env.nearest_dt(base.fidelity.dt * factor)) for factor in DT_FACTORS)
-    elif setting == "resolution" and base.fidelity.resolution:
-        yield from map(base.with_cells, CELL_FACTORS)
-    elif setting == "particles" and env.work().unit == "particle-substep":
-        yield from map(base.with_particles, PARTICLE_FACTORS)
-    elif setting == "precision":
-        yield base.with_other_precision()
-    elif setting == "stiffness" and (option := env.contact_stiffness):
+    yield from base.vary(setting, FACTORS.get(setting, ()), env)
+    if setting == "stiffness" and (option := env.contact_stiffness):
         for factor in STIFFNESS_FACTORS:
             options = base.options | {option: base.options[option] * factor}
             yield base.change(f"{base.name}-{option}-x{factor:g}", setting, options=options)

@@ -12,6 +12,7 @@ import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -21,19 +22,10 @@ from ..landscapes.sampling.memory import free_memory
 from . import samples
 from .claims import CLAIMS, Choice, Claim, Shortfall, choose, fronts, nearness, surely_beaten
 from .fidelity import FidelityRecord, FidelityStudy, MeasuredVariant
-from .samples import Sample
-from .variants import (
-    Refused,
-    Study,
-    StudyRecord,
-    Variant,
-    expected_work,
-    read_positive,
-    seconds_with_gradient,
-)
+from .samples import Sample, interval_columns
+from .variants import Refused, Study, StudyRecord, Variant, expected_work, read_positive, seconds_with_gradient
 
 if TYPE_CHECKING:
-    import pandas as pd
     from torch import Tensor
 
     from ..envs.base import Environment
@@ -64,6 +56,7 @@ class MixedRecord(StudyRecord):
     """
 
     kind: ClassVar[str] = MIXED
+    index: ClassVar[tuple[str, ...]] = ("claim", "which")
 
     measured: FidelityRecord
     choices: tuple[Choice, ...]
@@ -85,17 +78,15 @@ class MixedRecord(StudyRecord):
         """Return a measured variant by its name."""
         return self.measured.variant(name)
 
-    def table(self) -> pd.DataFrame:
-        """Return two rows for each claim: the variant that bears its name `today`, and the one `chosen`.
+    def rows(self) -> Iterator[dict[str, Any]]:
+        """Yield two rows for each claim: the variant that bears its name `today`, and the one `chosen`.
 
         Columns: `variant`; `rank`, `cosine` and `error`, the 95th percentile of loss errors as a share of the spread,
         each with the ends of its 95 % interval; `seconds` per episode with gradient, on `device`; `shortfall`, the
         largest lack as a ratio to what the claim allows, and `kept`, whether that is at most 1.
         """
-        import pandas as pd
-
-        rows = [row for one in self.choices for row in self._rows(one)]
-        return pd.DataFrame(rows).set_index(["claim", "which"])
+        for one in self.choices:
+            yield from self._rows(one)
 
     def _rows(self, one: Choice) -> Iterator[dict[str, Any]]:
         today = ("today", one.claim.name, one.today_seconds, one.today_shortfall)
@@ -104,10 +95,9 @@ class MixedRecord(StudyRecord):
                 continue
             found = self.variant(name).comparison
             parts = {"rank": found.spearman, "cosine": found.gradient.cosine, "error": found.loss_error.p95_relative}
-            ends = {"": "value", "_low": "low", "_high": "high"}
+            ends = [interval_columns(part, value).items() for part, value in parts.items()]
             yield {
-                **{"claim": one.claim.name, "which": which, "variant": name},
-                **{part + end: getattr(value, of) for part, value in parts.items() for end, of in ends.items()},
+                **{"claim": one.claim.name, "which": which, "variant": name, **dict(chain.from_iterable(ends))},
                 **{"seconds": seconds, "device": self.cost_device[one.claim.name]},
                 **{"shortfall": shortfall, "kept": shortfall is not None and shortfall <= 1},
             }
@@ -357,11 +347,7 @@ class MixedStudy(FidelityStudy):
     def _time_again(self, say: Callable[[str], None]) -> None:
         """Time those in turn that may be chosen, and the named ones, so that no busy moment decides between them."""
         names = sorted({name for claim in CLAIMS for name in self._contenders(claim, self._costs())})
-        kept = self._load_seconds(TIMED_AGAIN)
-        if set(kept) != set(names):
-            kept = self._rounds(names, say)
-            self._save_seconds(TIMED_AGAIN, kept)
-        for name, seconds in kept.items():
+        for name, seconds in self._keep_seconds(TIMED_AGAIN, names, lambda: self._rounds(names, say)).items():
             sample = self.samples[name]
             self._accept(self._named(name), replace(sample, with_gradient=min(seconds, sample.with_gradient)))
 
@@ -393,12 +379,16 @@ class MixedStudy(FidelityStudy):
         env.evaluate(batch, grad=True)
         return (time.perf_counter() - began) / rows
 
-    def _load_seconds(self, part: str) -> dict[str, float]:
-        arrays = self.checkpoint.load(part) or {"names": np.array([]), "seconds": np.array([])}
-        return dict(zip(map(str, arrays["names"]), map(float, arrays["seconds"]), strict=True))
-
-    def _save_seconds(self, part: str, seconds: Mapping[str, float]) -> None:
-        self.checkpoint.save(part, names=np.array(list(seconds)), seconds=np.array(list(seconds.values())))
+    def _keep_seconds(
+        self, part: str, names: Sequence[str], time_them: Callable[[], dict[str, float]]
+    ) -> dict[str, float]:
+        """Return the seconds of variants by name that a part keeps; they are timed where it is of others."""
+        arrays = self.checkpoint.load(part)
+        if arrays is not None and set(map(str, arrays["names"])) == set(names):
+            return dict(zip(map(str, arrays["names"]), map(float, arrays["seconds"]), strict=True))
+        found = time_them()
+        self.checkpoint.save(part, names=np.array(list(found)), seconds=np.array(list(found.values())))
+        return found
 
     def _final_costs(self, say: Callable[[str], None]) -> Costs:
         """Return the costs that decide: a draft's, measured on a GPU, are timed on the CPU of those that may be it.
@@ -409,10 +399,7 @@ class MixedStudy(FidelityStudy):
         if self.env.device == "cpu" or "cpu" not in self.env.devices:
             return costs
         names = [name for name in dict.fromkeys(self._contenders(CLAIMS[0], costs)) if name != "standard"]
-        timed = self._load_seconds(TIMED_ON_CPU)
-        if set(timed) != set(names):
-            timed = {name: self._cpu_seconds(name, say) for name in names}
-            self._save_seconds(TIMED_ON_CPU, timed)
+        timed = self._keep_seconds(TIMED_ON_CPU, names, lambda: {name: self._cpu_seconds(name, say) for name in names})
         rate = timed["draft"] / costs["draft"]["draft"]
         return costs | {"draft": {name: rate * cost for name, cost in costs["draft"].items()} | timed}
 

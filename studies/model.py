@@ -5,8 +5,7 @@ Every part is changed, left out or put in, at the same points as the full model 
 
 from __future__ import annotations
 
-import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import cached_property, reduce
@@ -15,16 +14,13 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 import torch
 
-from ..envs.records import Fidelity, ModelPart
+from ..envs.records import ModelPart
 from ..landscapes.objective import failed, has_loss
-from ..landscapes.plain import digest
 from . import samples
-from .samples import Bootstrap, Comparison, Sample, Seconds, Turns, compare, evaluate_points, spread
-from .variants import Expected, StudyRecord, Variant, VariantStudy, samples_of
+from .samples import Bootstrap, Comparison, Sample, Seconds, Turns, compare, evaluate_points, interval_columns, spread
+from .variants import Expected, StudyRecord, Variant, VariantStudy, part_name, samples_of
 
 if TYPE_CHECKING:
-    import pandas as pd
-
     from ..envs.base import Environment
     from ..jobs.watch import Watch
     from .samples import Follow
@@ -113,6 +109,7 @@ class ModelRecord(StudyRecord):
     """
 
     kind: ClassVar[str] = "model"
+    read_elsewhere: ClassVar[bool] = False
 
     fidelity: str
     spread: float | None
@@ -120,9 +117,6 @@ class ModelRecord(StudyRecord):
     seconds: Seconds
     noise: Noise
     parts: tuple[MeasuredPart, ...]
-
-    def to_keep(self) -> None:
-        """Return nothing: no other verb reads it."""
 
     @property
     def present(self) -> tuple[MeasuredPart, ...]:
@@ -134,26 +128,21 @@ class ModelRecord(StudyRecord):
         """The parts that it leaves out."""
         return tuple(part for part in self.parts if part.missing)
 
-    def table(self) -> pd.DataFrame:
-        """Return a row for each part, those that the model has first, indexed by `name`.
+    def rows(self) -> Iterator[dict[str, Any]]:
+        """Yield a row for each part, those that the model has first.
 
         Columns: `change`, `missing`; `median` and `p95`, of how far losses move as shares of the spread, with the ends
         of the latter's 95 % interval; `moved`, the share of points beyond the noise; `spearman`, `cosine`,
         `relative_error`, `diverged`; `cost`, the time of an episode with gradient as a ratio to the full model's, with
         the ends of its interval; `effect` and `price`, the verdict.
         """
-        import pandas as pd
-
-        columns = [
-            {
+        for part in (*self.present, *self.missing):
+            yield {
                 **{"name": part.name, "change": part.change, "missing": part.missing, "moved": part.moved},
                 **part.comparison.columns(),
-                **{"cost": part.cost.value, "cost_low": part.cost.low, "cost_high": part.cost.high},
+                **interval_columns("cost", part.cost),
                 **{"effect": part.effect.value, "price": part.price.value},
             }
-            for part in (*self.present, *self.missing)
-        ]
-        return pd.DataFrame(columns, columns=list(columns[0]) if columns else ["name"]).set_index("name")
 
     def sentences(self) -> list[str]:
         """Return the verdict on each part."""
@@ -165,6 +154,7 @@ class ModelStudy(VariantStudy):
 
     kind = "model"
     what = "models"
+    about_last = False
     advice = "compiling kernels comes on top; --points and a cheaper --fidelity lower it"
 
     def __init__(self, env: Environment, options: StudyOptions) -> None:
@@ -173,13 +163,6 @@ class ModelStudy(VariantStudy):
         super().__init__(env, options)
         self._parts = {part.name: part for part in env.model_parts}
         self._rounding = float(torch.finfo(getattr(torch, env.fidelity.precision)).eps)
-
-    @classmethod
-    def choose_fidelity(
-        cls, scene: Environment | type[Environment], given: Fidelity | str | None
-    ) -> Fidelity | str | None:
-        """Return the fidelity of the full model: the one that is given."""
-        return given
 
     @cached_property
     def variants(self) -> list[Variant]:
@@ -195,8 +178,7 @@ class ModelStudy(VariantStudy):
         """Return the name of a variant's part of the checkpoint: another change of the same part is another one."""
         if variant.changed != PART:
             return variant.name
-        slug = re.sub(r"[^a-z0-9]+", "-", variant.name.lower()).strip("-")
-        return f"part-{slug}-{digest(dict(self._parts[variant.name].options))}"
+        return part_name("part", variant.name, dict(self._parts[variant.name].options))
 
     def _make(self, variant: Variant) -> Environment:
         """Make the model; raises ValueError where a changed part is the full model, or the scene refuses it."""

@@ -150,13 +150,12 @@ def find_floor(differences: Sequence[float | None], verdict: Verdict) -> float |
     return min(known) if stalled or verdict == "does not converge" else None
 
 
-def choose_order(order: Order, designed: float | None) -> float | None:
+def choose_order(verdict: Verdict, found: Bootstrap, designed: float | None) -> float | None:
     """Return the order to extrapolate by: the designed one where the interval holds it, else the observed one.
 
     None where nothing converges.
     """
-    found = order.pooled
-    if order.verdict != "converges" or found.value is None or found.low is None:
+    if verdict != "converges" or found.value is None or found.low is None:
         return None
     high = math.inf if found.high is None else found.high
     return designed if designed is not None and found.low <= designed <= high else found.value

@@ -113,11 +113,7 @@ def evaluate_parts(objective: Objective, x: Float[Tensor, "point dim"], follow: 
 
 
 def evaluate_points(
-    objective: Objective,
-    x: Float[Tensor, "point dim"],
-    follow: Follow = ignore,
-    *,
-    by: Evaluate = evaluate_parts,
+    objective: Objective, x: Float[Tensor, "point dim"], follow: Follow = ignore, *, by: Evaluate = evaluate_parts
 ) -> Sample:
     """Evaluate losses and gradients in the batches that an objective prefers; seconds are those of the best batch."""
     found, each = by(objective, x, follow)
@@ -314,6 +310,16 @@ class Bootstrap:
         return f"{value} ({low} to {high})"
 
 
+def interval_columns(name: str, found: Bootstrap | Estimate) -> dict[str, float | None]:
+    """Return the columns of a table for a number and the ends of its interval."""
+    return {name: found.value, f"{name}_low": found.low, f"{name}_high": found.high}
+
+
+def percent(value: float | None) -> str:
+    """Return a share in per cent; None is what is not finite."""
+    return "more than a number can say" if value is None else f"{100 * value:.2g} %"
+
+
 @dataclass(frozen=True)
 class LossError:
     """Hold median and 95th percentile of |loss - reference|, in the loss's unit and as shares of the losses' spread."""
@@ -366,10 +372,9 @@ class Comparison:
 
     def columns(self) -> dict[str, float | None]:
         """Return what tables have of it: errors are shares of the spread, with the ends of 95 % intervals."""
-        p95 = self.loss_error.p95_relative
         return {
             "median": self.loss_error.median_relative.value,
-            **{"p95": p95.value, "p95_low": p95.low, "p95_high": p95.high},
+            **interval_columns("p95", self.loss_error.p95_relative),
             **{"spearman": self.spearman.value, "cosine": self.gradient.cosine.value},
             **{"relative_error": self.gradient.relative_error.value, "diverged": self.diverged},
         }

@@ -81,11 +81,8 @@ def _ask_alone(objective: Objective, row: Float[Tensor, "one dim"]) -> Evaluatio
 
 
 def _failed(x: Tensor) -> Evaluation:
-    return Evaluation.from_results(x.new_full((len(x),), torch.nan), torch.full_like(x, torch.nan), _errors(len(x)))
-
-
-def _errors(count: int) -> Tensor:
-    return torch.full((count,), Status.ERROR, dtype=torch.int8)
+    status = torch.full((len(x),), Status.ERROR, dtype=torch.int8)
+    return Evaluation.from_results(x.new_full((len(x),), torch.nan), torch.full_like(x, torch.nan), status)
 
 
 def _line(error: Exception) -> str:

@@ -6,8 +6,7 @@ The same points are evaluated under every replica of a scene, which computes the
 from __future__ import annotations
 
 import math
-import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -15,21 +14,16 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 import torch
 
-from ..envs.records import Fidelity
 from ..envs.registry import as_environment
 from ..landscapes.measures.floor import Floor, floor_between, format_cosine, refuse_other_space, replica_cosines
 from ..landscapes.objective import Evaluation
-from ..landscapes.plain import digest
 from ..landscapes.statistics import Estimate, spearman
-from .samples import Bootstrap, Sample, evaluate_points
-from .variants import Expected, StudyRecord, Variant, VariantStudy, samples_of
+from .samples import Bootstrap, Sample, interval_columns, percent
+from .variants import Expected, StudyRecord, Variant, VariantStudy, part_name, samples_of
 
 if TYPE_CHECKING:
-    import pandas as pd
-
     from ..envs.base import Environment
     from ..jobs.watch import Watch
-    from .samples import Follow
     from .variants import StudyOptions
 
 OWN, REPLICA = "the scene itself", "replica"
@@ -61,36 +55,23 @@ class SymmetryRecord(StudyRecord):
     """Hold the replicas of a scene at the same points, each against the scene itself, and the floor of all together."""
 
     kind: ClassVar[str] = "symmetry"
+    read_elsewhere: ClassVar[bool] = False
 
     fidelity: str
     floor: Floor
     replicas: tuple[MeasuredReplica, ...]
 
-    def to_keep(self) -> None:
-        """Return nothing: no other verb reads it."""
-
-    def table(self) -> pd.DataFrame:
-        """Return a row for each replica, indexed by `name`.
+    def rows(self) -> Iterator[dict[str, Any]]:
+        """Yield a row for each replica.
 
         Columns: `apart`, the standard deviation between its losses and the scene's as a share of their range, with the
         ends of the 95 % interval; `spearman`; `cosine` and `cosine_low`, median and lower quartile; `failed`, points.
         """
-        import pandas as pd
-
-        columns = [
-            {
-                **{
-                    "name": one.name,
-                    "apart": one.apart.value,
-                    "apart_low": one.apart.low,
-                    "apart_high": one.apart.high,
-                },
-                **{"spearman": one.spearman.value, "cosine": one.cosine.value, "cosine_low": one.cosine_low},
-                "failed": one.failed,
+        for one in self.replicas:
+            yield {
+                **{"name": one.name, **interval_columns("apart", one.apart), "spearman": one.spearman.value},
+                **{"cosine": one.cosine.value, "cosine_low": one.cosine_low, "failed": one.failed},
             }
-            for one in self.replicas
-        ]
-        return pd.DataFrame(columns, columns=list(columns[0]) if columns else ["name"]).set_index("name")
 
     def sentences(self) -> list[str]:
         """Return the numerical floor with its intervals, and which replica is farthest away."""
@@ -122,6 +103,7 @@ class SymmetryStudy(VariantStudy):
 
     kind = "symmetry"
     what = "replicas"
+    about_last = False
     default_points = 32
     advice = "compiling kernels comes on top; --points and a cheaper --fidelity lower it"
 
@@ -132,13 +114,6 @@ class SymmetryStudy(VariantStudy):
         for name, one in self._replicas.items():
             refuse_other_space(env, name, one)
         super().__init__(env, options)
-
-    @classmethod
-    def choose_fidelity(
-        cls, scene: Environment | type[Environment], given: Fidelity | str | None
-    ) -> Fidelity | str | None:
-        """Return the fidelity of which there are replicas: the one that is given."""
-        return given
 
     def identity(self) -> dict[str, Any]:
         """Return what decides the numbers, as plain JSON; a study of other replicas is not continued."""
@@ -152,17 +127,7 @@ class SymmetryStudy(VariantStudy):
 
     def part(self, variant: Variant) -> str:
         """Return the name of a variant's part of the checkpoint."""
-        if variant.changed != REPLICA:
-            return "own"
-        slug = re.sub(r"[^a-z0-9]+", "-", variant.name.lower()).strip("-")
-        return f"replica-{slug}-{digest(variant.name)}"
-
-    def measure(self, variant: Variant, follow: Follow) -> Mapping[str, Any]:
-        """Return the arrays that are measured of a variant, and give back its memory."""
-        env = self._make(variant)
-        found = evaluate_points(env, self.x, follow, by=self.evaluates(variant)).arrays()
-        env.release()
-        return found
+        return "own" if variant.changed != REPLICA else part_name("replica", variant.name, variant.name)
 
     def _make(self, variant: Variant) -> Environment:
         return self._replicas[variant.name] if variant.changed == REPLICA else self.env
@@ -185,11 +150,6 @@ class SymmetryStudy(VariantStudy):
             floor=floor_between(own, found, seed=self.seed),
             replicas=tuple(_measure(name, own, one, self.seed) for name, one in found.items()),
         )
-
-
-def percent(share: float) -> str:
-    """Return a share in per cent."""
-    return f"{100 * share:.2g} %"
 
 
 def _evaluation(sample: Sample) -> Evaluation:

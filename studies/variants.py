@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import abc
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -15,6 +16,7 @@ from ..landscapes.capacity import Need, require
 from ..landscapes.cost import episode_cost
 from ..landscapes.identity import MODEL_VERSION
 from ..landscapes.options import record_options
+from ..landscapes.plain import digest
 from ..landscapes.sampling.memory import free_memory
 from ..landscapes.storage.checkpoint import Checkpoint
 from ..landscapes.verification import POINTS
@@ -111,6 +113,17 @@ class Variant:
         other = "float64" if self.fidelity.precision == "float32" else "float32"
         return self.refine("precision", other, precision=other)
 
+    def vary(self, setting: str, factors: Sequence[float], env: Environment) -> Iterator[Variant]:
+        """Yield this variant at so many times a setting of the fidelity, or in the other precision; none it lacks."""
+        if setting == "dt" and self.fidelity.dt:
+            yield from (self.with_dt(env.nearest_dt(self.fidelity.dt * factor)) for factor in factors)
+        elif setting == "resolution" and self.fidelity.resolution:
+            yield from map(self.with_cells, factors)
+        elif setting == "particles" and env.work().unit == "particle-substep":
+            yield from map(self.with_particles, factors)
+        elif setting == "precision":
+            yield self.with_other_precision()
+
     def key(self) -> tuple[Any, ...]:
         """Return what decides the variant's numbers."""
         same = replace(self.fidelity, name="")
@@ -145,6 +158,18 @@ def refuse_single(env: Environment) -> None:
         )
 
 
+def refuse_settings(settings: Sequence[str], known: Sequence[str], where: str = "") -> None:
+    """Raise ValueError for a setting that a kind of study does not change."""
+    if unknown := set(settings) - set(known):
+        raise ValueError(f"--settings takes {', '.join(known)}{where}; got {', '.join(sorted(unknown))}")
+
+
+def part_name(prefix: str, name: str, key: Any) -> str:
+    """Return a name of a part of a checkpoint: of another key, which is plain JSON, it is another one."""
+    slug = re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")
+    return f"{prefix}-{slug}-{digest(key)}"
+
+
 def one_line(error: BaseException) -> str:
     """Return what an error says, on one line."""
     return " ".join(str(error).split())
@@ -168,6 +193,8 @@ class StudyRecord(abc.ABC):
     kind: ClassVar[str]
     derived: ClassVar[tuple[str, ...]] = ("kind",)
     kept_by: ClassVar[tuple[str, ...]] = ("options",)  # of the identity: of others the user's own study is another one
+    read_elsewhere: ClassVar[bool] = True  # by other verbs, so that it is worth keeping
+    index: ClassVar[tuple[str, ...]] = ("name",)  # columns of the table that tell its rows apart
 
     env: str
     points: int
@@ -184,8 +211,15 @@ class StudyRecord(abc.ABC):
         return str(self.identity["device"])
 
     @abc.abstractmethod
+    def rows(self) -> Iterable[Mapping[str, Any]]:
+        """Return what was measured, a row each, in the columns of the table."""
+
     def table(self) -> pd.DataFrame:
-        """Return what was measured as a table."""
+        """Return what was measured as a table; `rows` says which columns it has."""
+        import pandas as pd
+
+        rows, index = list(self.rows()), list(self.index)
+        return pd.DataFrame(rows, columns=None if rows else index).set_index(index)
 
     @abc.abstractmethod
     def sentences(self) -> list[str]:
@@ -193,7 +227,7 @@ class StudyRecord(abc.ABC):
 
     def to_keep(self) -> StudyRecord | None:
         """Return what of it is worth keeping where other verbs find it; nothing says when a function has changed."""
-        return self if self.identity.get(MODEL_VERSION) else None
+        return self if self.read_elsewhere and self.identity.get(MODEL_VERSION) else None
 
     def plot(self, width: float | None = None) -> Picture:
         """Draw it, for a screen, or for a page so wide [mm]."""
@@ -256,6 +290,7 @@ class Study(abc.ABC):
     what: ClassVar[str] = "variants"
     default_points: ClassVar[int] = 64
     copies: ClassVar[int] = 50  # of the points: a loss and a gradient there by every variant
+    about_last: ClassVar[bool] = True  # of a scene's fidelities, or else about the one that is given
     advice: ClassVar[str] = "compiling kernels comes on top; --points and --settings lower it"
     checkpoint: Checkpoint
 
@@ -271,7 +306,9 @@ class Study(abc.ABC):
     def choose_fidelity(
         cls, scene: Environment | type[Environment], given: Fidelity | str | None
     ) -> Fidelity | str | None:
-        """Return the fidelity of the reference: the scene's last. Raises ValueError where another is `given`."""
+        """Return the fidelity of the reference. Raises ValueError where it is the scene's last, and one is `given`."""
+        if not cls.about_last:
+            return given
         if given is not None:
             raise ValueError(f"study {cls.kind} is about the last fidelity of a scene; got {given}, leave it out")
         return list(scene.fidelities)[-1]
@@ -350,8 +387,11 @@ class VariantStudy(Study):
         return variant.name
 
     def measure(self, variant: Variant, follow: Follow) -> Mapping[str, Any]:
-        """Return the arrays that are measured of a variant."""
-        return evaluate_points(self._make(variant), self.x, follow, by=self.evaluates(variant)).arrays()
+        """Return the arrays that are measured of a variant, and give back its memory."""
+        env = self._make(variant)
+        found = evaluate_points(env, self.x, follow, by=self.evaluates(variant)).arrays()
+        env.release()
+        return found
 
     def evaluates(self, variant: Variant) -> Evaluate:
         """Return what evaluates a variant: the reference is kept for every study of the same points."""

@@ -139,23 +139,24 @@ def kept_league() -> League:
     return found
 
 
+def races(head: Sequence[str], cells: Callable[[SceneStandings], Sequence[str]], *more: Sequence[str]) -> str:
+    """Return a table with a row for each race of the league, and more rows below them."""
+    rows = [[f"`{one.env}`", one.fidelity, *cells(one)] for one in kept_league().scenes]
+    return table(("environment", "fidelity", *head), [*rows, *more])
+
+
 def short_league() -> str:
     """README's: who has the best mean rank, and how many of the others it is ahead of."""
     scenes = kept_league().scenes
-    rows = [
-        [
-            f"`{scene.env}`",
-            scene.fidelity,
-            *_lead(scene.lead, scene.ranks),
-            *_lead(scene.equal_cost.lead, scene.equal_cost.ranks),
-            f"{len(scene.not_told_from_random)} of {len(scene.methods) - 1}",
-        ]
-        for scene in scenes
-    ]
     (budget,), (forwards,) = {one.budget for one in scenes}, {f"{one.equal_cost.forwards:.0f}" for one in scenes}
     ahead = "is ahead of"
     costs = (f"best mean rank, {budget} episodes", ahead, f"best mean rank, {forwards} forward equivalents", ahead)
-    return table(("environment", "fidelity", *costs, "not told from random search"), rows) + _changed(scenes)
+
+    def cells(one: SceneStandings) -> list[str]:
+        rest = f"{len(one.not_told_from_random)} of {len(one.methods) - 1}"
+        return [*_lead(one.lead, one.ranks), *_lead(one.equal_cost.lead, one.equal_cost.ranks), rest]
+
+    return races((*costs, "not told from random search"), cells) + _changed(scenes)
 
 
 def _changed(scenes: Sequence[SceneStandings]) -> str:
@@ -176,12 +177,10 @@ def _lead(lead: Lead, ranks: Sequence[MeanRank]) -> list[str]:
 def league() -> str:
     """Mean ranks of all methods in all scenes, at equal episodes and at equal forward equivalents."""
     found = kept_league()
-    rows = [
-        [f"`{scene.env}`", scene.fidelity, *(_ranks(scene, name) for name in found.methods)] for scene in found.scenes
-    ]
     cost = {one.method: one.rank for one in found.overall_at_equal_cost}
-    rows.append(["all scenes", "", *(f"{one.rank:.2f} / {cost[one.method]:.2f}" for one in found.overall)])
-    return table(("environment", "fidelity", *found.methods), rows) + _changed(found.scenes)
+    whole = ["all scenes", "", *(f"{one.rank:.2f} / {cost[one.method]:.2f}" for one in found.overall)]
+    ranks = races(found.methods, lambda one: [_ranks(one, name) for name in found.methods], whole)
+    return ranks + _changed(found.scenes)
 
 
 def _ranks(scene: SceneStandings, method: str) -> str:
@@ -194,18 +193,11 @@ def _ranks(scene: SceneStandings, method: str) -> str:
 
 def rivals() -> str:
     """Which methods the one of the best mean rank is not ahead of, and which cannot be told from random search."""
-    rows = [
-        [
-            f"`{scene.env}`",
-            scene.fidelity,
-            _rivals(scene.lead),
-            _rivals(scene.equal_cost.lead),
-            ", ".join(scene.not_told_from_random) or "none",
-        ]
-        for scene in kept_league().scenes
-    ]
     costs = ("best mean rank at equal episodes", "best mean rank at equal forward equivalents")
-    return table(("environment", "fidelity", *costs, "not told from random search"), rows)
+    return races(
+        (*costs, "not told from random search"),
+        lambda one: [_rivals(one.lead), _rivals(one.equal_cost.lead), ", ".join(one.not_told_from_random) or "none"],
+    )
 
 
 def _rivals(lead: Lead) -> str:

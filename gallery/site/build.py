@@ -34,22 +34,8 @@ from ...landscapes.storage.files import check_ours, placing, resolve
 from ...landscapes.storage.paths import is_slice
 from ...landscapes.storage.records import reading
 from ...landscapes.storage.store import SliceStore, open_slice
+from .. import files
 from ..figures import Figure
-from ..files import (
-    COMPANION_PICTURE,
-    COMPANION_TABLE,
-    MEASURES,
-    PICTURE,
-    QUALITY,
-    QUALITY_TABLE,
-    REMAKE,
-    REPORT,
-    STORE,
-    SURFACES,
-    SWEEP_FILM,
-    THUMBNAIL,
-    dark_name,
-)
 from ..paper import read_paper
 from ..records import Companion, read_companions
 from .downloads import save_slice, save_table
@@ -98,7 +84,7 @@ def build_site(
     """
     out = resolve(out)
     _check(out)
-    there = [figure for figure in figures if _has_samples(data / figure.id / STORE)]
+    there = [figure for figure in figures if _has_samples(data / figure.id / files.STORE)]
     if not there:
         raise ValueError(f"{data} holds no slice of a figure; `landscape gallery compute` samples them")
     tables = read_runs(data)
@@ -148,7 +134,7 @@ def _templates() -> Environment:
     )  # fmt: skip
     pages.filters["number"] = _number
     pages.filters |= FILTERS
-    pages.filters["dark"] = dark_name
+    pages.filters["dark"] = files.dark_name
     pages.filters["beside"] = _describe_companion
     pages.filters["size"] = size_class
     pages.filters["rank_style"] = rank_style
@@ -186,16 +172,16 @@ class _Site:
     def write_slice(self, figure: Figure) -> FigureEntry:
         """Write a slice's page and all it shows, and return its entry in the manifest."""
         source, folder = self.data / figure.id, self.folder / figure.id
-        dataset = open_slice(source / STORE)
+        dataset = open_slice(source / files.STORE)
         episodes, runs = read_episodes(source, dataset), lay_runs(dataset, self.tables)
         nodes = read_off_nodes(dataset, episodes, runs)
-        (folder / NODES).write_text(f"const SLICE = {json.dumps(to_json(nodes), separators=(',', ':'))};\n")
+        (folder / NODES).write_text(f"const SLICE = {json.dumps(nodes, separators=(',', ':'))};\n")
         companions, report = read_companions(source), read_report(source)
         given = [name for episode in episodes for name in episode.files]
-        given += [COMPANION_PICTURE] if companions else []
-        tables: dict[str, Sequence[Mapping[str, Any]]] = {COMPANION_TABLE: to_json(companions)}
-        if (source / QUALITY).exists() and report is not None:
-            tables[QUALITY_TABLE] = quality_rows(report.profile)
+        given += [files.COMPANION_PICTURE] if companions else []
+        tables: dict[str, Sequence[Mapping[str, Any]]] = {files.COMPANION_TABLE: to_json(companions)}
+        if (source / files.QUALITY).exists() and report is not None:
+            tables[files.QUALITY_TABLE] = quality_rows(report.profile)
         taken = self._place(dataset, source, folder, given, {name: rows for name, rows in tables.items() if rows})
         entry = replace(
             FigureEntry.of(figure, dataset, source),
@@ -212,7 +198,7 @@ class _Site:
             studies=self.studies[figure.env],
             held=list(_held_parameters(dataset)),
             scene=entries().get(figure.env),
-            finer=nodes.finer is not None,
+            finer=nodes["finer"] is not None,
         )
         return entry
 
@@ -230,21 +216,19 @@ class _Site:
         """
         for name, rows in tables.items():
             save_table(rows, folder / name)
-        given = [
-            *(name for name in (*SURFACES, SWEEP_FILM, REPORT, MEASURES, QUALITY) if (source / name).exists()),
-            *given,
-        ]
+        found = (*files.SURFACES, files.SWEEP_FILM, files.REPORT, files.MEASURES, files.QUALITY)
+        given = [*(name for name in found if (source / name).exists()), *given]
         for name in given:
             shutil.copyfile(source / name, folder / name)
         drawn = draws(source, len(dataset["loss"].dims))
-        pictures = [name for name in dict.fromkeys([PICTURE, THUMBNAIL, *given]) if name.endswith(".png")]
+        pictures = [name for name in dict.fromkeys([files.PICTURE, files.THUMBNAIL, *given]) if name.endswith(".png")]
         for name in pictures:
             if name not in drawn:
-                within = partial(reading, source / name, REMAKE.format("slices"))
+                within = partial(reading, source / name, files.REMAKE.format("slices"))
                 self.studio.develop(source / name, folder / name, within)
         copied = [name for name in given if name not in pictures]
-        taken = [*save_slice(dataset, source / STORE, folder), *tables, *copied]
-        return [*taken, *(name for one in pictures for name in (one, dark_name(one)))]
+        taken = [*save_slice(dataset, source / files.STORE, folder), *tables, *copied]
+        return [*taken, *(name for one in pictures for name in (one, files.dark_name(one)))]
 
     def write_index(
         self,
@@ -271,8 +255,8 @@ class _Site:
             engines=sorted({tile.engine for tile in tiles if tile.engine}),
             sizes={name: words for name, words in SIZES.items() if name in sizes},
         )
-        files = [file.relative_to(self.folder).as_posix() for file in self.folder.rglob("*") if file.is_file()]
-        manifest = replace(manifest, files=sorted([*files, MANIFEST]))
+        there = [file.relative_to(self.folder).as_posix() for file in self.folder.rglob("*") if file.is_file()]
+        manifest = replace(manifest, files=sorted([*there, MANIFEST]))
         (self.folder / MANIFEST).write_text(json.dumps(to_json(manifest), indent=1) + "\n")
         return manifest
 

@@ -15,7 +15,7 @@ from ...landscapes.storage.paths import is_finished
 from ...landscapes.storage.records import read_json, reading, write_record
 from ...landscapes.storage.store import open_slice
 from ...optim.claims import ClaimFinding, ClaimVerdict
-from ...optim.league import League, OverallRank, SceneStandings, Standing
+from ...optim.league import League, SceneStandings, Standing
 from ...optim.statistics import MeanRank
 from ..files import LEAGUE, LEAGUE_PICTURE, LEAGUE_RECORD, REMAKE, STORE, LeagueFiles
 from ..league import read_league, save_both
@@ -161,5 +161,5 @@ def _came_off(scene: SceneStandings, one: Standing) -> Mapping[str, Any]:
     return {"method": one.method, **best, **rank, **times, "failed episodes": one.failed}
 
 
-def _ends(name: str, one: MeanRank | OverallRank) -> dict[str, float]:
+def _ends(name: str, one: MeanRank) -> dict[str, float]:
     return {name: one.rank, f"{name}, low": one.low, f"{name}, high": one.high}

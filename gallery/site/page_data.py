@@ -111,59 +111,6 @@ class Trajectory(Search):
 
 
 @dataclass(frozen=True)
-class Axis:
-    """An axis of a map: its label, the coordinates of its nodes, and where it is labelled.
-
-    Coordinates along a `logarithmic` one are decimal logarithms of values.
-    """
-
-    label: str
-    values: Sequence[float]
-    ticks: Sequence[float]
-    logarithmic: bool = False
-
-
-@dataclass(frozen=True)
-class ColourScale:
-    """The scale of a map's colours, or of a line's height."""
-
-    low: float
-    high: float
-    logarithmic: bool
-    extend: str
-    ticks: Sequence[float]
-
-
-@dataclass(frozen=True)
-class Nodes:
-    """A slice as the map draws it, row by row from the lowest v; `page_data.pack` packs its arrays.
-
-    `loss` [unit] is packed float32, NaN where there is none, and `status` packed uint8, by the numbers of `statuses`.
-    `cells` and `looks` are the same as they are drawn, where a refined slice was not sampled everywhere. `slope` is the
-    gradient along the axes, `gradient` its length in all dimensions, packed float32 both. `finer` are packed flags of
-    the cells between four samples whose gradients contradict their losses. `scales` are those that the map can have,
-    by name, `scale` that which it begins with. `azimuth` is where the surface is seen from at first [degrees].
-    """
-
-    axes: Sequence[Axis]
-    unit: str
-    loss: str
-    status: str
-    statuses: Mapping[int, str]
-    scale: str
-    scales: Mapping[str, ColourScale]
-    palette: Sequence[str]
-    episodes: Sequence[EpisodeEntry]
-    runs: Sequence[Trajectory]
-    azimuth: float | None = None
-    slope: Sequence[str] | None = None
-    gradient: str | None = None
-    cells: str | None = None
-    looks: str | None = None
-    finer: str | None = None
-
-
-@dataclass(frozen=True)
 class Word:
     """A word that was measured, or that the `paper` says; `measured` is None where that is not resolved."""
 
@@ -283,40 +230,44 @@ def count_numbers(dataset: xr.Dataset) -> Numbers:
     )
 
 
-def read_off_nodes(dataset: xr.Dataset, episodes: Sequence[EpisodeEntry], runs: Sequence[Trajectory]) -> Nodes:
-    """Read off a slice what the map draws and says of its nodes."""
+def read_off_nodes(dataset: xr.Dataset, episodes: Sequence[EpisodeEntry], runs: Sequence[Trajectory]) -> dict[str, Any]:
+    """Read off a slice what the map draws and says of its nodes, as JSON for its script.
+
+    Nodes go row by row from the lowest v; arrays are packed, see `pack`. `loss` [unit] is float32, NaN where there is
+    none, and `status` uint8, by the numbers of `statuses`. `cells` and `looks` are the same as they are drawn, where a
+    refined slice was not sampled everywhere. `slope` is the gradient along the axes, `gradient` its length in all
+    dimensions, float32 both. `finer` are flags of the cells between four samples whose gradients contradict their
+    losses. `scales` are those that the map can have, by name, `scale` that which it begins with. `azimuth` is where the
+    surface is seen from at first [degrees].
+    """
     from ...landscapes.draw.render.relief import Relief, azimuth
     from ...landscapes.draw.style import LOSS_MAP, Scale
 
     plane, loss = plane_of(dataset), dataset["loss"].to_numpy()
-    own = Scale.of_loss(loss)
-    nodes = Nodes(
-        axes=_axes(plane),
-        unit=str(dataset["loss"].attrs.get("units", "")),
-        loss=pack(loss),
-        status=pack(dataset["status"].to_numpy(), "u1"),
-        statuses={int(code): code.name for code in Status},
-        scale=LOGARITHMIC if own.logarithmic and plane.rank == 2 else LINEAR,
-        scales=_scales(loss, [run.best for run in runs if run.best is not None]),
-        palette=[bytes(round(255 * part) for part in LOSS_MAP(level)[:3]).hex() for level in range(256)],
-        episodes=episodes,
-        runs=runs,
-        azimuth=azimuth(Relief(plane, own), dataset) if plane.rank == 2 else None,
-    )
-    if (dataset["status"] == Status.INTERPOLATED).any() and plane.rank == 2:
-        drawn = own_cells(dataset)
-        nodes = replace(nodes, cells=pack(drawn["loss"].to_numpy()), looks=pack(drawn["status"].to_numpy(), "u1"))
-    if "grad" not in dataset:
-        return nodes
-    grad = dataset["grad"].to_numpy().reshape(loss.size, -1)
-    slope = [pack(column) for column in plane.slope(torch.from_numpy(grad)).numpy().T]
-    finer = contradicted_cells(dataset) if plane.rank == 2 else np.zeros(0)
-    return replace(
-        nodes,
-        slope=slope,
-        gradient=pack(np.linalg.norm(grad, axis=1)),
-        finer=pack(finer, "u1") if finer.any() else None,
-    )
+    own, flat = Scale.of_loss(loss), plane.rank == 2
+    skipped = flat and bool((dataset["status"] == Status.INTERPOLATED).any())
+    drawn = own_cells(dataset) if skipped else None
+    grad = torch.from_numpy(dataset["grad"].to_numpy().reshape(loss.size, -1)) if "grad" in dataset else None
+    finer = contradicted_cells(dataset) if flat and grad is not None else np.zeros(0)
+    found = {
+        "axes": _axes(plane),
+        "unit": str(dataset["loss"].attrs.get("units", "")),
+        "loss": pack(loss),
+        "status": pack(dataset["status"].to_numpy(), "u1"),
+        "statuses": {int(code): code.name for code in Status},
+        "scale": LOGARITHMIC if own.logarithmic and flat else LINEAR,
+        "scales": _scales(loss, [run.best for run in runs if run.best is not None]),
+        "palette": [bytes(round(255 * part) for part in LOSS_MAP(level)[:3]).hex() for level in range(256)],
+        "episodes": episodes,
+        "runs": runs,
+        "azimuth": azimuth(Relief(plane, own), dataset) if flat else None,
+        "slope": None if grad is None else [pack(column) for column in plane.slope(grad).numpy().T],
+        "gradient": None if grad is None else pack(np.linalg.norm(grad.numpy(), axis=1)),
+        "cells": None if drawn is None else pack(drawn["loss"].to_numpy()),
+        "looks": None if drawn is None else pack(drawn["status"].to_numpy(), "u1"),
+        "finer": pack(finer, "u1") if finer.any() else None,
+    }
+    return dict(to_json(found))
 
 
 def pack(values: np.ndarray[Any, Any], kind: str = "f4") -> str:
@@ -324,17 +275,18 @@ def pack(values: np.ndarray[Any, Any], kind: str = "f4") -> str:
     return base64.b64encode(values.astype(f"<{kind}").tobytes()).decode()
 
 
-def _axes(plane: Plane) -> list[Axis]:
+def _axes(plane: Plane) -> list[dict[str, Any]]:
+    """Return the axes of a map: coordinates of nodes, where they are labelled, both logarithms on a logarithmic one."""
     from ...landscapes.draw.style import decades, round_values
 
-    found = list[Axis]()
+    found = []
     for label, places, scale in zip(plane.labels, (axis.tolist() for axis in plane.axes()), plane.scales, strict=True):
         ticks = (decades if scale == LOG10 else round_values)(places[0], places[-1])
-        found.append(Axis(label, places, ticks, scale == LOG10))
+        found.append({"label": label, "values": places, "ticks": ticks, "logarithmic": scale == LOG10})
     return found
 
 
-def _scales(loss: np.ndarray[Any, Any], below: Sequence[float]) -> dict[str, ColourScale]:
+def _scales(loss: np.ndarray[Any, Any], below: Sequence[float]) -> dict[str, dict[str, Any]]:
     """Return the scales that a map's colours can have, or a line's height, which goes down to what lies below.
 
     A logarithmic one is there where all losses are positive.
@@ -350,7 +302,11 @@ def _scales(loss: np.ndarray[Any, Any], below: Sequence[float]) -> dict[str, Col
         found = {LINEAR: Scale.between(low - room, high + room)}
     if finite.size and 0 < low < high and finite.min() > 0:
         found[LOGARITHMIC] = Scale.between(low, high, logarithmic=True, extend=scale.extend)
-    return {name: ColourScale(*one.ends, one.logarithmic, one.extend, one.ticks()) for name, one in found.items()}
+    names = ("low", "high", "logarithmic", "extend", "ticks")
+    return {
+        name: dict(zip(names, (*one.ends, one.logarithmic, one.extend, one.ticks()), strict=True))
+        for name, one in found.items()
+    }
 
 
 def read_episodes(folder: Path, dataset: xr.Dataset) -> list[EpisodeEntry]:

@@ -49,15 +49,7 @@ from ...landscapes.objective import Evaluation, Status, failed
 from ...landscapes.plain import plain_json
 from ...landscapes.space import ParameterSpace
 from ...landscapes.storage.arrays import FILL, consolidate, create_array, flags, open_group
-from ...landscapes.storage.files import (
-    check_ours,
-    clear_halves,
-    lost_root,
-    placing,
-    replacing,
-    resolve,
-    store_files,
-)
+from ...landscapes.storage.files import check_ours, clear_halves, lost_root, placing, replacing, resolve, store_files
 from ..base import Kind
 from . import RUN as RUN
 from .run import Run
@@ -266,7 +258,7 @@ def lay_out(group: zarr.Group, attributes: dict[str, Any]) -> None:
 class RunStore:
     """Keep what an optimiser evaluates, row by row, so that a run stopped at any instant can be continued.
 
-    Make one with `create`, `open`, `open_or_create` or `in_memory`; `search` fills it. `identity` holds what decides
+    Make one with `open`, `open_or_create` or `in_memory`; `search` fills it. `identity` holds what decides
     the numbers (objective, options, fidelity, device, method, its options, seed); the budget is not of it, since a run
     can be continued to a larger one.
     """
@@ -286,36 +278,6 @@ class RunStore:
         if path:
             self._inode = path.stat().st_ino
             self._load(path)
-
-    @classmethod
-    def create(
-        cls,
-        path: str | Path,
-        space: ParameterSpace,
-        *,
-        identity: Mapping[str, Any],
-        provenance: Mapping[str, Any] | None = None,
-        budget: int,
-        overwrite: bool = False,
-    ) -> RunStore:
-        """Make an empty run at a path where there is none, all at once; `overwrite` replaces a run, nothing else.
-
-        Raises StoreExistsError where there is one, StoreError where something else is to be replaced.
-        """
-        path = resolve(path)
-        attributes = attributes_of(space, identity, provenance or {}, budget)
-        if path.exists() and not overwrite:
-            raise StoreExistsError(f"{path} exists already; write elsewhere with --out, or replace it with --force")
-        if path.exists():
-            check_replaceable(path)
-        try:
-            with placing(path, overwrite=overwrite, check=partial(check_replaceable, path)) as new:
-                lay_out(zarr.create_group(new, zarr_format=3), attributes)
-                consolidate(new)
-                Journal(about=digest_of(attributes)).write(new)
-        except FileExistsError as error:
-            raise StoreExistsError(str(error)) from None
-        return cls.open(path)
 
     @classmethod
     def open(cls, path: str | Path) -> RunStore:
@@ -338,13 +300,28 @@ class RunStore:
         identity: Mapping[str, Any],
         provenance: Mapping[str, Any] | None = None,
         budget: int,
+        overwrite: bool = False,
     ) -> RunStore:
-        """Continue the run at `path`, or make it; a run made by other settings raises `StoreMismatchError`."""
-        with contextlib.suppress(StoreExistsError):
-            return cls.create(path, space, identity=identity, provenance=provenance, budget=budget)
+        """Continue the run at `path`, or make an empty one, all at once; `overwrite` replaces a run, nothing else.
+
+        Raises StoreMismatchError for a run made by other settings, StoreError where something else is to be replaced,
+        and StoreExistsError where another process has replaced it meanwhile.
+        """
+        path = resolve(path)
+        attributes = attributes_of(space, identity, provenance or {}, budget)
+        if path.exists() and overwrite:
+            check_replaceable(path)
+        if overwrite or not path.exists():
+            try:
+                with placing(path, overwrite=overwrite, check=partial(check_replaceable, path)) as new:
+                    lay_out(zarr.create_group(new, zarr_format=3), attributes)
+                    consolidate(new)
+                    Journal(about=digest_of(attributes)).write(new)
+            except FileExistsError as error:
+                if overwrite:
+                    raise StoreExistsError(str(error)) from None
         run = cls.open(path)
-        wanted = attributes_of(space, identity, {}, budget)["identity"]
-        check_identity(run.path, wanted=wanted, found=run.identity, what="run")
+        check_identity(run.path, wanted=attributes["identity"], found=run.identity, what="run")
         return run
 
     @classmethod

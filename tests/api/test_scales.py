@@ -132,9 +132,9 @@ def test_a_surface_and_a_page_of_the_gallery_have_the_same_decades(map_of_spring
     relief = Relief(map_of_spring.plane, Scale.between(0, 1))
     places, _ = relief.ticks(0)
     assert [relief.write(0, place) for place in places] == ["0.01", "1", "100", "10⁴", "10⁶"]
-    across, up = read_off_nodes(map_of_spring.data, [], []).axes
-    assert (across.logarithmic, up.logarithmic) == (True, False)
-    assert list(across.ticks) == [-2, 0, 2, 4, 6]
+    across, up = read_off_nodes(map_of_spring.data, [], [])["axes"]
+    assert (across["logarithmic"], up["logarithmic"]) == (True, False)
+    assert list(across["ticks"]) == [-2, 0, 2, 4, 6]
 
 
 def test_a_run_searches_decades_and_its_table_and_best_have_values(here: Path) -> None:

@@ -54,17 +54,7 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (source / "gallery" / name).write_text("{}")
     shutil.copy(DOCS / "references.bib", source)
     how = ["-c", DOCS, "-D", "walked=0", "-D", f"gallery_site={source / 'gallery'}", "-D", "exclude_patterns=gallery"]
-    command = [
-        sys.executable,
-        "-m",
-        "sphinx",
-        "-W",
-        "--keep-going",
-        "-q",
-        *map(str, how),
-        str(source),
-        str(source / "out"),
-    ]
+    command = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", *map(str, [*how, source, source / "out"])]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     return source / "out"

@@ -101,9 +101,7 @@ def test_its_races_are_those_of_the_verb_and_neither_repeats_the_other(
     assert compute(small, "--only", "branin") == 0
     assert "all 72 episodes are there already" in capsys.readouterr().err
     ours = to_json(read_standings(small / "league/branin.json"))
-    assert {name: one for name, one in ours.items() if name != "command"} == {
-        name: one for name, one in theirs.items() if name != "command"
-    }
+    assert {**ours, "command": ""} == {**theirs, "command": ""}
     assert ours["command"].startswith("landscape league branin@exact --methods random,descents --budget 12 --seeds 3")
 
 

@@ -72,7 +72,7 @@ def test_a_run_of_before_there_were_versions_goes_on(branin, tmp_path):
     about = run_identity(branin, kind.on(branin, seed=0, options=kind.Options()))
     assert about["method_version"] == 1
     path = tmp_path / "run.zarr"
-    run = RunStore.create(path, branin.space, identity=about, budget=4)
+    run = RunStore.open_or_create(path, branin.space, identity=about, budget=4)
     group = rewrite(path, before(run.identity), text=False)
     Journal(about=digest_of(group.attrs.asdict())).write(path)
     again = RunStore.open_or_create(path, branin.space, identity=about, budget=4)

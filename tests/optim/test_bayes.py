@@ -4,13 +4,11 @@ import torch
 from botorch.acquisition.analytic import UpperConfidenceBound
 
 from gradscape.envs.adapters import from_torch
-from gradscape.envs.registry import make
 from gradscape.landscapes.objective import Evaluation, Objective, Status
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.optim.base import Kind
 from gradscape.optim.methods.bayes import BO, BODescents, BODescentsOptions
 from gradscape.optim.methods.bo_leap import BOLeap
-from gradscape.optim.methods.random import RandomSearch
 from gradscape.optim.search import search
 
 from .states import model_of
@@ -51,16 +49,6 @@ def test_bo_evaluates_where_the_bound_of_all_it_knows_is_least_and_the_first_ten
     bound = UpperConfidenceBound(model_of(optimizer.surrogate), beta=1.0, maximize=False)
     with torch.no_grad():
         assert bound(found[:, None]) >= bound(grid[:, None]).max() - 1e-6
-
-
-@pytest.mark.slow
-def test_bo_comes_closer_to_branins_minimum_than_chance_does():
-    branin = make("branin")
-    gaps = [
-        [search(branin, method(branin.space, seed=seed), budget=40).best_loss - branin.minimum for seed in range(3)]
-        for method in (BO, RandomSearch)
-    ]
-    assert np.median(gaps[0]) < 0.1 * np.median(gaps[1])
 
 
 def test_bo_descents_descends_from_each_proposal_and_proposes_anew_when_a_descent_ends():

@@ -150,8 +150,7 @@ def test_a_missing_row_is_damage_not_data(tmp_path: Path) -> None:
     run.save(lambda: {})
     (tmp_path / "run.zarr/status/c/1").unlink()
     with pytest.raises(
-        StoreError,
-        match=f"rows {CHUNK + 1} to {2 * CHUNK} are not what was written; .* begin the run again",
+        StoreError, match=f"rows {CHUNK + 1} to {2 * CHUNK} are not what was written; .* begin the run again"
     ):
         RunStore.open(tmp_path / "run.zarr")
 
@@ -281,7 +280,7 @@ def test_only_a_run_is_replaced(tmp_path: Path) -> None:
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine/thesis.txt").write_text("precious")
     with pytest.raises(StoreError, match="is no run, so it is not replaced"):
-        RunStore.create(tmp_path / "mine", SPACE, identity={}, budget=3, overwrite=True)
+        RunStore.open_or_create(tmp_path / "mine", SPACE, identity={}, budget=3, overwrite=True)
     assert not is_run(tmp_path / "mine")
     with pytest.raises(StoreError, match="is no run of format 2"):
         RunStore.open(tmp_path / "mine")
@@ -290,7 +289,7 @@ def test_only_a_run_is_replaced(tmp_path: Path) -> None:
     run = run_at(tmp_path / "run.zarr")
     run.append(*points(3), Kind.RANDOM, 1.0)
     run.save(lambda: {})
-    assert RunStore.create(tmp_path / "run.zarr", SPACE, identity={}, budget=3, overwrite=True).count == 0
+    assert RunStore.open_or_create(tmp_path / "run.zarr", SPACE, identity={}, budget=3, overwrite=True).count == 0
     with pytest.raises(StoreError, match="was replaced or removed"):
         run.save(lambda: {})
     assert sorted(path.name for path in tmp_path.iterdir()) == ["mine", "run.zarr"]
@@ -301,13 +300,13 @@ def test_a_file_of_somebody_elses_in_a_run_is_not_lost_by_force(tmp_path: Path) 
     run_at(path)
     (path / "x/thesis.txt").write_text("precious")
     with pytest.raises(ValueError, match=r"holds files that are not of a run: x/thesis\.txt"):
-        RunStore.create(path, SPACE, identity={}, budget=3, overwrite=True)
+        RunStore.open_or_create(path, SPACE, identity={}, budget=3, overwrite=True)
     assert (path / "x/thesis.txt").read_text() == "precious"
     (path / "x/thesis.txt").unlink()
     (path / "zarr.json").write_text("{")
     with pytest.raises(StoreError, match=r"run\.zarr/zarr\.json is damaged: .*begin the run again in another"):
         RunStore.open(path)
-    assert RunStore.create(path, SPACE, identity={}, budget=3, overwrite=True).budget == 3
+    assert RunStore.open_or_create(path, SPACE, identity={}, budget=3, overwrite=True).budget == 3
 
 
 def test_what_zarr_had_not_written_whole_goes_when_the_run_is_filled_again(tmp_path: Path) -> None:

@@ -1,5 +1,3 @@
-import signal
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +16,6 @@ from gradscape.optim.runs.store import RunStore
 from gradscape.optim.search import SearchProgress, search
 
 from ..clock import Clock
-from ..processes import Instant, alone
 
 SPACE = ParameterSpace(("a", "b", "c"), torch.tensor([-2.0, 0, 5]), torch.tensor([2.0, 9, 6]), ("m", "s", ""))
 
@@ -139,34 +136,6 @@ def test_a_run_continued_to_a_larger_budget_is_the_one_that_had_it_from_the_begi
     objective = Pit()
     assert filled(tmp_path / "run.zarr", kind, budget=19, objective=objective).sizes["evaluation"] == 40
     assert not objective.batches
-
-
-def test_a_run_in_memory_can_be_continued_too() -> None:
-    run = search(Pit(), Mixed(SPACE), budget=5, gradient_cost=3.0)
-    xr.testing.assert_equal(
-        search(Pit(), Mixed(SPACE), run, budget=33).dataset().drop_vars("seconds"),
-        search(Pit(), Mixed(SPACE), budget=33, gradient_cost=3.0).dataset().drop_vars("seconds"),
-    )
-
-
-def searching(path: Path) -> None:
-    filled(path, CMAES, budget=45)
-
-
-@pytest.mark.e2e
-def test_sigkill_at_any_instant_changes_no_bit(tmp_path: Path) -> None:
-    instants = alone(partial(searching, tmp_path / "whole.zarr"), tmp_path).changes
-    whole, found = run_at(tmp_path / "whole.zarr", budget=45).dataset().drop_vars("seconds"), []
-    for instant in range(1, instants + 1, 17):
-        path = tmp_path / f"{instant}.zarr"
-        assert alone(partial(searching, path), tmp_path, Instant(instant)).returncode == -signal.SIGKILL
-        found.append(run_at(path, budget=45).count)
-        objective = Pit()
-        xr.testing.assert_identical(filled(path, CMAES, budget=45, objective=objective), whole)
-        assert sum(objective.batches) == 45 - found[-1]
-    assert found[0] == 0
-    assert found == sorted(found)
-    assert len(set(found)) > 3
 
 
 def test_forward_equivalents_count_a_gradient_for_what_it_costs(tmp_path: Path) -> None:

@@ -104,11 +104,6 @@ def test_targets_go_down_to_the_best_that_is_known_and_not_below_what_coco_asks_
     assert (zero.spacing, zero.best_known) == ("log", 0.0)
 
 
-def test_every_tenth_target_stands_for_all_with_both_ends():
-    goals = statistics.targets(RACE)
-    assert goals.some == [0, 10, 20, 30, 40, 50]
-
-
 def test_an_expected_running_time_is_all_that_was_spent_by_how_many_succeeded():
     goals = statistics.Targets(np.array([0.5, 1.0, 2.0, 4.5]), "log", "")
     # a: never; after 3 and in vain all 4; after 3 and 4; after 1 and 4

@@ -43,25 +43,6 @@ def test_the_bounds_argmin_agrees_with_a_dense_grid(count, kernel):
     assert (found - grid[values.argmin()]).abs().max() < 0.006
 
 
-def test_the_process_is_the_posterior_of_a_zero_mean_with_squared_exponential_covariance():
-    surrogate = informed()
-    model = model_of(surrogate)
-    u, new = (surrogate.z + 1.0) / 2.0, np.random.default_rng(2).uniform(size=(5, 2))
-    mean, spread = surrogate.loss.mean(), surrogate.loss.std(ddof=1)
-    scale = model.covar_module.lengthscale.detach().numpy()
-    noise = model.likelihood.noise.item()
-
-    def k(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        return np.exp(-0.5 * (((a[:, None] - b[None]) / scale) ** 2).sum(axis=2))
-
-    inverse = np.linalg.inv(k(u, u) + noise * np.eye(len(u)))  # Rasmussen & Williams 2006, eq. 2.25 and 2.26
-    wanted = k(new, u) @ inverse @ ((surrogate.loss - mean) / spread)
-    variance = 1.0 - np.einsum("ij,jk,ik->i", k(new, u), inverse, k(new, u))
-    posterior = model.posterior(torch.from_numpy(new))
-    np.testing.assert_allclose(posterior.mean.detach()[:, 0], mean + spread * wanted, rtol=1e-6)
-    np.testing.assert_allclose(posterior.variance.detach()[:, 0], spread**2 * variance, rtol=1e-4, atol=1e-8)
-
-
 def going_on(surrogate: Surrogate, first: int) -> Process:
     """Return the process of a surrogate as one that continues from the factor of its first points."""
     return replace(surrogate.process(), first=first)
@@ -69,7 +50,7 @@ def going_on(surrogate: Surrogate, first: int) -> Process:
 
 @pytest.mark.parametrize("first", [30, 40])
 @pytest.mark.parametrize("kernel", ["rbf", "matern"])
-def test_the_bound_and_its_slopes_are_those_of_botorch(kernel, first):
+def test_the_bound_its_slopes_and_the_posterior_are_those_of_botorch(kernel, first):
     surrogate = informed(kernel=kernel)
     model = model_of(surrogate)
     points = torch.rand(7, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64).requires_grad_()
@@ -80,18 +61,11 @@ def test_the_bound_and_its_slopes_are_those_of_botorch(kernel, first):
     torch.testing.assert_close(scale.untransform(value[:, None])[0][:, 0], wanted.detach(), rtol=1e-9, atol=1e-9)
     torch.testing.assert_close(scale.stdvs[0] * slope, slopes, rtol=1e-7, atol=1e-7)
     torch.testing.assert_close(bound(points.detach()), value)
-
-
-@pytest.mark.parametrize("kernel", ["rbf", "matern"])
-def test_the_posterior_is_that_of_botorch(kernel):
-    surrogate = informed(kernel=kernel)
-    model = model_of(surrogate)
-    points = torch.rand(20, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    mean, covariance = surrogate.process().posterior(points)
-    wanted, scale = model.posterior(points), model.outcome_transform
-    torch.testing.assert_close(scale.untransform(mean[:, None])[0], wanted.mean.detach(), rtol=1e-9, atol=1e-9)
-    covariance = covariance * scale.stdvs[0] ** 2
-    torch.testing.assert_close(covariance, wanted.distribution.covariance_matrix.detach(), rtol=1e-6, atol=1e-8)
+    mean, covariance = going_on(surrogate, first).posterior(points.detach())
+    whole = model.posterior(points.detach())
+    torch.testing.assert_close(scale.untransform(mean[:, None])[0], whole.mean.detach(), rtol=1e-9, atol=1e-9)
+    theirs = whole.distribution.covariance_matrix.detach()
+    torch.testing.assert_close(covariance * scale.stdvs[0] ** 2, theirs, rtol=1e-6, atol=1e-8)
 
 
 @pytest.mark.parametrize("kernel", ["rbf", "matern"])
@@ -132,14 +106,6 @@ def test_more_exploration_goes_further_from_what_is_known():
         return np.linalg.norm(surrogate.z - proposal_of(surrogate), axis=1).min()
 
     assert distance(20.0) > 2.0 * distance(0.0)
-
-
-def test_fitting_raises_the_likelihood_that_a_parameter_without_effect_is_ignored():
-    surrogate = Surrogate(2, SurrogateOptions())
-    z = np.random.default_rng(1).uniform(-1.0, 1.0, (60, 2))
-    surrogate.add(z, np.sin(5.0 * z[:, 0]))
-    used, unused = model_of(surrogate).covar_module.lengthscale.detach().flatten().tolist()
-    assert unused > 10.0 * used
 
 
 def test_a_failure_counts_as_the_worst_loss():

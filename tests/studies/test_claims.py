@@ -7,16 +7,7 @@ import pytest
 
 from gradscape.envs.records import Fidelity
 from gradscape.landscapes.convert import from_json, to_json
-from gradscape.studies.claims import (
-    CLAIMS,
-    Choice,
-    Claim,
-    Shortfall,
-    choose,
-    fronts,
-    nearness,
-    surely_beaten,
-)
+from gradscape.studies.claims import CLAIMS, Choice, Claim, Shortfall, choose, fronts, nearness, surely_beaten
 from gradscape.studies.fidelity import MeasuredVariant
 from gradscape.studies.samples import Bootstrap, Comparison, GradientError, LossError, Seconds
 
@@ -60,11 +51,6 @@ def test_a_claim_is_kept_at_its_limit_and_broken_just_beyond(claim: Claim, what:
     broken = Shortfall.of(measured(**{what: worse}).comparison, claim)
     assert not broken.kept
     assert broken.by == what
-
-
-def test_the_claims_are_those_of_the_docs() -> None:
-    assert Claim("draft", rank=0.95, cosine=0.9, error=0.1) == DRAFT
-    assert Claim("standard", rank=0.99, cosine=0.98, error=0.03) == STANDARD
 
 
 @pytest.mark.parametrize(

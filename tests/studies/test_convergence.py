@@ -60,14 +60,11 @@ class Wild(Second):
 
 
 @pytest.fixture(autouse=True)
-def own_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Keep measurements in a folder of the test's own."""
-    monkeypatch.setattr("gradscape.studies.own_folder.user_data_path", lambda name: tmp_path / "data" / name)
-    for name, value in (("RESAMPLES", 99), ("REPETITION", 0.002), ("LARGEST", 0.002)):
+def registered(few_resamples: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value in (("REPETITION", 0.002), ("LARGEST", 0.002)):
         monkeypatch.setattr(samples, name, value)
     for kind in (Second, Wild):
         monkeypatch.setitem(registry.entries(), kind.name, registry.Entry(kind.name, f"{__name__}:{kind.__name__}"))
-    return tmp_path / "data"
 
 
 def study(scene: str, *more: str) -> list[str]:
@@ -122,21 +119,21 @@ def test_a_trade_off_prints_what_a_study_of_the_same_code_has_left(run: Run, tmp
 def test_levels_go_from_coarse_to_fine_about_the_reference() -> None:
     for scene in ("fluid", "cartpole"):
         env = registry.make(scene, fidelity="reference", device="cpu")
-        found = {one.setting: one for one in find_refinements(env)}
-        for one in found.values():
-            widths = [width for _, width in one.levels]
+        found = find_refinements(env)
+        for setting, levels in found.items():
+            widths = [width for _, width in levels]
             assert widths == sorted(set(widths), reverse=True)
-            assert len(widths) > 2 or one.setting == "precision"
-            assert "reference" in [variant.name for variant, _ in one.levels]
+            assert len(widths) > 2 or setting == "precision"
+            assert "reference" in [variant.name for variant, _ in levels]
         assert ("joint" in found) == (scene == "fluid")
 
 
 def test_widths_are_those_of_the_levels_fidelities() -> None:
     cells = registry.make("fluid", fidelity="reference", device="cpu").fidelity.resolution
-    (grids,) = find_refinements(registry.make("fluid", fidelity="reference", device="cpu"), ["resolution"])
-    assert [width for _, width in grids.levels] == [cells / one.fidelity.resolution for one, _ in grids.levels]
-    assert [width for _, width in grids.levels] == pytest.approx([3 / 2, 1, 2 / 3, 1 / 2], abs=2 / cells)  # even cells
+    (grids,) = find_refinements(registry.make("fluid", fidelity="reference", device="cpu"), ["resolution"]).values()
+    assert [width for _, width in grids] == [cells / one.fidelity.resolution for one, _ in grids]
+    assert [width for _, width in grids] == pytest.approx([3 / 2, 1, 2 / 3, 1 / 2], abs=2 / cells)  # even cells
     cartpole = registry.make("cartpole", fidelity="reference", device="cpu")
-    (steps,) = find_refinements(cartpole, ["dt"])
+    (steps,) = find_refinements(cartpole, ["dt"]).values()
     dt = cartpole.fidelity.dt
-    assert [width for _, width in steps.levels] == pytest.approx([4 * dt, 2 * dt, dt, dt / 2, dt / 4])
+    assert [width for _, width in steps] == pytest.approx([4 * dt, 2 * dt, dt, dt / 2, dt / 4])

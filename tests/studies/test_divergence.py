@@ -21,28 +21,6 @@ def logistic(x: float, steps: int) -> Array:
     return np.array(found)
 
 
-def sinai(angle: float, steps: int) -> Array:
-    """Follow a point in a unit torus with a disc of radius 0.3 in its middle, sampled at equal times."""
-    place, way, found = np.array([0.1, 0.0]), np.array([math.cos(angle), math.sin(angle)]), []
-    left, dt, unwrapped = 0.25, 0.25, np.array([0.1, 0.0])
-    while len(found) < steps:
-        far, centre = left, None
-        for shift in np.ndindex(5, 5):
-            about = np.array(shift) - 2 + 0.5 - (place - np.floor(place))
-            along = float(about @ way)
-            under = along**2 - float(about @ about) + 0.09
-            if under > 0 and 1e-12 < (hit := along - math.sqrt(under)) < far:
-                far, centre = hit, about
-        place, unwrapped, left = place + far * way, unwrapped + far * way, left - far
-        if centre is not None:
-            normal = (far * way - centre) / 0.3
-            way = way - 2 * float(way @ normal) * normal
-        else:
-            found.append(unwrapped.copy())
-            left = dt
-    return np.array(found)
-
-
 def test_the_logistic_map_parts_at_log_two() -> None:
     rates = []
     for start in np.linspace(0.11, 0.41, 30):
@@ -51,14 +29,6 @@ def test_the_logistic_map_parts_at_log_two() -> None:
         rates.append(growth.rate)
     assert np.mean(rates) == pytest.approx(math.log(2), rel=0.1)
     assert growth.chaotic
-
-
-def test_a_billiard_with_a_disc_is_chaotic() -> None:
-    time = 0.25 * np.arange(48)
-    distances = np.linalg.norm(sinai(0.7, 48) - sinai(0.7 + 1e-10, 48), axis=1)
-    growth = fit_rate(time, distances, extent=1.0)
-    assert growth.chaotic
-    assert 0.5 < growth.rate < 4.0
 
 
 def test_oscillators_flights_and_powers_of_time_are_not_chaotic() -> None:
@@ -92,15 +62,6 @@ def test_half_chaotic_points_make_a_chaotic_scene() -> None:
     assert found.rate.value == pytest.approx(6)
     assert not Divergence.of([tame, tame, wild], responses, size=1e-8).is_chaos
     assert from_json(Divergence, to_json(found)) == found
-
-
-def test_distances_of_uniform_samples_are_the_closed_forms() -> None:
-    """Of U(0, 1) and U(s, 1 + s): Kolmogorov's is s, Wasserstein's is s."""
-    grid = (np.arange(1000) + 0.5) / 1000
-    for shift in (0.1, 0.5):
-        kolmogorov, wasserstein = distances(grid, grid + shift, scale=2.0)
-        assert kolmogorov == pytest.approx(shift, abs=2e-3)
-        assert wasserstein == pytest.approx(shift / 2, rel=1e-9)
 
 
 def test_distances_are_those_of_scipy() -> None:

@@ -24,12 +24,8 @@ WIDTH = 0.05
 
 
 @pytest.fixture(autouse=True)
-def own_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Keep margins in a folder of the test's own; foretell what a job takes by one episode."""
-    monkeypatch.setattr("gradscape.studies.own_folder.user_data_path", lambda name: tmp_path / "data" / name)
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("gradscape.landscapes.draw.figures.page.save", lambda figure, path: path.touch())
-    for name in ("MOMENT", "ENOUGH", "WARM_UP"):
-        monkeypatch.setattr(f"gradscape.landscapes.cost.{name}", 0.0)
 
 
 @dataclass(frozen=True)
@@ -160,8 +156,7 @@ def assert_bracketed(limit: Limit, truth: float) -> None:
 
 
 @pytest.mark.parametrize(
-    ("kind", "step", "stiffness"),
-    [(Spring, 2 / math.sqrt(100.0), 4 / 0.02**2), (Decay, 2 / 100.0, 2 / 0.02)],
+    ("kind", "step", "stiffness"), [(Spring, 2 / math.sqrt(100.0), 4 / 0.02**2), (Decay, 2 / 100.0, 2 / 0.02)]
 )
 def test_the_largest_step_and_stiffness_are_those_of_the_closed_form(
     kind: type[Environment], step: float, stiffness: float, tmp_path: Path

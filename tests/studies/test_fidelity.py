@@ -12,7 +12,6 @@ from torch import Tensor
 import gradscape
 from gradscape.envs import registry
 from gradscape.envs.base import Environment, Fidelity, Work
-from gradscape.jobs.scene import read_tolerance
 from gradscape.landscapes import cost
 from gradscape.landscapes.objective import Evaluation
 from gradscape.landscapes.space import ParameterSpace
@@ -25,6 +24,7 @@ from ..clock import Clock
 from ..command import Run
 
 CLOCK = Clock()
+CUT = ["slice", "converging", "--device", "cpu", "--dims", "0", "1", "--resolution", "3"]
 TRADE = ["study", "fidelity", "converging", "--points", "16", "--device", "cpu", "--out", "trade"]
 
 
@@ -59,14 +59,11 @@ class Converging(Environment):
 
 
 @pytest.fixture(autouse=True)
-def own_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Keep measurements in a folder of the test's own, and time by the clock of the scene."""
-    monkeypatch.setattr("gradscape.studies.own_folder.user_data_path", lambda name: tmp_path / "data" / name)
+def timed(few_resamples: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Time by the clock of the scene."""
     for module in (samples, cost):
         monkeypatch.setattr(module, "time", CLOCK)
-    monkeypatch.setattr(samples, "RESAMPLES", 99)
     monkeypatch.setitem(registry.entries(), "converging", registry.Entry("converging", f"{__name__}:Converging"))
-    return tmp_path / "data"
 
 
 def _double(found: Evaluation) -> Evaluation:
@@ -126,29 +123,28 @@ def test_a_study_is_printed_without_being_measured_again(
     assert rows == [POINTS, POINTS]  # those that are verified, each time
 
 
-def test_variants_that_are_refused_are_listed_and_those_that_diverge_are_counted(run: Run) -> None:
+def test_variants_that_are_refused_or_whose_engine_gives_up_are_listed_and_those_that_diverge_are_counted(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    simulate = Converging._evaluate
+
+    def short_of_memory(self: Converging, x: Tensor, *, grad: bool) -> Evaluation:
+        if self.fidelity.name == "standard-float64":
+            raise RuntimeError("out of memory")
+        return simulate(self, x, grad=grad)
+
+    monkeypatch.setattr(Converging, "_evaluate", short_of_memory)
     done = run(*TRADE, "--json")
     report = done.json
-    assert report["refused"] == [{"name": "draft-dt-x4", "why": "converging takes dt below 0.4; got 0.4"}]
+    refused = {one["name"]: one["why"] for one in report["refused"]}
+    assert refused == {
+        "draft-dt-x4": "converging takes dt below 0.4; got 0.4", "standard-float64": "out of memory"
+    }  # fmt: skip
     assert "refused: draft-dt-x4: converging takes dt below 0.4; got 0.4" in done.stderr
     coarse = by_name(report)["draft-dt-x2"]
     x = Converging.space.sobol(16, seed=0)
     assert coarse["comparison"]["diverged"] == pytest.approx(float((x[:, 0] > 0.5).double().mean()))
     assert coarse["comparison"]["loss_error"]["p95"]["value"] is None
-
-
-def test_a_variant_whose_engine_gives_up_is_listed_too(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    simulate = Converging._evaluate
-
-    def short_of_memory(self: Converging, x: Tensor, *, grad: bool) -> Evaluation:
-        if self.fidelity.name == "standard":
-            raise RuntimeError("out of memory")
-        return simulate(self, x, grad=grad)
-
-    monkeypatch.setattr(Converging, "_evaluate", short_of_memory)
-    report = run.json(*TRADE, "--settings", "precision")
-    assert report["refused"] == [{"name": "standard", "why": "out of memory"}]
-    assert {"draft", "draft-float64", "standard-float64", "reference"} < set(by_name(report))
 
 
 def test_a_variant_has_given_back_its_memory_when_the_next_one_is_measured(
@@ -273,24 +269,16 @@ def test_a_stopped_study_goes_on_with_the_next_variant(
     assert kept == {name: (tmp_path / "trade/pieces" / name).read_bytes() for name in kept}
 
 
-def test_another_study_is_not_overwritten(run: Run, tmp_path: Path) -> None:
-    run(*TRADE, "--settings", "dt")
-    before = (tmp_path / "trade/fidelity.json").read_bytes()
-    run.refuse(*TRADE, "--seed", "1", said="seed: wanted 1, found 0")
-    assert (tmp_path / "trade/fidelity.json").read_bytes() == before
-
-
 def test_a_tolerance_takes_the_quickest_fidelity_within_it(run: Run, tmp_path: Path) -> None:
     report = run.json(*TRADE)
     errors = {row["name"]: row["comparison"]["loss_error"]["p95_relative"]["value"] for row in report["variants"]}
     within = [row for row in report["variants"] if (off := errors[row["name"]]) is not None and off <= 0.02]
     wanted = min(within, key=lambda row: row["comparison"]["seconds"]["with_gradient"])
     assert len(report["variants"]) > len(within) > 1
-    how = ["converging", "--device", "cpu", "--tolerance", "2%"]
-    cut = run.ok("slice", *how, "--dims", "0", "1", "--resolution", "3", "--out", "cut")
+    cut = run.ok(*CUT, "--tolerance", "2%", "--out", "cut")
     assert f"{wanted['name']}: the quickest of" in cut.stderr
     assert gradscape.open_slice(tmp_path / "cut").identity["settings"] == wanted["fidelity"]
-    searched = run.json("optimize", *how, "--method", "random", "--budget", "3")
+    searched = run.json("optimize converging --device cpu --tolerance 2% --method random --budget 3")
     assert searched["fidelity"] == wanted["fidelity"]["name"]
 
 
@@ -304,15 +292,14 @@ def test_a_tolerance_that_nothing_meets_names_the_best(run: Run, tmp_path: Path)
     ]
     report["identity"]["model_version"] = 0
     write_record(path, report)
-    how = ["slice", "converging", "--device", "cpu", "--dims", "0", "1", "--resolution", "3", "--tolerance"]
-    run.refuse(*how, "1e-9", said="the best is standard-dt-x0.5")
-    some = run.ok(*how, "50%")
+    run.refuse(*CUT, "--tolerance", "1e-9", said="the best is standard-dt-x0.5")
+    some = run.ok(*CUT, "--tolerance", "50%")
     assert "warning: measured by converging model 0; this is model 1" in some.stderr
 
 
 def test_a_name_whose_settings_changed_since_is_not_chosen(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     run(*TRADE)
-    how = ["slice", "converging", "--device", "cpu", "--dims", "0", "1", "--resolution", "3", "--tolerance", "50%"]
+    how = [*CUT, "--tolerance", "50%"]
     before = run.json(*how, "--out", "before")["fidelity"]
     monkeypatch.setattr(Converging, "fidelities", {**Converging.fidelities, "draft": Fidelity("draft", dt=0.125)})
     after = run.json(*how, "--out", "after")["fidelity"]
@@ -331,7 +318,7 @@ def test_the_gallerys_variants_of_the_same_problem_are_found_where_nothing_of_th
     path = tmp_path / "data" / "studies" / "converging-cpu.fidelity.json"
     path.parent.mkdir(parents=True)
     monkeypatch.setattr("gradscape.studies.kept.resources.files", lambda package: tmp_path)
-    how = ["slice", "converging", "--device", "cpu", "--dims", "0", "1", "--resolution", "3", "--tolerance", "50%"]
+    how = [*CUT, "--tolerance", "50%"]
     write_record(path, {**report, "variants": [softer, *report["variants"]]})
     done = run.ok(*how)
     assert str(path) in done.stderr
@@ -341,16 +328,11 @@ def test_the_gallerys_variants_of_the_same_problem_are_found_where_nothing_of_th
 
 
 def test_a_slice_at_a_measured_fidelity_can_be_cut_anew(run: Run, tmp_path: Path) -> None:
-    how = ["converging", "--device", "cpu", "--tolerance", "0.0015"]
     run(*TRADE, "--settings", "dt")
-    run("slice", *how, "--dims", "0", "1", "--resolution", "3", "--out", "cut")
-    run("optimize", *how, "--method", "random", "--budget", "3", "--out", "searched")
+    run(*CUT, "--tolerance", "0.0015", "--out", "cut")
+    run("optimize converging --device cpu --tolerance 0.0015 --method random --budget 3 --out searched")
     assert json.loads((tmp_path / "cut/summary.json").read_text())["fidelity"] == "standard-dt-x0.5"
     run.ok("overlay cut searched --through best --device cpu --out over")
-
-
-def test_a_tolerance_is_a_share() -> None:
-    assert read_tolerance("5%") == read_tolerance("0.05") == 0.05
 
 
 def elsewhere(report: dict[str, Any]) -> dict[str, Any]:
@@ -381,7 +363,7 @@ def test_seconds_are_those_of_the_device_that_will_run(
         return variants.expected_work(env)
 
     monkeypatch.setattr(variants, "seconds_with_gradient", slow)
-    how = ["slice", "converging", "--device", "cpu", "--dims", "0", "1", "--resolution", "3", "--json"]
+    how = [*CUT, "--json"]
     errors = {row["name"]: row["comparison"]["loss_error"]["p95_relative"]["value"] for row in report["variants"]}
     within = [name for name, off in errors.items() if off is not None and off <= 0.02]
     work = {

@@ -74,9 +74,8 @@ class Trading(Environment):
 
 
 @pytest.fixture(autouse=True)
-def own_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Keep measurements in a folder of the test's own, and time by the clock of the scene."""
-    monkeypatch.setattr("gradscape.studies.own_folder.user_data_path", lambda name: tmp_path / "data" / name)
+def timed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Time by the clock of the scene."""
     CLOCK.now = 0.0
     for module in (samples, cost, mixed):
         monkeypatch.setattr(module, "time", CLOCK)

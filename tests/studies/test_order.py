@@ -6,14 +6,7 @@ from numpy.typing import NDArray
 
 from gradscape.envs.records import Fidelity
 from gradscape.studies import samples
-from gradscape.studies.convergence import (
-    Level,
-    Levels,
-    Scale,
-    conclude,
-    estimate_remainders,
-    judge,
-)
+from gradscape.studies.convergence import Level, Levels, Scale, conclude, estimate_remainders, judge
 from gradscape.studies.order import (
     choose_order,
     extrapolate,
@@ -93,9 +86,9 @@ def test_what_does_not_converge_gets_no_limit(seed: int) -> None:
     assert found.verdict == "does not converge"
     assert found.pooled.low is not None
     assert found.pooled.low <= 0
-    assert choose_order(found, 1.0) is None
-    _, order = conclude(one := refined("dt", WIDTHS, losses), "reference", Scale(1.0, Bootstrap(1.0, 1.0, 1.0), 0))
-    assert estimate_remainders([(one, order)], {"reference": losses[1]}, losses[1], scale_of(1.0)) == ()
+    assert choose_order(found.verdict, found.pooled, 1.0) is None
+    said = conclude(one := refined("dt", WIDTHS, losses), "reference", scale_of(1.0))
+    assert estimate_remainders([(one, said)], {"reference": losses[1]}, losses[1], scale_of(1.0)) == ()
     with pytest.raises(ValueError, match="positive order"):
         extrapolate(WIDTHS, losses, -0.5)
 
@@ -142,7 +135,7 @@ def test_what_is_left_is_the_distance_from_the_limit_and_corrections_add_up(monk
         refined("resolution", WIDTHS, np.array([at[0.5, h] for h in WIDTHS])),
     ]
     reference = at[0.5, 0.5]
-    pairs = [(one, conclude(one, "reference", scale_of(1.0))[1]) for one in both]
+    pairs = [(one, conclude(one, "reference", scale_of(1.0))) for one in both]
     found = estimate_remainders(pairs, {"standard": at[1.0, 1.0], "reference": reference}, reference, scale_of(1.0))
     standard, left = found
     assert standard.median.value == pytest.approx(float(np.median(np.abs(step + cell))), rel=1e-6)
@@ -156,8 +149,8 @@ def test_a_remainder_s_interval_holds_it_where_the_order_is_measured(monkeypatch
     for seed in range(tries):
         losses = manufacture(WIDTHS, 1.5, points=24, noise=0.05, seed=seed)
         one = refined("dt", WIDTHS, losses)
-        _, order = conclude(one, "reference", scale_of(1.0))
-        (left,) = estimate_remainders([(one, order)], {"reference": losses[1]}, losses[1], scale_of(1.0))
+        said = conclude(one, "reference", scale_of(1.0))
+        (left,) = estimate_remainders([(one, said)], {"reference": losses[1]}, losses[1], scale_of(1.0))
         truth = 0.5**1.5 * 0.6745  # of the median of |a|, a standard normal
         assert left.median.low is not None
         assert left.median.high is not None
@@ -171,7 +164,7 @@ def test_a_remainder_s_interval_holds_it_where_the_order_is_measured(monkeypatch
 def test_the_rule_is_a_tenth_of_what_standard_is_off(off: float, met: bool, start: str | None) -> None:
     """With a = 1, halving the step from a half moves losses by 0.25 - 0.5 = 1/4 of a, then by an eighth."""
     losses = np.arange(16.0) + np.array(WIDTHS)[:, None] * 2
-    found, _ = conclude(refined("dt", WIDTHS, losses), "reference", scale_of(off))
+    found = conclude(refined("dt", WIDTHS, losses), "reference", scale_of(off))
     assert found.moved is not None
     assert found.moved.value == pytest.approx(0.5)
     assert (found.met, found.met_from) == (met, start)
@@ -185,7 +178,7 @@ def test_a_reference_that_moves_by_rounding_alone_is_converged_however_right_sta
     moves: float, met: bool
 ) -> None:
     losses = np.arange(16.0) + moves * np.array([1, -1, 1, -1])[:, None]
-    found, _ = conclude(refined("dt", WIDTHS, losses), "reference", scale_of(1e-10))
+    found = conclude(refined("dt", WIDTHS, losses), "reference", scale_of(1e-10))
     rule = judge([found], scale_of(1e-10))
     assert (rule.met, "is converged to rounding" in rule.sentence()) == (met, met)
     assert "within a tenth" not in found.sentence()
@@ -194,7 +187,7 @@ def test_a_reference_that_moves_by_rounding_alone_is_converged_however_right_sta
 def test_points_that_a_finer_level_fails_at_count_as_infinitely_far_off() -> None:
     losses = manufacture(WIDTHS, 1.0)
     losses[2, :3] = np.nan
-    found, _ = conclude(refined("dt", WIDTHS, losses), "reference", scale_of(1.0))
+    found = conclude(refined("dt", WIDTHS, losses), "reference", scale_of(1.0))
     assert found.moved is not None
     assert found.moved.value is None
     assert found.met is False

@@ -5,12 +5,11 @@ import pytest
 from matplotlib.text import Text
 
 from gradscape.landscapes import cost
-from gradscape.landscapes.convert import from_json, to_json
 from gradscape.landscapes.draw.figures.accuracy import model_figure
 from gradscape.landscapes.objective import Evaluation, Objective
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.studies import samples
-from gradscape.studies.model import Effect, ModelRecord, Price, judge_price
+from gradscape.studies.model import Effect, Price, judge_price
 from gradscape.studies.samples import Bootstrap
 
 from ..clock import Clock
@@ -125,8 +124,3 @@ def test_missing_parts_are_hollow_and_what_cannot_be_placed_is_on_the_edges() ->
     said = [text.get_text() for text in ax.figure.legends[0].get_texts()]
     assert "hollow: missing, put in by the change" in said
     assert any(text.startswith("noise of the full model: ") for text in said)
-
-
-def test_a_study_comes_back_from_its_record() -> None:
-    made = study(PARTS, failing=True)
-    assert from_json(ModelRecord, to_json(made)) == made

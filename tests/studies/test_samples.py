@@ -176,20 +176,6 @@ def test_no_legend_is_wider_than_its_page(tmp_path: Any) -> None:
     assert 0 <= box.x0 < box.x1 <= drawn.bbox.width
 
 
-@pytest.mark.drawn
-def test_names_of_fidelities_cover_nothing(figure: Figure) -> None:
-    (ax,) = figure.axes
-    names = [text for text in ax.texts if text.get_text() in ("draft", "standard")]
-    assert len(names) == 2
-    figure.canvas.draw()
-    boxes = [Text.get_window_extent(text) for text in names]
-    assert not boxes[0].overlaps(boxes[1])
-    for line in ax.lines:
-        if line.get_gid() and line.get_gid() not in ("front", "interval"):
-            for point in ax.transData.transform(line.get_xydata()):
-                assert not any(box.contains(*point) for box in boxes)
-
-
 @pytest.mark.parametrize("width", [None, 85.0])
 @pytest.mark.parametrize("crowd", [0, 8])
 @pytest.mark.drawn
@@ -205,17 +191,3 @@ def test_every_variant_is_named_beside_its_mark_or_by_number_in_the_legend(width
     drawn.canvas.draw()
     boxes = [Text.get_window_extent(text) for text in ax.texts]
     assert not any(one.overlaps(other) for number, one in enumerate(boxes) for other in boxes[:number])
-
-
-@pytest.mark.parametrize(
-    ("name", "changed", "said"),
-    [
-        ("standard", "named", "standard"),
-        ("draft-dt-x0.5", "dt", "draft ×0.5"),
-        ("standard-resolution-96", "resolution", "standard 96"),
-        ("draft-float64", "precision", "draft float64"),
-        ("draft on taichi", "engine", "draft taichi"),
-    ],
-)
-def test_a_short_name_leaves_out_what_the_mark_says(name: str, changed: str, said: str) -> None:
-    assert short_name(variant(name, 1.0, 0.1, changed)) == said

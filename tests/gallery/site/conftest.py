@@ -220,7 +220,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
         for method in ("random", "descents"):
             identity = {"objective": env, "options": {}, "method": method, "seed": 0, "fidelity": "draft"}
             provenance = {"command": f"landscape optimize {env} --method {method}"}
-            run = RunStore.create(
+            run = RunStore.open_or_create(
                 folder / "runs.tmp" / env / method, SPACE, identity=identity, provenance=provenance, budget=24
             )
             (folder / RUNS / env).mkdir(parents=True, exist_ok=True)

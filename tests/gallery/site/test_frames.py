@@ -92,21 +92,18 @@ def test_a_frame_of_the_map_reads_no_node(ledges: str, visit: Visit) -> None:
     assert (seen[0] == seen[1]).all()
 
 
-def test_layers_over_a_moving_map_are_pictures_too(counted: dict[str, Any]) -> None:
+@pytest.mark.parametrize(
+    ("move", "pictures", "put", "lines"),
+    [("(k) => setView(2, 0.2 + k / 200, 0.1)", 1 + 2 + 2 + 1, 0, 100),
+     ("(k) => { turning = true; turn(0.05, 0.001); }", 1, 1, 40)],
+)  # fmt: skip
+def test_layers_over_a_moving_map_are_pictures_and_a_turning_surface_is_one(
+    counted: dict[str, Any], move: str, pictures: int, put: int, lines: int
+) -> None:
     for page in counted.values():
-        page.check("input[name=isolines]")
-        page.check("input[name=finer]")
-    moves = "(k) => setView(2, 0.2 + k / 200, 0.1)"
-    for page in counted.values():
-        calls = work(page, moves)
+        for layer in ("isolines", "finer"):
+            page.check(f"input[name={layer}]")
+        calls = work(page, move)
         assert not NEVER & calls.keys()
-        assert calls["drawImage"] == 1 + 2 + 2 + 1
-        assert calls["lineTo"] < 100
-
-
-def test_a_frame_of_the_surface_makes_nothing_anew(counted: dict[str, Any]) -> None:
-    for page in counted.values():
-        calls = work(page, "(k) => { turning = true; turn(0.05, 0.001); }")
-        assert not NEVER & calls.keys()
-        assert (calls["putImageData"], calls["drawImage"]) == (1, 1)
-        assert calls["lineTo"] < 40
+        assert (calls["drawImage"], calls.get("putImageData", 0)) == (pictures, put)
+        assert calls["lineTo"] < lines

@@ -65,6 +65,8 @@ def test_without_a_league_the_front_page_says_that_nothing_was_raced(data: Path,
     build_site(FIGURES, few, tmp_path / "site")
     page = (tmp_path / "site/index.html").read_text()
     assert "Not raced yet." in page
+    assert "league.html" not in page
+    assert not (tmp_path / "site/league.html").exists()
     assert "landscape card" in page
     assert "not measured yet" in page
 
@@ -146,6 +148,9 @@ def test_the_front_page_is_filtered_by_word_number_and_engine_and_a_link_keeps_t
     page.select_option("#engine", "warp")
     assert left() == (["fluid"], 1)
     page.select_option("#engine", "")
+    page.fill("#filter", "figure 10 DESC")
+    assert left() == ([], 1)
+    page.wait_for_function("document.getElementById('count').textContent === '1 of 3 slices'")
     page.fill("#filter", "nothing at all")
     assert left() == ([], 0)
     assert page.is_visible(".none")

@@ -180,16 +180,6 @@ def test_isolines_cross_every_edge_between_losses_on_both_sides_and_none_at_a_fa
     assert (pixels(page, "map") == plain).all()
 
 
-def test_isolines_are_drawn_sharp_once_the_map_rests(ledges: str, visit: Visit) -> None:
-    page = visit(ledges, "coarse/index.html")
-    page.check("input[name=isolines]")
-    page.evaluate("setView(3, 0.2, 0.2)")
-    page.wait_for_function("sharp.zoom === 3 && !sharp.stale")
-    rested = pixels(page, "map")
-    page.evaluate("sharp.stale = true; redraw()")
-    assert (pixels(page, "map") == rested).all()
-
-
 def test_arrows_are_thinned_by_the_zoom(ledges: str, visit: Visit) -> None:
     page = visit(ledges, "fine/index.html")
     page.evaluate("""() => {

@@ -1,7 +1,6 @@
 """What a browser makes of the site: from files and from a server, with the pointer, with keys, on a phone."""
 
 import json
-import re
 import threading
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -63,17 +62,6 @@ def test_every_page_opens(way: str, visit: Visit, request: pytest.FixtureRequest
             )
         page.click("text=All landscapes")
         page.wait_for_url("**/index.html")
-
-
-def test_the_index_is_filtered_by_words(filed: str, visit: Visit) -> None:
-    page = visit(filed, "index.html")
-    page.fill("#filter", "figure 10 DESC")
-    assert page.locator(".slice:visible").count() == 1
-    assert page.locator("section:visible[data-env]").count() == 1
-    page.wait_for_function("document.getElementById('count').textContent === '1 of 3 slices'")
-    page.fill("#filter", "")
-    assert page.locator(".slice:visible").count() == 3
-    assert "ball" in page.inner_text("section[aria-labelledby=bounce] p >> nth=0")
 
 
 def test_the_map_says_what_is_under_the_pointer_and_the_keys(filed: str, data: Path, visit: Visit) -> None:
@@ -251,19 +239,6 @@ def test_the_surface_is_flat_where_a_node_is_and_opens_where_its_valley_is_seen(
     assert np.argmax(nearest) == np.argmax(corners @ [np.cos(eye), np.sin(eye)])
 
 
-def test_dark_screens_have_the_dark_pictures_and_print_the_light_ones(filed: str, visit: Visit) -> None:
-    sources = "() => Array.from(document.querySelectorAll('picture img')).map((one) => one.currentSrc.split('/').pop())"
-    for scheme, dark in (("dark", True), ("light", False)):
-        page = visit(filed, "full/index.html", color_scheme=scheme)
-        page.evaluate("document.querySelectorAll('img').forEach((one) => { one.loading = 'eager'; })")
-        page.wait_for_function("Array.from(document.querySelectorAll('picture img')).every((one) => one.currentSrc)")
-        found = page.evaluate(sources)
-        assert len(found) >= 3
-        assert {name.endswith("-dark.png") for name in found} == {dark}
-        page.emulate_media(media="print")
-        page.wait_for_function("!Array.from(document.images).some((one) => one.currentSrc.endsWith('-dark.png'))")
-
-
 @pytest.mark.parametrize("path", ["full/index.html", "league.html"])
 def test_every_table_shows_all_of_its_columns_on_a_phone(filed: str, visit: Visit, path: str) -> None:
     page = visit(filed, path, width=360)
@@ -281,19 +256,6 @@ def test_every_table_shows_all_of_its_columns_on_a_phone(filed: str, visit: Visi
     assert page.evaluate("document.documentElement.scrollWidth") <= 360
     for table in page.locator(".across").all():
         assert table.evaluate("(one) => one.scrollWidth <= one.clientWidth")
-
-
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_pages_fit_a_phone_in_light_and_dark(filed: str, visit: Visit, scheme: str) -> None:
-    for path in ("index.html", "card.html", "league.html", "full/index.html", "line/index.html"):
-        page = visit(filed, path, width=360, color_scheme=scheme, device_scale_factor=2)
-        assert page.evaluate("document.documentElement.scrollWidth") <= 360
-        ground = page.evaluate("getComputedStyle(document.body).backgroundColor")
-        level = float(np.mean([int(part) for part in re.findall(r"\d+", ground)[:3]]))
-        assert level > 200 if scheme == "light" else level < 60
-    corner = pixels(page, "map")[4, 4, :3]
-    assert abs(float(corner.mean()) - level) < 2
-    assert page.evaluate("canvas.width === 2 * canvas.clientWidth")
 
 
 def test_every_control_has_a_name_and_can_be_reached_by_keys(filed: str, visit: Visit) -> None:

@@ -170,13 +170,6 @@ def test_ranks_are_legible_on_their_colours(site: Path) -> None:
         assert (high + 0.05) / (low + 0.05) >= 4.5
 
 
-def test_without_races_there_is_no_league(data: Path, tmp_path: Path) -> None:
-    few = shutil.copytree(data / "bare", tmp_path / "data/bare").parent
-    build_site(FIGURES, few, tmp_path / "site")
-    assert not (tmp_path / "site/league.html").exists()
-    assert "league.html" not in (tmp_path / "site/index.html").read_text()
-
-
 MINIMA = "12 minima and 7.5 turns along a side, deeper than 1 % of the range; exponent over short distances 0.90"
 COSINE = "mean cosine of gradient and slope over 1 % of the box: 0.25 (0.10 to 0.40), not"
 
