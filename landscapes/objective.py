@@ -194,6 +194,7 @@ class Objective(abc.ABC):
     preferred_batch: int = 1  # points worth evaluating at once
     whole_batches: bool = False  # whether a part of a batch takes as long as all of it
     own_programs: bool = False  # whether each one made compiles programs of its own, for each size of batch
+    episodes_per_point: int = 1  # that the evaluation of one point takes
     decisions: int = 1  # how often controls are chosen in an episode: dim / decisions of them, time first
     _named: bool = False
 
