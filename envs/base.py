@@ -424,6 +424,10 @@ class Environment(Objective):
         """
         return {}
 
+    def without(self) -> Environment:
+        """Return the environment within its remedies, itself where it has none."""
+        return self
+
     def engine_call(self, x: Float[Tensor, "batch dim"], *, grad: bool) -> Callable[[], object] | None:
         """Return what calls the engine alone at these points, for timing; None where evaluating does no more."""
         return None

@@ -16,6 +16,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..landscapes.episode import Episode
+from ..landscapes.identity import EPISODES_PER_POINT, REMEDY
 from ..landscapes.objective import Evaluation, Status
 from ..landscapes.plain import read_share
 from ..landscapes.space import LINEAR, LOG10, ParameterSpace, as_whole
@@ -78,7 +79,8 @@ class RemediedEnvironment(Environment):
     def identity(self) -> dict[str, Any]:
         """Return what decides the numbers: all of the environment within, and the remedies, the first one first."""
         within = self.inner.identity()
-        return {**within, "remedy": ",".join(filter(None, (within.get("remedy", ""), self.remedy.text)))}
+        remedies = ",".join(filter(None, (within.get(REMEDY, ""), self.remedy.text)))
+        return {**within, REMEDY: remedies, EPISODES_PER_POINT: self.episodes_per_point}
 
     @property
     def precision(self) -> str:
@@ -129,8 +131,8 @@ class RemediedEnvironment(Environment):
         return RemediedEnvironment(self.inner.with_horizon(horizon), self.remedy)
 
     def without(self) -> Environment:
-        """Return the environment within all remedies."""
-        return self.inner.without() if isinstance(self.inner, RemediedEnvironment) else self.inner
+        """Return the environment within its remedies."""
+        return self.inner.without()
 
     def _remake(self, **settings: Any) -> Environment:
         return RemediedEnvironment(self.inner.remake(**settings), self.remedy)

@@ -28,7 +28,7 @@ from .folder import RACE, ROOT, RUN_STORE, folder_named
 from .job import Job, filling
 from .plan import simulation_seconds
 from .scene import provenance
-from .search import divide_methods, make_optimizer, open_run_store
+from .search import divide_methods, make_optimizer, open_run_store, points_within
 from .watch import PREPARING, Watch, Work
 from .workers import recipe
 
@@ -84,7 +84,7 @@ class RaceJob(Job[Race]):
         race would not fit this machine.
         """
         watch, options = watch or Watch(), options or {}
-        budget, seeds = as_whole(budget, "a budget", least=1), as_whole(seeds, "a number of seeds", least=1)
+        budget, seeds = points_within(env, budget), as_whole(seeds, "a number of seeds", least=1)
         workers = as_whole(workers, "a number of workers", least=1)
         methods = check_methods(methods) or _able_methods(env, watch)
         folder = out or race_folder(env, options)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..landscapes.cost import duration, episode_cost
-from ..landscapes.identity import METHOD_VERSION
+from ..landscapes.identity import METHOD_VERSION, simulator_parts
 from ..landscapes.objective import FAILED, Objective, Status, describe_errors
 from ..landscapes.space import as_whole
 from ..landscapes.storage.files import check_free, clear
@@ -111,7 +111,7 @@ class SearchJob(SummaryJob[SearchSummary]):
         StoreError where another process fills the run that is to be replaced, and TooLargeError where the run would
         not fit this machine.
         """
-        budget, identity = as_whole(budget, "a budget", least=1), run_identity(env, optimizer)
+        budget, identity = points_within(env, budget), run_identity(env, optimizer)
         folder = out or run_folder(identity)
         require_runs(env.space.dim, budget, 1, folder)
         optimizer.require_memory(optimizer.options, SearchSize(env.space.dim, env.decisions, budget))
@@ -188,7 +188,8 @@ class SearchJob(SummaryJob[SearchSummary]):
         return ratio if grad else None
 
     def _place(self) -> str:
-        return f"{self.env.name} · {self.env.fidelity.name} · {self.env.device} · {self.optimizer.name} · {self.folder}"
+        parts = " · ".join(simulator_parts(self.env.identity()))
+        return f"{parts} · {self.env.device} · {self.optimizer.name} · {self.folder}"
 
     def _summary(self, resumed: int, seconds: float, files: list[str]) -> SearchSummary:
         run, identity = self.store.read(), self.store.identity
@@ -216,6 +217,17 @@ class SearchJob(SummaryJob[SearchSummary]):
             files=files,
             error=self.store.error,
         )
+
+
+def points_within(env: Environment, budget: int) -> int:
+    """Return how many points a budget of episodes allows: one takes several where a remedy averages.
+
+    Raises ValueError where that is none.
+    """
+    budget, cost = as_whole(budget, "a budget", least=1), env.episodes_per_point
+    if budget < cost:
+        raise ValueError(f"a point of {env.name} takes {cost} episodes with its remedy; got a budget of {budget}")
+    return budget // cost
 
 
 @one_torch_thread()

@@ -309,8 +309,8 @@ class ObjectiveWrapper(Objective):
 
 
 PASSED_ON = (
-    "threads preferred_batch precision packages identity prepare shrink release memory events special_places "
-    "nan_origin wrong_origin energy noise replicas observe"
+    "threads preferred_batch episodes_per_point precision packages identity prepare shrink release memory events "
+    "special_places nan_origin wrong_origin energy noise replicas observe"
 )
 for _part in PASSED_ON.split():
     setattr(ObjectiveWrapper, _part, property(attrgetter(f"objective.{_part}")))

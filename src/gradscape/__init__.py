@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from .envs.adapters import from_jax, from_numpy, from_step, from_torch, from_warp
     from .envs.base import Environment, Fidelity
     from .envs.registry import as_environment, make, register
+    from .envs.remedies import average, clip, rescale, shorten, smooth, soften
     from .jobs.scene import SceneSpec
     from .landscapes.episode import Episode
     from .landscapes.objective import Evaluation, Status
@@ -50,6 +51,7 @@ _HOMES = {
     "envs.adapters": ("from_jax", "from_numpy", "from_step", "from_torch", "from_warp"),
     "envs.base": ("Environment", "Fidelity"),
     "envs.registry": ("as_environment", "make", "register"),
+    "envs.remedies": ("average", "clip", "rescale", "shorten", "smooth", "soften"),
     "jobs.scene": ("SceneSpec",),
     "landscapes.episode": ("Episode",),
     "landscapes.objective": ("Evaluation", "Status"),

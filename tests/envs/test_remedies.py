@@ -2,6 +2,7 @@
 
 import math
 from itertools import pairwise
+from pathlib import Path
 
 import pytest
 import torch
@@ -191,3 +192,23 @@ def test_wider_smoothing_flattens() -> None:
 def test_what_no_remedy_is_gets_refused(text: str, said: str) -> None:
     with pytest.raises(ValueError, match=said):
         remedied(CUBIC, text)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "function", [lambda x: (x * x.abs()).sum(dim=1), lambda x: ((x.round() - 3) ** 2).sum(dim=1) + 0 * x.sum(dim=1)]
+)
+def test_a_remedy_around_a_function_goes_through_every_door(function, tmp_path: Path) -> None:
+    """A drag force, whose second derivative jumps, and a staircase, whose gradient is zero."""
+    space = gs.ParameterSpace({"a": (-1, 1), "b": (-1, 1)})
+    env = gs.smooth(gs.from_torch(function, space, name="own"), 0.05, estimator="first", samples=4)
+    found = gs.slice(env, (0, 1), resolution=6)
+    assert "smooth:0.05:first:4" in found.data.attrs["identity"]
+    assert found.report().words
+    assert gs.check(env, power=0.2)
+    best = gs.optimize(env, "l-bfgs-b", budget=42)
+    assert len(best.data["loss"]) == 10  # points of 4 episodes
+    assert best.data["episodes"][-1] == 10
+    assert best.data["forwards"][-1] >= 40
+    gs.race(env, ["random"], seeds=1, budget=8, out=tmp_path / "race")
+    gs.census(env, slices=1, resolution=6, out=tmp_path / "census")
