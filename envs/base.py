@@ -424,6 +424,10 @@ class Environment(Objective):
         """
         return {}
 
+    def plain_point(self, x: Float[Tensor, "*batch dim"]) -> Float[Tensor, "*batch dim"]:
+        """Return the points of the environment within its remedies that points stand for."""
+        return x
+
     def without(self) -> Environment:
         """Return the environment within its remedies, itself where it has none."""
         return self

@@ -130,6 +130,10 @@ class RemediedEnvironment(Environment):
         """Return this environment with episodes of another length."""
         return RemediedEnvironment(self.inner.with_horizon(horizon), self.remedy)
 
+    def plain_point(self, x: Float[Tensor, "*batch dim"]) -> Float[Tensor, "*batch dim"]:
+        """Return the points of the environment within its remedies that points stand for."""
+        return self.inner.plain_point(self.remedy.to_inner(self.inner, x))
+
     def without(self) -> Environment:
         """Return the environment within its remedies."""
         return self.inner.without()
