@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,7 +14,9 @@ from torch import Tensor
 
 from ..envs.base import Environment
 from ..envs.remedies import remedied
+from ..landscapes.convert import NOT_JSON
 from ..landscapes.objective import evaluate
+from ..landscapes.space import ParameterSpace
 from ..landscapes.statistics import Estimate, middle_95, share
 from ..optim.lockstep import Asking, Evaluate, Lockstep
 from ..optim.methods.quasi_newton import LocalSearch
@@ -41,8 +42,9 @@ class RemedyRow:
     `points` is what each descent could evaluate, each of `episodes_per_point`. `reached` is the median over the starts
     [loss unit], `better` the share of starts from which it got farther than without, and `p` that of Wilcoxon's
     signed-rank test of this, corrected for the number of remedies (Holm 1979). `falls` are the shares of the starts at
-    which a step of `STEPS` along the gradient lowers the loss. `moved` is how far its lowest point lies from the lowest
-    point of all rows, as a share of the box in the parameter that moved most. `losses` has the end of every descent.
+    which a step of `STEPS` along the gradient lowers the loss. `moved` is how far a descent with the remedy leads away
+    from the lowest point without it, as a share of the box in the parameter that moves most. `losses` has the end of
+    every descent.
     `words` are those for the landscape on the plane.
     """
 
@@ -64,7 +66,8 @@ class RemedyStudy:
     """Hold what each remedy does for descents from the same `starts`; the first row is without a remedy.
 
     `budget` is the episodes with gradient that a descent without a remedy could take, and `gradient_cost` what such an
-    episode costs in episodes without gradient: all rows cost the same in these.
+    episode costs in episodes without gradient: all rows cost the same in these. `dims` label the plane through the
+    centre of the box that `maps` are of, the losses with each remedy, and that the words are of.
     """
 
     env: str
@@ -79,7 +82,7 @@ class RemedyStudy:
     identity: dict[str, Any]
     provenance: dict[str, Any]
     command: str
-    folder: Path | None = field(default=None, metadata={"json": False}, compare=False)
+    maps: Mapping[str, NDArray[np.float64]] = field(default_factory=dict, metadata=NOT_JSON, compare=False, repr=False)
     derived = ("sentence",)
 
     @property
@@ -110,15 +113,13 @@ class RemedyStudy:
             return f"none of the {tried} remedies gets descents farther beyond chance: they reach {without}"
         best = self.helpful[0]
         said = f"{best.remedy} helps: descents reach {_median(best)}{unit}, and {without} (p = {best.p:.2g})"
-        if best.moved > max(STEPS[0], self.plain.moved):
-            said += f"; its lowest point lies {best.moved:.1%} of the box from the lowest that is known"
-        return said
+        return f"{said}; the minimum moves by {best.moved:.1%} of the box"
 
-    def plot(self) -> Picture:
-        """Draw the loss reached with every remedy, and the words of its landscape."""
+    def plot(self, *, width: float | None = None) -> Picture:
+        """Draw the loss reached with every remedy, and the landscape without one and with the best."""
         from ..landscapes.draw.figures.remedies import plot_remedies
 
-        return plot_remedies(self)
+        return plot_remedies(self, width=width)
 
 
 def _median(row: RemedyRow) -> str:
@@ -155,6 +156,11 @@ class Ends:
     points: int
     episodes_per_point: int
     falls: NDArray[np.float64]  # shape (step, start): 1 where a step along the gradient lowers the loss, NaN unknown
+    moved: float  # how far a descent leads away from the lowest point without a remedy, as a share of the box
+
+    def lowest(self, space: ParameterSpace) -> Float[Tensor, " dim"]:
+        """Return the lowest point, in the unit cube."""
+        return space.to_unit(self.x[int(self.loss.nan_to_num(torch.inf).argmin())])
 
 
 def descend(
@@ -164,12 +170,13 @@ def descend(
     *,
     budget: int,
     gradient_cost: float,
+    lowest: Float[Tensor, " dim"] | None = None,
     follow: Callable[[int], None] = lambda done: None,
 ) -> Ends:
     """Descend from starts in the unit cube with a remedy, by L-BFGS-B, each at the cost of `budget` gradients.
 
     A descent that ends goes on from its best point, as long as that gets it anywhere. What it found is evaluated
-    without the remedy.
+    without the remedy. One more descent starts at the `lowest` point without a remedy, to see how far that moves.
     """
     treated = env if text == WITHOUT else remedied(env, text)
     needs_gradient = ":zeroth" not in text
@@ -182,10 +189,19 @@ def descend(
         done += 1
         follow(done)
 
-    searches = [_descent(treated, start, points, advance) for start in starts]
-    best = torch.stack(Lockstep(treated).run(searches))
-    x = treated.plain_point(best)
-    return Ends(x, evaluate(env, x, grad=False).loss, points, treated.episodes_per_point, _falls(env, treated, starts))
+    begun = starts if lowest is None else torch.cat([starts, _unit_with(treated, env, lowest)])
+    best = torch.stack(Lockstep(treated).run([_descent(treated, start, points, advance) for start in begun]))
+    x, moved = treated.plain_point(best), 0.0
+    if lowest is not None:
+        moved, x = float((env.space.to_unit(x[-1]) - lowest).abs().max()), x[:-1]
+    losses, falls = evaluate(env, x, grad=False).loss, _falls(env, treated, starts)
+    return Ends(x, losses, points, treated.episodes_per_point, falls, moved)
+
+
+def _unit_with(treated: Environment, env: Environment, unit: Float[Tensor, " dim"]) -> Float[Tensor, "one dim"]:
+    """Return a point of the unit cube of an environment as one of the same with a remedy."""
+    values = env.space.to_values(env.space.from_unit(unit[None]))
+    return treated.space.to_unit(treated.space.from_values(values)).clamp(0, 1)
 
 
 def _descent(
@@ -230,11 +246,9 @@ def _falls(env: Environment, treated: Environment, starts: Float[Tensor, "start 
     return lower
 
 
-def conclude(ends: Sequence[tuple[str, Ends, tuple[str, ...]]], space_sides: Float[Tensor, " dim"]) -> list[RemedyRow]:
+def conclude(ends: Sequence[tuple[str, Ends, tuple[str, ...]]]) -> list[RemedyRow]:
     """Return the rows of remedies, the first being without one; `ends` has each one's name, ends and words."""
     losses = {name: np.where(np.isfinite(one.loss), one.loss, np.inf) for name, one, _ in ends}
-    lowest = min((one for _, one, _ in ends), key=lambda one: float(one.loss.nan_to_num(torch.inf).min()))
-    target = lowest.x[int(lowest.loss.nan_to_num(torch.inf).argmin())]
     plain = losses[ends[0][0]]
     ps = [1.0, *holm([_signed_rank(losses[name], plain) for name, _, _ in ends[1:]])]
     return [
@@ -246,7 +260,7 @@ def conclude(ends: Sequence[tuple[str, Ends, tuple[str, ...]]], space_sides: Flo
             better=_share_better(losses[name], plain),
             p=p,
             falls=tuple(share(int(np.nansum(row)), int(np.isfinite(row).sum())) for row in one.falls),
-            moved=float(((one.x[int(np.argmin(losses[name]))] - target) / space_sides).abs().max()),
+            moved=one.moved,
             words=words,
             losses=tuple(losses[name].tolist()),
         )

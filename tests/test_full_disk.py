@@ -38,6 +38,9 @@ WRITING = {  # the command, the file for which there is no room any more, what i
     ),
     "pairs": ("pairs branin --samples 2 --out made", "pairs.json", "2 batches are kept in made"),
     "hessian": ("hessian branin --out made", "hessian.json", "batches are kept in made"),
+    "remedy": (
+        "remedy branin --starts 6 --budget 16 --remedies clip:9 --out made", "remedy.json", "2 remedies are kept in made"
+    ),
     "census": ("census branin --slices 1 --resolution 6 --out made", "census.json", "1 of 1 slices are kept in made"),
     "check": ("check branin --power 50% --device cpu --out made", "check.json", "nothing of the check is kept"),
     "card": (

@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from .api.compare import compare
     from .api.environments import list_envs
     from .api.export import export
-    from .api.measure import bench, card, census, check, hessian, pairs
+    from .api.measure import bench, card, census, check, hessian, pairs, remedy
     from .api.overlay import overlay
     from .api.plan import plan
     from .api.replay import replay
@@ -38,7 +38,7 @@ _HOMES = {
     "api.compare": ("compare",),
     "api.environments": ("list_envs",),
     "api.export": ("export",),
-    "api.measure": ("bench", "card", "census", "check", "hessian", "pairs"),
+    "api.measure": ("bench", "card", "census", "check", "hessian", "pairs", "remedy"),
     "api.overlay": ("overlay",),
     "api.plan": ("plan",),
     "api.replay": ("replay",),
