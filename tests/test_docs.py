@@ -65,7 +65,7 @@ ADDED = {
     "pairs": ["--samples", "2"],
     "card": ["--scene", "control", "--resolution", "3"],
     "census": ["--slices", "1", "--resolution", "6"],
-    "remedy": ["--starts", "6", "--budget", "16", "--fidelity", "draft", "--remedies", "clip:9"],
+    "remedy": ["--starts", "6", "--budget", "16", "--remedies", "clip:9"],
     "gallery compute": ["--only", "bounce-y", "--part", "slices", "--fidelity", "draft", "--data", "made"],
     "gallery build": ["--data", "few", "--out", "site"],
     "gallery serve": ["--out", "served", "--port", "0"],
