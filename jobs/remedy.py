@@ -23,6 +23,7 @@ from ..landscapes.storage.files import replacing
 from ..studies.remedies import WITHOUT, Ends, RemedyStudy, candidates, conclude, descend
 from .folder import REMEDY, ROOT, folder_named
 from .job import CheckpointedJob
+from .plan import simulation_seconds
 from .scene import SceneSpec, plane_through, provenance
 from .watch import PREPARING, Watch, Work
 
@@ -152,9 +153,9 @@ class RemedyJob(CheckpointedJob[RemedyStudy]):
         env = self.env
         watch.note(f"{env.name} · {env.fidelity.name} · {env.device} · {self.folder}")
         with watch.busy(f"{env.name}: {PREPARING}"):
-            cost = episode_cost(env)
-        episodes = sum(one.losses + one.gradients for one in self.work())
-        seconds = episodes * cost.forward * cost.ratio / max(1, env.threads) + many * PICTURE_SECONDS
+            (work,) = self.work()
+            each = simulation_seconds(env, work.losses, work.gradients, env.preferred_batch)
+        seconds = each + PICTURE_SECONDS
         watch.announce(
             f"{many - 1} remedies and none, {self.starts} descents each at the cost of {self.budget} gradients: at "
             f"most {duration(seconds)}; --starts and --budget lower it",

@@ -248,7 +248,7 @@ def _falls(env: Environment, treated: Environment, starts: Float[Tensor, "start 
 
 def conclude(ends: Sequence[tuple[str, Ends, tuple[str, ...]]]) -> list[RemedyRow]:
     """Return the rows of remedies, the first being without one; `ends` has each one's name, ends and words."""
-    losses = {name: np.where(np.isfinite(one.loss), one.loss, np.inf) for name, one, _ in ends}
+    losses = {name: np.nan_to_num(one.loss.numpy(), nan=np.inf, posinf=np.inf) for name, one, _ in ends}
     plain = losses[ends[0][0]]
     ps = [1.0, *holm([_signed_rank(losses[name], plain) for name, _, _ in ends[1:]])]
     return [
