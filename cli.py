@@ -39,6 +39,7 @@ GROUPS = {  # of the help: heading -> verbs, each with the module of `api` that 
         "census": "measure",
         "pairs": "measure",
         "hessian": "measure",
+        "remedy": "measure",
         "study": "study",
         "card": "measure",
         "bench": "measure",

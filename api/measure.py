@@ -1,4 +1,4 @@
-"""`gs.check`, `gs.card`, `gs.pairs`, `gs.hessian`, `gs.census`, `gs.bench`: what a scene is like and costs."""
+"""What a scene is like, costs and needs: `gs.check`, `card`, `pairs`, `hessian`, `remedy`, `census`, `bench`."""
 
 from __future__ import annotations
 
@@ -14,8 +14,10 @@ from .options import (
     ARGUMENT,
     Count,
     Device,
+    Dims,
     FigureWidth,
     Force,
+    Names,
     Out,
     Point,
     Scene,
@@ -36,6 +38,7 @@ if TYPE_CHECKING:
     from ..landscapes.measures.card import Card
     from ..landscapes.measures.census import Census
     from ..landscapes.measures.hessian import Hessian
+    from ..studies.remedies import RemedyStudy
 
 OtherScenes = Annotated[
     Any,
@@ -262,6 +265,54 @@ def hessian(
     job = HessianJob.open(
         spec.resolve(call.watch), through, pairs=eigenpairs, probes=probes, seed=seed, out=as_path(out), force=force,
         prints=as_widths(figure_width_mm), command=call.command,
+    )  # fmt: skip
+    return job.run(call.watch)
+
+
+@verb
+def remedy(
+    scene: Scene,
+    *,
+    remedies: Annotated[
+        Names, Parameter(help="A remedy to try, as --remedy takes it. It may be repeated. The default is all.")
+    ] = (),
+    dims: Annotated[Dims, Parameter(help="Parameters of the plane that is drawn. The default is the first two.")] = (),
+    starts: Annotated[int, at_least(6)] = 32,
+    budget: Annotated[int, at_least(16)] = 320,
+    seed: Seed = 0,
+    figure_width_mm: FigureWidth = (),
+    out: Out = None,
+    force: Force = False,
+    **keywords: Unpack[SceneKeywords],
+) -> RemedyStudy:
+    """Find out which remedy helps a search: descents from the same starts at the same cost, with each and without.
+
+    A remedy is smoothing, clipping, an average over numerical replicas, another scale of parameters, a shorter episode
+    or softer contact; docs/remedies.md explains them. L-BFGS-B descends from random starts. What it finds is evaluated
+    without the remedy, and compared start by start. The folder then holds remedy.json, remedy.npz (losses on a plane)
+    and remedy.png. Stop at any time: the same command continues with the next remedy.
+
+    Raises ValueError for what the scene does not have; StoreMismatchError where the folder holds another study; Stopped
+    where it is interrupted.
+
+    Example: landscape remedy branin --starts 8 --budget 48
+
+    Parameters
+    ----------
+    starts
+        Number of random starts.
+    budget
+        Cost of each descent, as a number of episodes with gradient. A remedy that takes several episodes a point gets
+        fewer points.
+    """
+    spec = spec_of(scene, keywords)
+    from ..jobs.remedy import RemedyJob
+
+    call = current()
+    job = RemedyJob.open(
+        spec.resolve(call.watch), [remedies] if isinstance(remedies, str) else list(remedies), dims=dims,
+        starts=starts, budget=budget, seed=seed, out=as_path(out), force=force, prints=as_widths(figure_width_mm),
+        command=call.command,
     )  # fmt: skip
     return job.run(call.watch)
 

@@ -129,6 +129,13 @@ class MadeKeywords(TypedDict, total=False):
         ),
     ]
     options: SceneOptions
+    remedy: Annotated[
+        str | None,
+        Parameter(
+            help="What is done about the landscape, such as smooth:2% or smooth:1%:zeroth:32,clip:0.5: smooth, clip, "
+            "average, rescale, shorten, soften, one after another. docs/remedies.md explains them."
+        ),
+    ]
 
 
 class SceneKeywords(MadeKeywords, total=False):

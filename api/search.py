@@ -254,9 +254,10 @@ def _processes(workers: int | None, scheduler: str | None) -> int:
 
 def _search_in_memory(env: Environment, optimizer: Optimizer, budget: int) -> Run:
     """Search without keeping the run on disk."""
+    from ..jobs.search import points_within
     from ..landscapes.threads import one_torch_thread
     from ..optim.search import search
 
     with one_torch_thread(), current().watch.progress(budget) as advance:
-        store = search(env, optimizer, budget=budget, progress=lambda now: advance(now.done))
+        store = search(env, optimizer, budget=points_within(env, budget), progress=lambda now: advance(now.done))
     return store.read()

@@ -26,6 +26,7 @@ SHOWN = {
     "PairRanking": "pairs:show",
     "Plan": "plan:show",
     "Race": "race:show",
+    "RemedyStudy": "remedy:show",
     "Report": "report:show",
     "Reports": "report:show_several",
     "SliceComparison": "compare:show",

@@ -404,6 +404,14 @@ class Environment(Objective):
         """
         return {}
 
+    def plain_point(self, x: Float[Tensor, "*batch dim"]) -> Float[Tensor, "*batch dim"]:
+        """Return the points of the environment within its remedies that points stand for."""
+        return x
+
+    def without(self) -> Environment:
+        """Return the environment within its remedies, itself where it has none."""
+        return self
+
     def engine_call(self, x: Float[Tensor, "batch dim"], *, grad: bool) -> Callable[[], object] | None:
         """Return what calls the engine alone at these points, for timing; None where evaluating does no more."""
         return None

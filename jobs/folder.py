@@ -80,6 +80,7 @@ CARD = Results("report card", ("card.json", "card.html", "card.npz", "card.png")
 PAIRS = Results("study of pairs", ("pairs.json",))
 CHECK = Results("check", ("check.json", "check.png"), "check.png")
 HESSIAN = Results("Hessian", ("hessian.json", "hessian.npz", "hessian.png"), "hessian.png")
+REMEDY = Results("study of remedies", ("remedy.json", "remedy.npz", "remedy.png"), "remedy.png")
 CENSUS = Results("census", ("census.json", "census.npz", "census.png"), "census.png")
 
 

@@ -28,7 +28,7 @@ from .folder import RACE, RUN_STORE, folder_named
 from .job import Job, filling
 from .plan import simulation_seconds
 from .scene import provenance
-from .search import divide_methods, make_optimizer, open_run_store
+from .search import divide_methods, make_optimizer, open_run_store, points_within
 from .watch import PREPARING, Watch, Work
 from .workers import recipe
 
@@ -82,7 +82,7 @@ class RaceJob(Job[Race]):
         that are not there, where the folder holds something else or other runs, and where the race would not fit here.
         """
         watch, options = watch or Watch(), options or {}
-        budget, seeds = as_whole(budget, "a budget", least=1), as_whole(seeds, "a number of seeds", least=1)
+        budget, seeds = points_within(env, budget), as_whole(seeds, "a number of seeds", least=1)
         workers = as_whole(workers, "a number of workers", least=1)
         if not (methods := check_methods(methods)):
             methods, unable = divide_methods(env)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from .. import __version__
 from ..envs.engines import installed_version
 from ..envs.registry import find_environment, make, registered_environment, source_of
-from ..landscapes.identity import MODEL_VERSION, PACKAGE, VERSIONS, stored_identity
+from ..landscapes.identity import MODEL_VERSION, PACKAGE, REMEDY, VERSIONS, stored_identity
 from ..landscapes.options import record_options
 from ..landscapes.plain import digest, number, plain_json, read_share
 from ..landscapes.storage.files import moved_by, write_json
@@ -46,7 +46,7 @@ class SceneSpec:
     `name` is a registered name, FILE.py:NAME, an environment's class, or an environment. `fidelity` is a name or a
     record, by default the cheapest; `tolerance` chooses it by measured loss errors instead ("5%" of the losses' spread,
     or "0.05" in their unit). `device` is auto, cpu or cuda, `engine` one of the scene's, by default its first, and
-    `options` are the scene's own.
+    `options` are the scene's own. `remedy` is what is done about its landscape, such as smooth:2% (`envs.remedies`).
     """
 
     name: str | type[Environment] | Environment
@@ -56,11 +56,15 @@ class SceneSpec:
     engine: str | None = None
     deterministic: bool = False
     options: Mapping[str, Any] = field(default_factory=dict)
+    remedy: str | None = None
 
     @classmethod
     def of(cls, env: Environment) -> SceneSpec:
         """Return what makes an environment such as this one again."""
-        return cls(source_of(env), env.fidelity, None, env.device, env.engine, env.deterministic, asdict(env.options))
+        return cls(
+            source_of(env), env.fidelity, None, env.device, env.engine, env.deterministic, asdict(env.options),
+            env.identity().get(REMEDY),
+        )  # fmt: skip
 
     @property
     def kind(self) -> type[Environment] | Environment:
@@ -79,8 +83,10 @@ class SceneSpec:
     def make(self, watch: Watch | None = None, **changes: Any) -> Environment:
         """Make the environment; `changes` are other options. Raises ValueError for what the scene does not have."""
         spec = self.resolve(watch or Watch())
-        how: dict[str, Any] = {"fidelity": spec.fidelity, "device": spec.device, "engine": spec.engine}
-        return make(spec.name, **how, deterministic=spec.deterministic, **{**spec.options, **changes})
+        return make(
+            spec.name, fidelity=spec.fidelity, device=spec.device, engine=spec.engine,
+            deterministic=spec.deterministic, remedy=spec.remedy, **{**spec.options, **changes},
+        )  # fmt: skip
 
 
 def provenance(objective: Objective, command: str) -> dict[str, Any]:
@@ -140,7 +146,7 @@ def environment_of(dataset: xr.Dataset, device: str, env: Any = None) -> Environ
         ) from error
     return make(
         found, fidelity=Fidelity(**identity["settings"]), device=device, engine=identity["engine"],
-        deterministic=identity["deterministic"], **identity["options"],
+        deterministic=identity["deterministic"], remedy=identity.get(REMEDY), **identity["options"],
     )  # fmt: skip
 
 

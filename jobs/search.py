@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..landscapes.cost import duration, episode_cost
-from ..landscapes.identity import METHOD_VERSION
+from ..landscapes.identity import METHOD_VERSION, simulator_parts
 from ..landscapes.objective import FAILED, Objective, Status, describe_errors
 from ..landscapes.space import as_whole
 from ..landscapes.storage.files import check_free, clear
@@ -109,7 +109,7 @@ class SearchJob(SummaryJob[SearchSummary]):
 
         Raises ValueError where the folder holds something else or another run, and where the run would not fit here.
         """
-        budget, identity = as_whole(budget, "a budget", least=1), run_identity(env, optimizer)
+        budget, identity = points_within(env, budget), run_identity(env, optimizer)
         parts = [identity["objective"], identity["method"], identity["fidelity"], f"s{identity['seed']}"]
         folder = out or folder_named(parts, identity)
         require_runs(env.space.dim, budget, 1, folder)
@@ -187,7 +187,8 @@ class SearchJob(SummaryJob[SearchSummary]):
         return ratio if grad else None
 
     def _place(self) -> str:
-        return f"{self.env.name} · {self.env.fidelity.name} · {self.env.device} · {self.optimizer.name} · {self.folder}"
+        parts = " · ".join(simulator_parts(self.env.identity()))
+        return f"{parts} · {self.env.device} · {self.optimizer.name} · {self.folder}"
 
     def _summary(self, resumed: int, seconds: float, files: list[str]) -> SearchSummary:
         run, identity = self.store.read(), self.store.identity
@@ -215,6 +216,17 @@ class SearchJob(SummaryJob[SearchSummary]):
             files=files,
             error=self.store.error,
         )
+
+
+def points_within(env: Environment, budget: int) -> int:
+    """Return how many points a budget of episodes allows: one takes several where a remedy averages.
+
+    Raises ValueError where that is none.
+    """
+    budget, cost = as_whole(budget, "a budget", least=1), env.episodes_per_point
+    if budget < cost:
+        raise ValueError(f"a point of {env.name} takes {cost} episodes with its remedy; got a budget of {budget}")
+    return budget // cost
 
 
 @one_torch_thread()

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..envs.registry import make, source_of
 from ..landscapes.draw.loopback import LOOPBACK
+from ..landscapes.identity import REMEDY
 from ..landscapes.plain import printable
 
 if TYPE_CHECKING:
@@ -122,6 +123,7 @@ def recipe(objective: Objective) -> partial[Environment] | None:
         return None
     env = objective
     how = {"fidelity": env.fidelity, "device": env.device, "engine": env.engine, "deterministic": env.deterministic}
+    how["remedy"] = env.identity().get(REMEDY)
     return partial(_make_checked, source_of(env), env.version_on(env.engine), how | asdict(env.options))
 
 

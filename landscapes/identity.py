@@ -22,6 +22,8 @@ ERROR = "error"  # the attribute of a slice or a run with what the first point t
 UNNAMED = "default"  # the fidelity of a simulator that names none
 BOUNDS = "bounds"  # of the parameters, lower and upper, by their own values: of a slice's provenance
 SCALES = "scales"  # of the parameters in an identity; not there where all are linear
+REMEDY = "remedy"  # in the identity of an environment with remedies, as the command line spells them; and with it
+EPISODES_PER_POINT = "episodes_per_point"  # how many episodes a point takes: elsewhere one
 ABSENT = "none"  # instead of a setting's value
 LISTED_SETTINGS = 6  # settings that differ, in the refusal of a store
 MODEL_VERSION: Final = "model_version"  # in an identity; and so is
@@ -125,9 +127,9 @@ def stored_provenance(dataset: xr.Dataset) -> dict[str, Any]:
 
 
 def simulator_parts(identity: Mapping[str, Any]) -> list[str]:
-    """Return the simulator's name and its fidelity, but for that of a function which names none."""
-    said = [str(identity[key]) for key in ("objective", "fidelity") if identity.get(key)]
-    return said[:1] if said[1:] == [UNNAMED] else said
+    """Return the simulator's name, its fidelity, but for that of a function which names none, and its remedies."""
+    said = {key: str(identity[key]) for key in ("objective", "fidelity", REMEDY) if identity.get(key)}
+    return [text for key, text in said.items() if (key, text) != ("fidelity", UNNAMED)]
 
 
 def stored_space(dataset: xr.Dataset) -> ParameterSpace | None:

@@ -194,6 +194,7 @@ class Objective(abc.ABC):
     preferred_batch: int = 1  # points worth evaluating at once
     whole_batches: bool = False  # whether a part of a batch takes as long as all of it
     own_programs: bool = False  # whether each one made compiles programs of its own, for each size of batch
+    episodes_per_point: int = 1  # that the evaluation of one point takes
     decisions: int = 1  # how often controls are chosen in an episode: dim / decisions of them, time first
     _named: bool = False
 
@@ -308,8 +309,8 @@ class ObjectiveWrapper(Objective):
 
 
 PASSED_ON = (
-    "threads preferred_batch precision packages identity prepare shrink release memory events special_places "
-    "nan_origin wrong_origin energy noise replicas observe"
+    "threads preferred_batch episodes_per_point precision packages identity prepare shrink release memory events "
+    "special_places nan_origin wrong_origin energy noise replicas observe"
 )
 for _part in PASSED_ON.split():
     setattr(ObjectiveWrapper, _part, property(attrgetter(f"objective.{_part}")))

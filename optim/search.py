@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from ..landscapes.cost import episode_cost
-from ..landscapes.identity import StoreError
+from ..landscapes.identity import EPISODES_PER_POINT, StoreError
 from ..landscapes.objective import Objective
 from ..landscapes.space import as_whole
 from .base import Optimizer
@@ -82,7 +82,8 @@ def fill(
 
 def _in_memory(objective: Objective, method: Optimizer | str, budget: int) -> RunStore:
     name, seed = (method, 0) if isinstance(method, str) else (method.name, method.seed)
-    identity = {"objective": objective.name, "method": name, "seed": seed}
+    identity: dict[str, Any] = {"objective": objective.name, "method": name, "seed": seed}
+    identity[EPISODES_PER_POINT] = objective.episodes_per_point
     return RunStore.in_memory(objective.space, identity=identity, budget=budget)
 
 

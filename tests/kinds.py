@@ -84,6 +84,7 @@ KINDS = {
     "league": Kind(f"league branin ackley --methods random,descents --seeds 2 --budget 8 --device cpu --out {MADE}"),
     "pairs": Kind(f"pairs ackley --set dim=3 --samples 2 --out {MADE} --json"),
     "hessian": Kind(f"hessian ackley --set dim=3 --through random:1 --out {MADE} --json"),
+    "remedy": Kind(f"remedy ackley --set dim=3 --starts 6 --budget 16 --remedies smooth:2%:first:4 --out {MADE}"),
     "census": Kind(f"census ackley --set dim=3 --slices 4 --resolution 6 --out {MADE} --json"),
     "check": Kind(f"check branin --power 50% --device cpu --out {MADE} --json"),
     "card": Kind(f"card --scene control --resolution 3 --out {MADE} --json"),

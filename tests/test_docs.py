@@ -65,6 +65,7 @@ ADDED = {
     "pairs": ["--samples", "2"],
     "card": ["--scene", "control", "--resolution", "3"],
     "census": ["--slices", "1", "--resolution", "6"],
+    "remedy": ["--remedies", "clip:9"],
     "gallery compute": ["--only", "bounce-y", "--part", "slices", "--fidelity", "draft", "--data", "made"],
     "gallery build": ["--data", "few", "--out", "site"],
     "gallery serve": ["--out", "served", "--port", "0"],
@@ -114,8 +115,9 @@ def small(command: str) -> list[str]:
     kind = "--tolerance" if "--tolerance" in words else verb
     scenes = SCENES.get(kind, {})
     found = [scenes.get(word, WORDS.get(word, word)) for word in words[1:]]
+    values = VALUES | ({"--budget": "16", "--starts": "6"} if verb == "remedy" else {})
     for at, word in enumerate(found[:-1]):
-        found[at + 1] = VALUES.get(word, found[at + 1])
+        found[at + 1] = values.get(word, found[at + 1])
     added = ADDED.get(verb, []) + (TAICHI if "taichi" in found else [])
     pairs = [added[at : at + 2] for at in range(0, len(added), 2)] if verb != "replay" else [added]
     if "mixed" in found:

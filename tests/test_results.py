@@ -67,6 +67,7 @@ RESULTS = {
     ),
     "pairs": Left("pairs.json - pieces", "batches are kept", "pairs", other=DIM),
     "hessian": Left("hessian.json hessian.png hessian.npz pieces", "batches are kept", "Hessian", other=DIM),
+    "remedy": Left("remedy.json remedy.png remedy.npz pieces", "2 remedies are kept", "study of remedies", other=DIM),
     "census": Left(
         "census.json census.png census.npz pieces", "4 of 4 slices are kept", "census", "", THERE, DIM
     ),

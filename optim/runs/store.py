@@ -37,6 +37,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ...landscapes.identity import (
+    EPISODES_PER_POINT,
     ERROR,
     StoreError,
     StoreExistsError,
@@ -486,6 +487,7 @@ class RunStore:
         grad = torch.full_like(x, torch.nan) if evaluation.grad is None else evaluation.grad
         number = np.arange(1, len(x) + 1)
         cost = 1.0 if evaluation.grad is None else self.gradient_cost or float("nan")
+        cost *= self.identity.get(EPISODES_PER_POINT, 1)
         return {
             "x": x.numpy(),
             "loss": evaluation.loss.numpy(),

@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from .api.compare import compare
     from .api.environments import list_envs
     from .api.export import export
-    from .api.measure import bench, card, census, check, hessian, pairs
+    from .api.measure import bench, card, census, check, hessian, pairs, remedy
     from .api.overlay import overlay
     from .api.plan import plan
     from .api.replay import replay
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from .envs.adapters import from_jax, from_numpy, from_step, from_torch, from_warp
     from .envs.base import Environment, Fidelity
     from .envs.registry import as_environment, make, register
+    from .envs.remedies import average, clip, rescale, shorten, smooth, soften
     from .jobs.scene import SceneSpec
     from .landscapes.episode import Episode
     from .landscapes.objective import Evaluation, Status
@@ -37,7 +38,7 @@ _HOMES = {
     "api.compare": ("compare",),
     "api.environments": ("list_envs",),
     "api.export": ("export",),
-    "api.measure": ("bench", "card", "census", "check", "hessian", "pairs"),
+    "api.measure": ("bench", "card", "census", "check", "hessian", "pairs", "remedy"),
     "api.overlay": ("overlay",),
     "api.plan": ("plan",),
     "api.replay": ("replay",),
@@ -50,6 +51,7 @@ _HOMES = {
     "envs.adapters": ("from_jax", "from_numpy", "from_step", "from_torch", "from_warp"),
     "envs.base": ("Environment", "Fidelity"),
     "envs.registry": ("as_environment", "make", "register"),
+    "envs.remedies": ("average", "clip", "rescale", "shorten", "smooth", "soften"),
     "jobs.scene": ("SceneSpec",),
     "landscapes.episode": ("Episode",),
     "landscapes.objective": ("Evaluation", "Status"),

@@ -1,0 +1,40 @@
+"""A study of remedies, on the terminal."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from .terminal import Console, table
+
+if TYPE_CHECKING:
+    from ..studies.remedies import RemedyStudy
+
+
+def show(found: RemedyStudy, console: Console) -> None:
+    """Print a row for each remedy, then what they come to."""
+    from rich.box import SIMPLE
+
+    unit = f" [{found.loss_unit}]" if found.loss_unit else ""
+    rows = table("remedy", f"loss reached{unit}", "95 %", "better", "p", "falls", "moved", box=SIMPLE)
+    for column in (0, 2, 4):
+        rows.columns[column].no_wrap = True
+    for row in found.rows:
+        one = row.reached
+        better = "" if row is found.plain or row.better.value != row.better.value else f"{row.better.value:.0%}"
+        rows.add_row(
+            row.remedy, f"{one.value:.4g}", f"{one.low:.4g} to {one.high:.4g}", better,
+            "" if row is found.plain else _p(row.p), f"{row.falls[1].value:.0%}", f"{row.moved:.1%}",
+        )  # fmt: skip
+    console.print(rows)
+    console.print(
+        f"{found.starts} descents by L-BFGS-B from the same starts, each at the cost of {found.budget} episodes with "
+        f"gradient, which costs {found.gradient_cost:.2g} episodes without. Losses are those without a remedy.\n"
+        "better: share of the starts from which a descent gets farther than without; p is corrected for the number of "
+        "remedies. falls: share of the starts at which a step of 1 % of the box along the gradient lowers the loss. "
+        "moved: how far the lowest point moves, as a share of the box."
+    )
+    console.print(found.sentence)
+
+
+def _p(value: float) -> str:
+    return "< 0.001" if value < 0.001 else f"{value:.2f}"

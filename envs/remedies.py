@@ -1,0 +1,535 @@
+"""Remedies: an environment around another one, whose losses or gradients are easier to search.
+
+A remedy is smoothing, clipping, a shorter episode, softer contact, a mean over numerical replicas, or another scale of
+parameters. Every verb takes the result, and `--remedy smooth:2%,clip:1` on the command line applies one after another.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal, get_args
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from ..landscapes.episode import Episode
+from ..landscapes.identity import EPISODES_PER_POINT, REMEDY
+from ..landscapes.objective import Evaluation, Status
+from ..landscapes.plain import read_share
+from ..landscapes.space import LINEAR, LOG10, ParameterSpace, as_whole
+from .base import Environment
+from .registry import as_environment
+
+Estimator = Literal["first", "zeroth", "mixed"]
+ESTIMATORS: tuple[Estimator, ...] = get_args(Estimator)
+MIN_SUCCEEDED = 0.5  # share of the samples around a point that must succeed for a smoothed loss
+DECADE = 10.0  # upper over lower bound from which on a parameter may run on a logarithmic scale
+SENSITIVITY_POINTS = 64  # points at which `rescale` measures gradients
+
+
+class Remedy(ABC):
+    """Say how losses and gradients come from those of another environment; `cost` is the episodes of one point."""
+
+    cost: int = 1
+
+    @property
+    @abstractmethod
+    def text(self) -> str:
+        """How the command line spells it, such as smooth:0.02:mixed:16."""
+
+    @abstractmethod
+    def evaluate(self, env: Environment, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
+        """Return losses, and gradients if asked, at points of the space of `env`."""
+
+    def space_of(self, env: Environment) -> ParameterSpace:
+        """Return the parameters of the environment with the remedy."""
+        return env.space
+
+    def to_inner(self, env: Environment, x: Float[Tensor, "*batch dim"]) -> Float[Tensor, "*batch dim"]:
+        """Return the points of `env` that points with the remedy stand for."""
+        return x
+
+
+class RemediedEnvironment(Environment):
+    """An environment with a remedy.
+
+    It has the settings, the episodes and the events of the environment within, `inner`. Its losses and its gradients
+    are those of the remedy. One point takes `episodes_per_point` episodes.
+    """
+
+    def __init__(self, inner: Environment, remedy: Remedy, /) -> None:
+        self.inner, self.remedy, self.space = inner, remedy, remedy.space_of(inner)
+        vars(self).update({name: getattr(inner, name) for name in SHARED}, engines=(inner.engine,))
+        super().__init__(
+            fidelity=inner.fidelity,
+            device=inner.device,
+            engine=inner.engine,
+            deterministic=inner.deterministic,
+            **vars(inner.options),
+        )
+
+    @property
+    def episodes_per_point(self) -> int:  # type: ignore[override] # read only
+        """Number of episodes that the evaluation of one point takes."""
+        return self.remedy.cost * self.inner.episodes_per_point
+
+    def identity(self) -> dict[str, Any]:
+        """Return what decides the numbers: all of the environment within, and the remedies, the first one first."""
+        within = self.inner.identity()
+        remedies = ",".join(filter(None, (within.get(REMEDY, ""), self.remedy.text)))
+        return {**within, REMEDY: remedies, EPISODES_PER_POINT: self.episodes_per_point}
+
+    @property
+    def precision(self) -> str:
+        """float32 or float64: what losses are computed in."""
+        return self.inner.precision
+
+    @property
+    def packages(self) -> tuple[str, ...]:
+        """Packages that losses depend on, in addition to those that all depend on."""
+        return self.inner.packages
+
+    @property
+    def threads(self) -> int:  # type: ignore[override] # read only
+        """One: the environment within spreads its batches itself."""
+        return 1
+
+    @property
+    def preferred_batch(self) -> int:  # type: ignore[override] # read only
+        """Number of points worth evaluating at once."""
+        return max(1, self.inner.preferred_batch // self.remedy.cost)
+
+    def memory(self) -> int:
+        """Estimate the bytes that the evaluation of one point takes."""
+        return self.remedy.cost * self.inner.memory()
+
+    def about(self) -> str:  # type: ignore[override] # what there is to say is the other environment's
+        """Return what the environment within says of itself, and the remedy."""
+        return f"{self.inner.about()}\n\nWith the remedy {self.remedy.text}."
+
+    def episode(self, x: Float[Tensor, " dim"]) -> Episode:
+        """Return the frames of the episode at one point, without the remedy."""
+        return self.inner.episode(self.remedy.to_inner(self.inner, x))
+
+    def events(self, x: Float[Tensor, "batch dim"]) -> Mapping[str, Int[Tensor, " batch"]]:
+        """Count what happens in the episode at each point, without the remedy."""
+        return self.inner.events(self.remedy.to_inner(self.inner, x))
+
+    def noise(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, " batch"] | None:
+        """Return None: repeats have to tell how large the noise is that a remedy leaves."""
+        return None
+
+    def replicas(self) -> Mapping[str, Environment]:
+        """Return the replicas of the environment within, each with the remedy."""
+        return {name: RemediedEnvironment(one, self.remedy) for name, one in self.inner.replicas().items()}
+
+    def with_horizon(self, horizon: float) -> Environment:
+        """Return this environment with episodes of another length."""
+        return RemediedEnvironment(self.inner.with_horizon(horizon), self.remedy)
+
+    def plain_point(self, x: Float[Tensor, "*batch dim"]) -> Float[Tensor, "*batch dim"]:
+        """Return the points of the environment within its remedies that points stand for."""
+        return self.inner.plain_point(self.remedy.to_inner(self.inner, x))
+
+    def without(self) -> Environment:
+        """Return the environment within its remedies."""
+        return self.inner.without()
+
+    def _remake(self, **settings: Any) -> Environment:
+        return RemediedEnvironment(self.inner.remake(**settings), self.remedy)
+
+    def _setup(self) -> None:
+        if self._max_rows < type(self)._max_rows:  # a batch took too much memory
+            self.inner.shrink(max(1, self._max_rows * self.remedy.cost))
+        self._capacity = self._max_rows
+
+    def _prepare(self) -> None:
+        self.inner.prepare()
+
+    def _simulate(self, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
+        return self.remedy.evaluate(self.inner, x, grad=grad)
+
+    def _evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
+        raise NotImplementedError  # `_simulate` takes points, which no scale has turned into values
+
+
+SHARED = [  # what an environment with a remedy has of the one within
+    *("name", "loss_unit", "beyond_box", "decisions", "own_programs", "fidelities", "Options", "presets", "devices"),
+    *("horizon_option", "control_step", "contact_stiffness", "material_range", "model_version", "examples"),
+]
+
+
+# ---- Smoothing: the mean loss under a Gaussian around each point.
+
+
+@dataclass(frozen=True)
+class Smooth(Remedy):
+    """Average the loss over a Gaussian around each point, reflected at the bounds.
+
+    L(x) = E f(x + s w), w ~ N(0, I), with `width` s as a share of every side of the box. The mean is over `samples` / 2
+    pairs of w and -w, drawn once by `seed`: losses at all points are of the same w, so that they are as smooth as the
+    mean and exactly repeatable.
+    """
+
+    width: float
+    estimator: Estimator = "mixed"
+    samples: int = 16
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if not 0 < self.width <= 1:
+            raise ValueError(f"smooth takes a width above 0 and up to 100 % of the box; got {self.width:g}")
+        if self.estimator not in ESTIMATORS:
+            raise ValueError(f"smooth estimates by {', '.join(ESTIMATORS)}; got {self.estimator!r}")
+        if as_whole(self.samples, "samples of smooth", least=2) % 2 or (self.samples < 6 and self.estimator == "mixed"):
+            raise ValueError(f"smooth takes an even number of samples, from 6 where it is mixed; got {self.samples}")
+
+    @property
+    def cost(self) -> int:  # type: ignore[override] # read only
+        """The samples of a point."""
+        return self.samples
+
+    @property
+    def text(self) -> str:
+        """How the command line spells it."""
+        seed = f":{self.seed}" if self.seed else ""
+        return f"smooth:{self.width:g}:{self.estimator}:{self.samples}{seed}"
+
+    def evaluate(self, env: Environment, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
+        """Return mean losses, and estimates of their gradients if asked."""
+        w, space = self._directions(space_dim := env.space.dim), env.space
+        moved = space.to_unit(x)[:, None, None] + self.width * torch.stack([w, -w])  # batch, sign, pair, dim
+        places, signs = reflect(moved)
+        sloped = grad and self.estimator != "zeroth"
+        found = env.evaluate(space.from_unit(places).reshape(-1, space_dim), grad=sloped)
+        shape = moved.shape[:-1]
+        loss, status = found.loss.double().reshape(shape), found.status.reshape(shape)
+        known = (status == Status.OK).all(dim=1)  # of pairs
+        if not sloped:
+            known |= (status == Status.NO_GRADIENT).all(dim=1)
+        mean, verdict = _mean_of_pairs(loss.mean(dim=1), known), _joint_status(status, known)
+        if not grad:
+            return Evaluation.from_results(mean, None, verdict, found.error)
+        half = (loss[:, 0] - loss[:, 1]) / (2 * self.width)
+        first = None
+        if found.grad is not None:
+            sides = space.upper - space.lower
+            first = (found.grad.double().reshape(moved.shape) * sides * signs).mean(dim=1)
+        slope = self._estimate(half, first, w, known) / (space.upper - space.lower)
+        return Evaluation.from_results(mean, slope, verdict, found.error)
+
+    def _directions(self, dim: int) -> Float[Tensor, "pair dim"]:
+        generator = torch.Generator().manual_seed(self.seed)
+        return torch.randn(self.samples // 2, dim, generator=generator, dtype=torch.float64)
+
+    def _estimate(
+        self,
+        half: Float[Tensor, "batch pair"],
+        first: Float[Tensor, "batch pair dim"] | None,
+        w: Float[Tensor, "pair dim"],
+        known: Tensor,
+    ) -> Float[Tensor, "batch dim"]:
+        """Return gradients per side of the box, from halved differences and gradients of the pairs that are known."""
+        half = torch.where(known, half, 0.0)
+        if first is None:
+            return _mean_of_pairs(half[..., None] * w, known)
+        first = torch.where(known[..., None], first, 0.0)
+        if self.estimator == "first":
+            return _mean_of_pairs(first, known)
+        return _mean_of_pairs(mix_orders(half, first, w, known), known)
+
+
+def smooth(
+    f: Any, width: float, *, estimator: Estimator = "mixed", samples: int = 16, seed: int = 0
+) -> RemediedEnvironment:
+    """Return an environment whose loss is averaged over a Gaussian around each point.
+
+    `width` is its standard deviation as a share of every side of the box. Gradients are estimated in one of three ways:
+
+    - "first": the mean of gradients. It has little variance where the loss is smooth, and is biased where it jumps.
+    - "zeroth": the mean of (f(x + s w) - f(x - s w)) w / (2 s). It is unbiased, and its variance grows with the number
+      of parameters.
+    - "mixed": zeroth order with the first order of the other pairs as a control variate. It is unbiased everywhere.
+
+    Source: Suh et al. 2022, "Do differentiable simulators give better policy gradients?". They mix by weights that
+    depend on a bound of the bias; here no bias has to be known, as the control variate has the same mean.
+
+    Raises ValueError for a width, an estimator or a number of samples that there is not.
+    """
+    return RemediedEnvironment(as_environment(f), Smooth(width, estimator, samples, seed))
+
+
+def reflect(u: Float[Tensor, "*batch dim"]) -> tuple[Float[Tensor, "*batch dim"], Float[Tensor, "*batch dim"]]:
+    """Return points of the unit cube that points beyond it are mirrored to, and the sign of that map's derivative."""
+    folded = torch.remainder(u, 2.0)
+    return 1 - (1 - folded).abs(), torch.where(folded <= 1, 1.0, -1.0)
+
+
+def mix_orders(
+    half: Float[Tensor, "batch pair"],
+    first: Float[Tensor, "batch pair dim"],
+    w: Float[Tensor, "pair dim"],
+    known: Tensor,
+) -> Float[Tensor, "batch pair dim"]:
+    """Return each pair's gradient estimate: zeroth order, with first order of the other pairs as a control variate.
+
+    With g the mean first-order gradient of the other pairs, (half - c g.w) w + c g has the mean of half w whatever g
+    and c are, as both are independent of w. `c`, from 0 to 1, is the slope of half over g.w among the other pairs: near
+    1 where gradients explain the differences of losses, near 0 where they do not.
+    """
+    count = known.sum(dim=1, keepdim=True).double()
+    others = (count - 1).clamp(min=1)[..., None]
+    g = (first.sum(dim=1, keepdim=True) - first) / others
+    along = torch.einsum("bkd,jd->bkj", g, w)  # of pair j, by the gradient that leaves out pair k
+    apart = known[:, None, :] & ~torch.eye(len(w), dtype=torch.bool)
+    along_others = torch.where(apart, along, 0.0)
+    size = along_others.square().sum(dim=2)
+    c = torch.where(size > 0, (along_others * half[:, None, :]).sum(dim=2) / size.clamp(min=torch.finfo().tiny), 0.0)
+    g = c.clamp(0, 1)[..., None] * g
+    mixed: Tensor = (half - (g * w).sum(dim=-1))[..., None] * w + g
+    return mixed
+
+
+def _mean_of_pairs(values: Tensor, known: Tensor) -> Tensor:
+    """Return means over the pairs that are known, NaN where none is."""
+    seen = known.reshape(*known.shape, *[1] * (values.ndim - known.ndim))
+    mean: Tensor = torch.where(seen, values, 0.0).sum(dim=1) / seen.sum(dim=1)
+    return mean
+
+
+def _joint_status(status: Int[Tensor, "batch part pair"], known: Tensor) -> Int[Tensor, " batch"]:
+    """Return OK where enough pairs are known, else how the first of the others ended."""
+    rows = status.movedim(1, -1).flatten(1)
+    bad = torch.where(rows == Status.OK, 0, rows)
+    first = bad.gather(1, (bad > 0).to(torch.int8).argmax(dim=1, keepdim=True))[:, 0]
+    enough = known.double().mean(dim=1) >= MIN_SUCCEEDED
+    return torch.where(enough, int(Status.OK), first.long()).to(torch.int8)
+
+
+# ---- Clipping, averaging over replicas, other scales of parameters: each one formula.
+
+
+@dataclass(frozen=True)
+class Clip(Remedy):
+    """Shorten gradients that are longer than `norm` [loss unit per side of the box]; losses stay as they are."""
+
+    norm: float
+
+    def __post_init__(self) -> None:
+        if not 0 < self.norm < torch.inf:
+            raise ValueError(f"clip takes a norm above 0 [loss unit per side of the box]; got {self.norm:g}")
+
+    @property
+    def text(self) -> str:
+        """How the command line spells it."""
+        return f"clip:{self.norm:g}"
+
+    def evaluate(self, env: Environment, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
+        """Return losses, and shortened gradients if asked."""
+        found = env.evaluate(x, grad=grad)
+        if found.grad is None:
+            return found
+        size = (found.grad * (env.space.upper - env.space.lower)).norm(dim=1, keepdim=True)
+        return replace(found, grad=found.grad * (self.norm / size).clamp(max=1.0))
+
+
+def clip(f: Any, norm: float) -> RemediedEnvironment:
+    """Return an environment whose gradients are shortened to at most `norm` [loss unit per side of the box].
+
+    Directions and losses stay as they are. Source: Pascanu et al. 2013, "On the difficulty of training recurrent neural
+    networks". Raises ValueError for a norm that is not positive.
+    """
+    return RemediedEnvironment(as_environment(f), Clip(norm))
+
+
+@dataclass(frozen=True)
+class Average(Remedy):
+    """Average losses and gradients over an environment and its numerical replicas, by their `names`, by default all."""
+
+    replicas: tuple[Environment, ...]
+    names: tuple[str, ...] = ()
+
+    @property
+    def cost(self) -> int:  # type: ignore[override] # read only
+        """The environment and its replicas."""
+        return 1 + len(self.replicas)
+
+    @property
+    def text(self) -> str:
+        """How the command line spells it."""
+        return ":".join(["average", *self.names])
+
+    def evaluate(self, env: Environment, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
+        """Return mean losses and gradients; a point fails where one of them does."""
+        found = [one.evaluate(x, grad=grad) for one in (env, *self.replicas)]
+        status = torch.stack([one.status for one in found]).amax(dim=0)
+        loss = torch.stack([one.loss for one in found]).mean(dim=0)
+        slopes = [one.grad for one in found if one.grad is not None]
+        error = next((one.error for one in found if one.error), "")
+        return Evaluation.from_results(loss, torch.stack(slopes).mean(dim=0) if slopes else None, status, error)
+
+
+def average(f: Any, replicas: Sequence[str] = ()) -> RemediedEnvironment:
+    """Return an environment whose losses and gradients are means over its numerical replicas and itself.
+
+    `replicas` names some of those that `f.replicas()` offers, by default all. What depends on the discretisation alone
+    shrinks, as ripples of a grid do. Raises ValueError where there are no such replicas.
+    """
+    env = as_environment(f)
+    offered = env.replicas()
+    if not offered or set(replicas) - set(offered):
+        raise ValueError(
+            f"{env.name} has {'the replicas ' + ', '.join(offered) if offered else 'no replicas to average over'}"
+            + (f"; got {', '.join(replicas)}" if replicas else "")
+        )
+    names = tuple(replicas)
+    return RemediedEnvironment(env, Average(tuple(offered[name] for name in names or offered), names))
+
+
+@dataclass(frozen=True)
+class Rescale(Remedy):
+    """Let parameters run from bound to bound by other `scales`, linear or log10."""
+
+    scales: tuple[str, ...]
+
+    @property
+    def text(self) -> str:
+        """How the command line spells it."""
+        return ":".join(["rescale", *self.scales])
+
+    def space_of(self, env: Environment) -> ParameterSpace:
+        """Return the same parameters and bounds on the other scales."""
+        space = env.space
+        lower, upper = space.to_values(space.lower), space.to_values(space.upper)
+        return ParameterSpace(space.names, lower, upper, space.units, self.scales)
+
+    def to_inner(self, env: Environment, x: Float[Tensor, "*batch dim"]) -> Float[Tensor, "*batch dim"]:
+        """Return points of the environment within, of the same values."""
+        inside: Tensor = env.space.from_values(self.space_of(env).to_values(x))
+        return torch.clamp(inside, env.space.lower, env.space.upper)
+
+    def evaluate(self, env: Environment, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
+        """Return losses, and gradients by the rescaled parameters if asked."""
+        space = self.space_of(env)
+        values = space.to_values(x)
+        found = env.evaluate(self.to_inner(env, x), grad=grad)
+        if found.grad is None:
+            return found
+        ones = torch.ones_like(values)
+        return replace(found, grad=found.grad * space.chain(values, ones) / env.space.chain(values, ones))
+
+
+def rescale(f: Any, scales: Sequence[str] = ()) -> RemediedEnvironment:
+    """Return an environment whose parameters run on the scales, linear or log10, on which its sensitivity is more even.
+
+    Every verb works in shares of the box, so that a constant factor per parameter changes nothing. What matters is how
+    evenly the loss changes from bound to bound. Without `scales`, one for each parameter, gradients at 64 points decide
+    for each parameter whose bounds are positive and a decade or more apart: the scale on which |dL/dx| varies less.
+
+    Raises ValueError for scales that there are not, and where the environment has no gradients to decide by.
+    """
+    env = as_environment(f)
+    chosen = tuple(scales) or _even_scales(env)
+    if len(chosen) != env.space.dim:
+        raise ValueError(f"rescale takes {env.space.dim} scales, one for each parameter; got {len(chosen)}")
+    return RemediedEnvironment(env, Rescale(chosen))
+
+
+def _even_scales(env: Environment) -> tuple[str, ...]:
+    space, points = env.space, env.space.sobol(SENSITIVITY_POINTS, seed=0)
+    found, values = env.evaluate(points, grad=True), env.space.to_values(points)
+    assert found.grad is not None  # as it was asked for
+    by_value = found.grad / space.chain(values, torch.ones_like(values))
+    spreads = {LINEAR: _variation(by_value), LOG10: _variation(by_value * values)}
+    lower, upper = space.to_values(space.lower), space.to_values(space.upper)
+    apart = (lower > 0) & (upper >= DECADE * lower)
+    better = torch.where(apart, spreads[LOG10] < spreads[LINEAR], False)
+    return tuple(LOG10 if one else LINEAR for one in better.tolist())
+
+
+def _variation(slopes: Float[Tensor, "point dim"]) -> Float[Tensor, " dim"]:
+    """Return the coefficient of variation of each parameter's |slope|, infinite where all are zero."""
+    known = slopes[slopes.isfinite().all(dim=1)].abs()
+    mean = known.mean(dim=0)
+    return torch.where(mean > 0, known.std(dim=0) / mean, torch.inf)
+
+
+# ---- Settings of the scene itself.
+
+
+def shorten(f: Any, share: float) -> Environment:
+    """Return an environment whose episodes are `share` as long.
+
+    Gradients of long episodes may explode (Xu et al. 2022, "Accelerated policy learning with parallel differentiable
+    simulation"). The loss is that of the shorter episode. Raises ValueError where the environment has no horizon.
+    """
+    env = as_environment(f)
+    if not 0 < share < 1:
+        raise ValueError(f"shorten takes a share of the episode between 0 and 1; got {share:g}")
+    if env.horizon is None:
+        raise ValueError(f"{env.name} has no setting that says how long an episode is; name one as horizon")
+    return env.with_horizon(env.horizon * share)
+
+
+def soften(f: Any, share: float | None = None, **settings: Any) -> Environment:
+    """Return an environment with softer settings: its contact stiffness times `share`, or settings by name.
+
+    The names are those of its options, `fidelity` and `engine` included, such as friction=0.1. Raises ValueError where
+    the environment has no contact stiffness, and for a setting that it does not have.
+    """
+    env = as_environment(f)
+    if share is not None:
+        if not env.contact_stiffness:
+            raise ValueError(
+                f"{env.name} has no contact stiffness to soften; name one of its options: "
+                f"{', '.join(vars(env.options)) or 'it has none'}"
+            )
+        settings[env.contact_stiffness] = vars(env.options)[env.contact_stiffness] * share
+    if not settings:
+        raise ValueError("soften takes a share of the contact stiffness, or settings by name; got neither")
+    return env.remake(**settings)
+
+
+# ---- Remedies as the command line spells them.
+
+
+def _read_smooth(f: Environment, width: str, estimator: str = "mixed", samples: str = "16", seed: str = "0") -> Any:
+    kind: Any = estimator
+    return smooth(f, read_share(width), estimator=kind, samples=int(samples), seed=int(seed))
+
+
+READERS: dict[str, Callable[..., Environment]] = {
+    "smooth": _read_smooth,
+    "clip": lambda f, norm: clip(f, float(norm)),
+    "average": lambda f, *names: average(f, names),
+    "rescale": lambda f, *scales: rescale(f, scales),
+    "shorten": lambda f, share: shorten(f, read_share(share)),
+    "soften": lambda f, share: soften(f, read_share(share)),
+}
+FORMS = {
+    "smooth": "smooth:WIDTH[:first|zeroth|mixed[:SAMPLES]]",
+    "clip": "clip:NORM",
+    "average": "average[:REPLICA...]",
+    "rescale": "rescale[:SCALE...]",
+    "shorten": "shorten:SHARE",
+    "soften": "soften:SHARE",
+}
+
+
+def remedied(env: Environment, text: str) -> Environment:
+    """Return an environment with the remedies that a text names, the first one first, such as smooth:2%,clip:1.
+
+    Raises ValueError for a remedy that there is not, or that the environment cannot take.
+    """
+    for part in filter(None, (part.strip() for part in text.split(","))):
+        name, *values = part.split(":")
+        if name not in READERS:
+            raise ValueError(f"there is no remedy {name!r}; there are {', '.join(FORMS.values())}")
+        try:
+            env = READERS[name](env, *values)
+        except TypeError as error:
+            raise ValueError(f"a remedy is spelt {FORMS[name]}; got {part!r}") from error
+    return env
