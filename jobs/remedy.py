@@ -114,8 +114,9 @@ class RemedyJob(CheckpointedJob[RemedyStudy]):
 
     def write(self, found: RemedyStudy) -> list[str]:
         """Draw and write the study, the losses on the plane in a file of their own."""
+        maps: dict[str, Any] = {f"map_{number}": one for number, one in enumerate(found.maps.values())}
         with replacing(self.folder / MAPS) as partial, partial.open("wb") as file:
-            np.savez_compressed(file, **{f"map_{number}": one for number, one in enumerate(found.maps.values())})
+            np.savez_compressed(file, **maps)
         return super().write(found)
 
     def outcome(self, found: RemedyStudy) -> str:

@@ -184,8 +184,8 @@ def check_identity(
     differ = differing_settings(wanted, found)
     if differ.keys() == {MODEL_VERSION} and MODEL_VERSION in wanted and MODEL_VERSION in found:
         name, theirs, ours = wanted.get("objective", "its"), found[MODEL_VERSION], wanted[MODEL_VERSION]
-        said = f"the {what} in {path or 'memory'} was made by {name} model {theirs}; this is model {ours}."
-        raise StoreMismatchError(f"{said} Use --out, or --force to replace it.")
+        made = f"the {what} in {path or 'memory'} was made by {name} model {theirs}; this is model {ours}."
+        raise StoreMismatchError(f"{made} Use --out, or --force to replace it.")
     said = [f"{name}: wanted {ours}, found {theirs}" for name, (ours, theirs) in differ.items()][:LISTED_SETTINGS]
     if len(differ) > LISTED_SETTINGS:
         said.append(f"and {len(differ) - LISTED_SETTINGS} more")

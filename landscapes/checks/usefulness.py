@@ -86,7 +86,7 @@ def _cosine(a: NDArray[np.float64], d: NDArray[np.float64]) -> Estimate:
     if len(a) < 2 or not (a.any() and d.any()):
         return UNKNOWN
     return _resampled(
-        lambda a, d: float(a @ d) / size if (size := np.linalg.norm(a) * np.linalg.norm(d)) else np.nan, a, d
+        lambda a, d: float(a @ d / size) if (size := np.linalg.norm(a) * np.linalg.norm(d)) else np.nan, a, d
     )
 
 
@@ -128,4 +128,4 @@ def _lacking(mean: NDArray[np.float64], wanted: NDArray[np.float64]) -> Estimate
     mean, wanted = mean[known], wanted[known]
     if len(mean) < MEANS or not wanted.any():
         return UNKNOWN
-    return _resampled(lambda mean, wanted: 1 - (mean @ wanted) / (wanted @ wanted), mean, wanted)
+    return _resampled(lambda mean, wanted: float(1 - (mean @ wanted) / (wanted @ wanted)), mean, wanted)
