@@ -409,25 +409,18 @@ def make(
     engine: str | None = None,
     deterministic: bool = False,
     preset: str | None = None,
-    remedy: str | None = None,
     **options: Any,
 ) -> Environment:
     """Make an environment with settings, of a registered name, FILE.py:NAME, a class, an environment or one's object.
 
     `fidelity` defaults to the cheapest, `engine` to the first, and both, like options, to those of an environment that
     is given; `device` is auto, cpu or cuda. `preset` names options that are set together; those that are given win.
-    `remedy` is what is done about its landscape, such as "smooth:2%,clip:1" (`envs.remedies`).
     Raises ValueError where the environment does not exist, or has no such fidelity, device, engine, preset or option,
     or where the engine does not give the same bits every time and they are to be `deterministic`.
     """
     found = find_environment(what)
     if preset is not None:
         options = {**found.preset_options(preset), **options}
-    if remedy:
-        from .remedies import remedied
-
-        plain = make(found, fidelity=fidelity, device=device, engine=engine, deterministic=deterministic, **options)
-        return remedied(plain, remedy)
     if isinstance(found, type):
         return found(fidelity=fidelity, device=device, engine=engine, deterministic=deterministic, **options)
     if not (fidelity or engine or deterministic or options) and device in ("auto", found.device):

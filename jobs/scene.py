@@ -83,10 +83,20 @@ class SceneSpec:
     def make(self, watch: Watch | None = None, **changes: Any) -> Environment:
         """Make the environment; `changes` are other options. Raises ValueError for what the scene does not have."""
         spec = self.resolve(watch or Watch())
-        return make(
+        made = make(
             spec.name, fidelity=spec.fidelity, device=spec.device, engine=spec.engine,
-            deterministic=spec.deterministic, remedy=spec.remedy, **{**spec.options, **changes},
+            deterministic=spec.deterministic, **{**spec.options, **changes},
         )  # fmt: skip
+        return with_remedy(made, spec.remedy)
+
+
+def with_remedy(env: Environment, remedy: str | None) -> Environment:
+    """Return an environment with remedies (smooth:2%,clip:1), itself without. Raises ValueError for what is none."""
+    if not remedy:
+        return env
+    from ..envs.remedies import remedied
+
+    return remedied(env, remedy)
 
 
 def provenance(objective: Objective, command: str) -> dict[str, Any]:
@@ -144,10 +154,11 @@ def environment_of(dataset: xr.Dataset, device: str, env: Any = None) -> Environ
             f"{name} is not registered here, and evaluating it again needs it: say where it is, --env FILE.py:NAME, or "
             "env= in Python"
         ) from error
-    return make(
+    made = make(
         found, fidelity=Fidelity(**identity["settings"]), device=device, engine=identity["engine"],
-        deterministic=identity["deterministic"], remedy=identity.get(REMEDY), **identity["options"],
+        deterministic=identity["deterministic"], **identity["options"],
     )  # fmt: skip
+    return with_remedy(made, identity.get(REMEDY))
 
 
 def point_of(env: Environment, text: str) -> Tensor:

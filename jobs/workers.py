@@ -23,6 +23,7 @@ from ..envs.registry import make, source_of
 from ..landscapes.draw.loopback import LOOPBACK
 from ..landscapes.identity import REMEDY
 from ..landscapes.plain import printable
+from .scene import with_remedy
 
 if TYPE_CHECKING:
     from ..envs.base import Environment
@@ -123,12 +124,14 @@ def recipe(objective: Objective) -> partial[Environment] | None:
         return None
     env = objective
     how = {"fidelity": env.fidelity, "device": env.device, "engine": env.engine, "deterministic": env.deterministic}
-    how["remedy"] = env.identity().get(REMEDY)
-    return partial(_make_checked, source_of(env), env.version_on(env.engine), how | asdict(env.options))
+    remedy = env.identity().get(REMEDY)
+    return partial(_make_checked, source_of(env), env.version_on(env.engine), how | asdict(env.options), remedy)
 
 
-def _make_checked(source: str | type[Environment] | Environment, model: int, settings: dict[str, Any]) -> Environment:
-    env = make(source, **settings)
+def _make_checked(
+    source: str | type[Environment] | Environment, model: int, settings: dict[str, Any], remedy: str | None
+) -> Environment:
+    env = with_remedy(make(source, **settings), remedy)
     if (theirs := env.version_on(env.engine)) != model:
         raise ValueError(
             f"worker {platform.node()} has {env.name} model {theirs}; here it is model {model}: install the same "

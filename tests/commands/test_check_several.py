@@ -106,8 +106,14 @@ def test_one_environment_is_shown_as_ever_and_may_write_the_xml_too(here: Path, 
 
 def test_what_no_scene_has_is_refused_before_any_is_checked(here: Path, run: Run) -> None:
     run.refuse("check branin nothing --power 20%", said="nothing")
-    run.refuse("check branin several.py:nothing --power 20%", cwd=here, said="holds no nothing")
     run.refuse("check branin --jobs 0", said="jobs")
+
+
+def test_a_name_that_a_file_does_not_have_is_said_in_its_line(here: Path, run: Run) -> None:
+    done = run("check branin several.py:nothing --power 20%", cwd=here)
+    assert done.returncode == 1
+    assert "holds no nothing" in done.stdout
+    assert "1 of 2 pass" in done.stdout
 
 
 def test_all_are_planned(here: Path, run: Run) -> None:

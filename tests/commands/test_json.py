@@ -20,7 +20,7 @@ gallery list .
 """.strip().splitlines()
 ELSEWHERE = {  # whose JSON other tests read
     *("bench", "bounce", "card", "census", "check", "compare", "gallery compute", "hessian", "league", "optimize"),
-    *("overlay", "pairs", "race", "replay", "report", "slice", "study", "surface", "sweep"),
+    *("overlay", "pairs", "race", "remedy", "replay", "report", "slice", "study", "surface", "sweep"),
 }
 
 

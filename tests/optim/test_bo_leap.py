@@ -11,6 +11,7 @@ from gradscape.optim.methods.bo_leap import BOLeap, BOLeapOptions, SemiLocal
 from gradscape.optim.search import search
 
 SPACE = ParameterSpace.box(("x", "y", "z"), -2.0, 4.0, "m")
+BRANIN = 10 / (8 * math.pi)  # its least loss: where the square and the cosine are as low as they get
 RIPPLES = from_torch(lambda x: ((x - 0.5) ** 2).sum(dim=1) + (4 * x).cos().sum(dim=1), SPACE)
 
 
@@ -18,7 +19,7 @@ RIPPLES = from_torch(lambda x: ((x - 0.5) ** 2).sum(dim=1) + (4 * x).cos().sum(d
 def test_branins_minimum_is_reached_to_a_thousandth_within_300_evaluations():
     branin = make("branin")
     runs = [search(branin, BOLeap(branin.space, seed=seed), budget=300, gradient_cost=2.0) for seed in range(5)]
-    reached = [run.best_loss - branin.minimum < 1e-3 for run in runs]
+    reached = [run.best_loss - BRANIN < 1e-3 for run in runs]
     assert sum(reached) >= 4
     assert all(run.count == 300 for run in runs)
 
