@@ -147,7 +147,8 @@ def race(
     from ..optim.registry import check_methods
     from ..optim.registry import methods as registered
 
-    processes, call = _processes(workers, scheduler), current()
+    _check_workers(workers, scheduler)
+    call = current()
     chosen = check_methods(as_names(methods))
     options = as_method_settings(method_options, chosen or list(registered()))
     env = environment(scene, keywords)
@@ -156,7 +157,7 @@ def race(
     from ..jobs.workers import workers as cluster
 
     job = RaceJob.of(
-        env, chosen, budget=budget, seeds=seeds, command=call.command, options=options, workers=processes,
+        env, chosen, budget=budget, seeds=seeds, command=call.command, options=options, workers=_processes(workers),
         best_known=best_known, claims=read_paper().claims_about(env.name), out=as_path(out), force=force,
         prints=as_widths(figure_width_mm), watch=call.watch,
     )  # fmt: skip
@@ -198,7 +199,8 @@ def league(
     """
     from ..optim.registry import check_methods
 
-    processes, call, named = _processes(workers, scheduler), current(), as_names(methods)
+    _check_workers(workers, scheduler)
+    call, named = current(), as_names(methods)
     check_methods(named)
     given = list(scenes) if isinstance(scenes, list | tuple) else [scenes]
     specs = [_league_spec(one, keywords) for one in given]
@@ -213,7 +215,7 @@ def league(
     )  # fmt: skip
     claims = {scene.name: read_paper().claims_about(scene.name) for scene in job.scenes}
     with cluster(scheduler, keywords.get("device", "auto")) as executor:
-        return replace(job, claims=claims, workers=processes, executor=executor).run(call.watch)
+        return replace(job, claims=claims, workers=_processes(workers), executor=executor).run(call.watch)
 
 
 def open_run(path: str | Path) -> Run:
@@ -236,15 +238,16 @@ def _league_spec(scene: Any, keywords: SceneKeywords) -> SceneSpec:
     return spec_of(spec.name, {**keywords, **({"fidelity": spec.fidelity} if spec.fidelity else {})})
 
 
-def _processes(workers: int | None, scheduler: str | None) -> int:
-    """Return how many processes fit models: by default one per core of the command, which starts no script again.
-
-    Raises ValueError for workers and a scheduler, and for less than one worker.
-    """
+def _check_workers(workers: int | None, scheduler: str | None) -> None:
+    """Raise ValueError for workers and a scheduler, and for less than one worker."""
     if workers and scheduler:
         raise ValueError(f"--scheduler has workers of its own, so --workers is left out; got {workers}")
     if workers is not None and workers < 1:
         raise ValueError(f"a number of workers is a whole number of at least 1; got {workers}")
+
+
+def _processes(workers: int | None) -> int:
+    """Return how many processes fit models: by default one per core of the command, which starts no script again."""
     if workers is not None or not current().on_disk:
         return workers or 1
     from ..envs.engines.runtime import cores

@@ -75,6 +75,7 @@ class RemedyJob(CheckpointedJob[RemedyStudy]):
         for text in remedies:
             remedied(env, text)
         require("starts", starts, lambda count: Need(64.0 * env.space.dim * count))
+        require("budget", budget, lambda count: Need(24.0 * env.space.dim * starts * count))
         plane = tuple(map(env.space.index, dims)) or tuple(range(min(2, env.space.dim)))
         identity = {
             **env.identity(), "remedies": list(remedies), "starts": starts, "budget": budget, "seed": seed,

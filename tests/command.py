@@ -44,6 +44,7 @@ study extremes bounce --set horizon=0.05 --points 4 --settings dt --precisions f
 pairs bounce --samples 2 --fidelity draft --device cpu
 report cut --points-per-axis 2 --device cpu
 hessian branin --device cpu
+remedy branin --starts 6 --budget 16 --remedies clip:9 --device cpu
 census branin --slices 1 --resolution 6
 card --scene control --resolution 3
 gallery compute --only bounce-y --part slices --resolution 4 --fidelity draft --device cpu --data data

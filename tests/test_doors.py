@@ -146,6 +146,7 @@ def commands(f: str, name: str) -> dict[str, str]:
 
 
 OTHER_FUNCTIONS = {"bench", "bounce", "card", "list_envs", "log", "register", "slices"}  # of no simulator that is given
+OTHER_FUNCTIONS |= {"average", "clip", "rescale", "shorten", "smooth", "soften"}  # which test_remedies.py tries
 OTHER_VERBS = {"bench", "bounce", "card", "info", "methods", "view"}  # so are these; bench times, which takes long
 
 

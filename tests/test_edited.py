@@ -243,7 +243,7 @@ def test_the_same_call_after_an_edit_is_refused(tmp_path: Path, monkeypatch: pyt
 
 
 def overlaid(out: Path, again: bool) -> Any:
-    cut = gs.open_slice(out / "cut") if again else gs.slice(Throw, DIMS, resolution=6, out=out / "cut")
+    cut = gs.open_slice(out / "cut", env=Throw) if again else gs.slice(Throw, DIMS, resolution=6, out=out / "cut")
     run = gs.open_run(out / "run") if again else gs.optimize(Throw, "random", budget=4, out=out / "run")
     return gs.overlay(cut, run, through="best", out=out / ("again" if again else "over"))
 

@@ -61,7 +61,6 @@ def packages(loaded: set[str]) -> set[str]:
 REFUSED = (
     *(
         "slice nosuch --dims 0 1",
-        "check own.py:Bowls",
         "check missing.py:Bowl",
         "replay nosuch",
         "study fidelity nosuch",
