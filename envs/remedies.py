@@ -427,7 +427,7 @@ def rescale(f: Any, scales: Sequence[str] = ()) -> RemediedEnvironment:
 
     Every verb works in shares of the box, so that a constant factor per parameter changes nothing. What matters is how
     evenly the loss changes from bound to bound. Without `scales`, one for each parameter, gradients at 64 points decide
-    for each parameter whose bounds are positive and a decade or more apart: the scale on which the size of dL/dx varies less.
+    for each parameter whose bounds are positive and a decade or more apart: the scale on which slopes vary less.
 
     Raises ValueError for scales that there are not, and where the environment has no gradients to decide by.
     """
