@@ -408,6 +408,11 @@ class Environment(Objective):
         """Return the points of the environment within its remedies that points stand for."""
         return x
 
+    @property
+    def gradients_from_losses(self) -> bool:
+        """Whether a gradient takes losses alone, so that it costs no more than they do."""
+        return False
+
     def without(self) -> Environment:
         """Return the environment within its remedies, itself where it has none."""
         return self

@@ -34,6 +34,7 @@ class Remedy(ABC):
     """Say how losses and gradients come from those of another environment; `cost` is the episodes of one point."""
 
     cost: int = 1
+    from_losses: bool = False  # whether gradients are estimated from losses alone
 
     @property
     @abstractmethod
@@ -75,6 +76,11 @@ class RemediedEnvironment(Environment):
     def episodes_per_point(self) -> int:  # type: ignore[override] # read only
         """Number of episodes that the evaluation of one point takes."""
         return self.remedy.cost * self.inner.episodes_per_point
+
+    @property
+    def gradients_from_losses(self) -> bool:
+        """Whether a gradient takes losses alone, so that it costs no more than they do."""
+        return self.remedy.from_losses or self.inner.gradients_from_losses
 
     def identity(self) -> dict[str, Any]:
         """Return what decides the numbers: all of the environment within, and the remedies, the first one first."""
@@ -150,10 +156,10 @@ class RemediedEnvironment(Environment):
         self.inner.prepare()
 
     def _simulate(self, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
-        return self.remedy.evaluate(self.inner, x, grad=grad)
+        return self._evaluate(x, grad=grad)  # points as they are: `inner` turns them into values
 
     def _evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
-        raise NotImplementedError  # `_simulate` takes points, which no scale has turned into values
+        return self.remedy.evaluate(self.inner, x, grad=grad)
 
 
 SHARED = [  # what an environment with a remedy has of the one within
@@ -193,6 +199,11 @@ class Smooth(Remedy):
         return self.samples
 
     @property
+    def from_losses(self) -> bool:  # type: ignore[override] # read only
+        """Whether it is zeroth order."""
+        return self.estimator == "zeroth"
+
+    @property
     def text(self) -> str:
         """How the command line spells it."""
         seed = f":{self.seed}" if self.seed else ""
@@ -203,14 +214,13 @@ class Smooth(Remedy):
         w, space = self._directions(space_dim := env.space.dim), env.space
         moved = space.to_unit(x)[:, None, None] + self.width * torch.stack([w, -w])  # batch, sign, pair, dim
         places, signs = reflect(moved)
-        sloped = grad and self.estimator != "zeroth"
+        sloped = grad and not self.from_losses
         found = env.evaluate(space.from_unit(places).reshape(-1, space_dim), grad=sloped)
         shape = moved.shape[:-1]
         loss, status = found.loss.double().reshape(shape), found.status.reshape(shape)
         known = (status == Status.OK).all(dim=1)  # of pairs
-        if not sloped:
-            known |= (status == Status.NO_GRADIENT).all(dim=1)
-        mean, verdict = _mean_of_pairs(loss.mean(dim=1), known), _joint_status(status, known)
+        valued = ((status == Status.OK) | (status == Status.NO_GRADIENT)).all(dim=1)
+        mean, verdict = _mean_of_pairs(loss.mean(dim=1), valued), _joint_status(status, valued)
         if not grad:
             return Evaluation.from_results(mean, None, verdict, found.error)
         half = (loss[:, 0] - loss[:, 1]) / (2 * self.width)

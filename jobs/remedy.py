@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,20 +20,21 @@ from ..landscapes.measures.verdict import judge_samples
 from ..landscapes.sampling.fill import sample
 from ..landscapes.storage.checkpoint import Checkpoint
 from ..landscapes.storage.files import replacing
-from ..studies.remedies import WITHOUT, Ends, RemedyStudy, candidates, conclude, descend
-from .folder import REMEDY, ROOT, folder_named
+from ..studies.remedies import WITHOUT, Ends, RemedyStudy, candidates, conclude, descend, treat
+from .folder import REMEDY, folder_named
 from .job import CheckpointedJob
 from .plan import simulation_seconds
 from .scene import SceneSpec, plane_through, provenance
+from .search import points_within
 from .watch import PREPARING, Watch, Work
 
 if TYPE_CHECKING:
     from ..envs.base import Environment
     from ..landscapes.objective import Objective
 
-RECORD, MAPS, PICTURE = REMEDY.files
+MAPS = REMEDY.files[1]
 STARTS, BUDGET, RESOLUTION = 32, 320, 16
-TIMED = "gradient-cost"  # the part that says what a gradient costs, so that a study goes on with the same
+TIMED = "gradient-cost"  # the part with what a gradient costs: a continued study has the same
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,12 +61,11 @@ class RemedyJob(CheckpointedJob[RemedyStudy]):
         budget: int = BUDGET,
         seed: int = 0,
         out: Path | None = None,
-        root: Path = ROOT,
         force: bool = False,
         prints: Sequence[float] = (),
         command: str = "",
     ) -> RemedyJob:
-        """Continue the study in its folder, by default one named after it under `root`, or begin it there.
+        """Continue the study in its folder, by default one named after it, or begin it there.
 
         Without `remedies` it tries all that the scene can take. `dims` are the parameters of the plane that pictures
         and words are of, by default the first two. Raises ValueError for what the scene does not have, TooLargeError
@@ -73,7 +73,7 @@ class RemedyJob(CheckpointedJob[RemedyStudy]):
         """
         env = scene.make()
         for text in remedies:
-            remedied(env, text)
+            points_within(remedied(env, text), budget)
         require("starts", starts, lambda count: Need(64.0 * env.space.dim * count))
         require("budget", budget, lambda count: Need(24.0 * env.space.dim * starts * count))
         plane = tuple(map(env.space.index, dims)) or tuple(range(min(2, env.space.dim)))
@@ -81,26 +81,29 @@ class RemedyJob(CheckpointedJob[RemedyStudy]):
             **env.identity(), "remedies": list(remedies), "starts": starts, "budget": budget, "seed": seed,
             "dims": list(plane),
         }  # fmt: skip
-        folder = out or folder_named(["remedy", env.name, env.fidelity.name], identity, root)
+        folder = out or folder_named(["remedy", env.name, env.fidelity.name], identity)
         return cls(
             env=env, remedies=tuple(remedies), dims=plane, starts=starts, budget=budget, seed=seed, identity=identity,
             folder=folder, checkpoint=Checkpoint.open(folder, identity, what="study of remedies", force=force),
             prints=prints, command=command,
         )  # fmt: skip
 
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """The rows: without a remedy, and with each."""
+        return WITHOUT, *(self.remedies or candidates(self.env))
+
     def work(self) -> list[Work]:
         """Return the most that each remedy takes: its descents, and the samples of the plane."""
-        many = 1 + (len(self.remedies) or len(candidates(self.env)))
-        return [Work(self.env, 0, many * (self.starts * self.budget + RESOLUTION ** len(self.dims) * 16))]
+        return [Work(self.env, 0, len(self.names) * (self.starts * self.budget + RESOLUTION ** len(self.dims) * 16))]
 
     def compute(self, watch: Watch) -> RemedyStudy:
         """Try the remedies that are missing, and return what all of them did."""
-        names = [WITHOUT, *(self.remedies or candidates(self.env))]
         cost = float(self.checkpoint.load_or_compute(TIMED, lambda: {"ratio": episode_cost(self.env).ratio})["ratio"])
-        self._announce(watch, len(names))
+        self._announce(watch)
         lowest: Tensor | None = None
         ends, maps = list[tuple[str, Ends, tuple[str, ...]]](), dict[str, NDArray[np.float64]]()
-        for number, name in enumerate(names):
+        for number, name in enumerate(self.names):
             part = self.checkpoint.load_or_compute(f"remedy-{number}", partial(self._try, name, cost, lowest, watch))
             ends.append((name, _ends_of(part), tuple(map(str, part["words"]))))
             lowest = ends[0][1].lowest(self.env.space)
@@ -135,12 +138,12 @@ class RemedyJob(CheckpointedJob[RemedyStudy]):
     def _try(self, name: str, cost: float, lowest: Tensor | None, watch: Watch) -> dict[str, Any]:
         """Return what a remedy does, as arrays for a file."""
         starts = self.env.space.to_unit(self.env.space.uniform(self.starts, seed=self.seed))
+        treated = treat(self.env, name)
         with watch.progress(self.starts * self.budget) as advance:
             found = descend(
-                self.env, name, starts, budget=self.budget, gradient_cost=cost, lowest=lowest,
+                self.env, treated, starts, budget=self.budget, gradient_cost=cost, lowest=lowest,
                 follow=lambda done: advance(min(done, self.starts * self.budget), name),
             )  # fmt: skip
-        treated = self.env if name == WITHOUT else remedied(self.env, name)
         plane = plane_through(treated, self.dims, through="center", window=None, resolution=RESOLUTION)
         with watch.busy(f"{name}: sampling a plane"):
             dataset = sample(treated, plane)
@@ -151,7 +154,7 @@ class RemedyJob(CheckpointedJob[RemedyStudy]):
             "map": dataset["loss"].to_numpy(),
         }  # fmt: skip
 
-    def _announce(self, watch: Watch, many: int) -> None:
+    def _announce(self, watch: Watch) -> None:
         env = self.env
         watch.note(f"{env.name} · {env.fidelity.name} · {env.device} · {self.folder}")
         with watch.busy(f"{env.name}: {PREPARING}"):
@@ -159,8 +162,8 @@ class RemedyJob(CheckpointedJob[RemedyStudy]):
             each = simulation_seconds(env, work.losses, work.gradients, env.preferred_batch)
         seconds = each + PICTURE_SECONDS
         watch.announce(
-            f"{many - 1} remedies and none, {self.starts} descents each at the cost of {self.budget} gradients: at "
-            f"most {duration(seconds)}; --starts and --budget lower it",
+            f"{len(self.names) - 1} remedies and none, {self.starts} descents each at the cost of {self.budget} "
+            f"gradients: at most {duration(seconds)}; --starts and --budget lower it",
             seconds,
         )
 

@@ -44,8 +44,7 @@ class RemedyRow:
     signed-rank test of this, corrected for the number of remedies (Holm 1979). `falls` are the shares of the starts at
     which a step of `STEPS` along the gradient lowers the loss. `moved` is how far a descent with the remedy leads away
     from the lowest point without it, as a share of the box in the parameter that moves most. `losses` has the end of
-    every descent.
-    `words` are those for the landscape on the plane.
+    every descent. `words` are those for the landscape on the plane.
     """
 
     remedy: str
@@ -58,7 +57,6 @@ class RemedyRow:
     moved: float
     words: tuple[str, ...]
     losses: tuple[float, ...]
-    error: str = ""
 
 
 @dataclass(frozen=True)
@@ -163,9 +161,14 @@ class Ends:
         return space.to_unit(self.x[int(self.loss.nan_to_num(torch.inf).argmin())])
 
 
+def treat(env: Environment, text: str) -> Environment:
+    """Return an environment with a remedy, or as it is for the row without one."""
+    return env if text == WITHOUT else remedied(env, text)
+
+
 def descend(
     env: Environment,
-    text: str,
+    treated: Environment,
     starts: Float[Tensor, "start dim"],
     *,
     budget: int,
@@ -173,14 +176,12 @@ def descend(
     lowest: Float[Tensor, " dim"] | None = None,
     follow: Callable[[int], None] = lambda done: None,
 ) -> Ends:
-    """Descend from starts in the unit cube with a remedy, by L-BFGS-B, each at the cost of `budget` gradients.
+    """Descend from starts in the unit cube of `env` with a remedy, by L-BFGS-B, at the cost of `budget` gradients each.
 
     A descent that ends goes on from its best point, as long as that gets it anywhere. What it found is evaluated
     without the remedy. One more descent starts at the `lowest` point without a remedy, to see how far that moves.
     """
-    treated = env if text == WITHOUT else remedied(env, text)
-    needs_gradient = ":zeroth" not in text
-    cost = treated.episodes_per_point * (1.0 if needs_gradient else 1 / gradient_cost)
+    cost = treated.episodes_per_point / (gradient_cost if treated.gradients_from_losses else 1.0)
     points = max(1, int(budget / cost))
     done = 0
 
@@ -189,18 +190,20 @@ def descend(
         done += 1
         follow(done)
 
-    begun = starts if lowest is None else torch.cat([starts, _unit_with(treated, env, lowest)])
+    begun = _rescaled(env, treated, starts if lowest is None else torch.cat([starts, lowest[None]]))
     best = torch.stack(Lockstep(treated).run([_descent(treated, start, points, advance) for start in begun]))
     x, moved = treated.plain_point(best), 0.0
     if lowest is not None:
         moved, x = float((env.space.to_unit(x[-1]) - lowest).abs().max()), x[:-1]
-    losses, falls = evaluate(env, x, grad=False).loss, _falls(env, treated, starts)
+    losses, falls = evaluate(env, x, grad=False).loss, _falls(env, treated, begun[: len(starts)])
     return Ends(x, losses, points, treated.episodes_per_point, falls, moved)
 
 
-def _unit_with(treated: Environment, env: Environment, unit: Float[Tensor, " dim"]) -> Float[Tensor, "one dim"]:
-    """Return a point of the unit cube of an environment as one of the same with a remedy."""
-    values = env.space.to_values(env.space.from_unit(unit[None]))
+def _rescaled(env: Environment, treated: Environment, unit: Float[Tensor, "some dim"]) -> Float[Tensor, "some dim"]:
+    """Return points of the unit cube as those of the same values with a remedy, which may change scales."""
+    if treated.space.scales == env.space.scales:
+        return unit
+    values = env.space.to_values(env.space.from_unit(unit))
     return treated.space.to_unit(treated.space.from_values(values)).clamp(0, 1)
 
 
@@ -211,7 +214,7 @@ def _descent(
     sides, left = env.space.upper - env.space.lower, points
     best, best_loss = 2 * start.numpy() - 1, np.inf
     while left:
-        search = LocalSearch(best, left)
+        search, before = LocalSearch(best, left), best_loss
         while left and not search.done:
             x = env.space.from_unit(torch.from_numpy((search.at + 1) / 2))
             evaluation, _ = yield Evaluate(x[None], True)
@@ -220,11 +223,9 @@ def _descent(
             assert evaluation.grad is not None  # as it was asked for
             loss, grad = float(evaluation.loss[0]), (evaluation.grad[0] * sides / 2).numpy()
             if np.isfinite(loss) and loss < best_loss:
-                best, best_loss, gained = search.at, loss, best_loss - loss
-            elif not search.loss:
-                gained = 0.0
+                best, best_loss = search.at, loss
             search.tell(loss if np.isfinite(loss) else np.inf, grad)
-        if not gained > GAIN * abs(best_loss):
+        if not before - best_loss > GAIN * abs(best_loss):
             break
     return env.space.from_unit(torch.from_numpy((best + 1) / 2))
 

@@ -37,6 +37,11 @@ def _cubic(x: Tensor) -> Tensor:
     return x[:, 0] ** 2 + 3 * x[:, 0] * x[:, 1] + x[:, 1] ** 3
 
 
+def _kinked(x: Tensor) -> Tensor:
+    """Return a loss that is known everywhere, whose gradient is NaN where the root would be of less than 0."""
+    return torch.where(x[:, 0] > 0.1, (x[:, 0] - 0.1).sqrt(), 0.0) + x[:, 1]
+
+
 STEP, CUBIC = gs.from_torch(_step, SQUARE, name="step"), gs.from_torch(_cubic, SQUARE, name="cubic")
 
 
@@ -126,6 +131,15 @@ def test_a_smoothed_point_fails_where_most_around_it_fail() -> None:
     broken = gs.from_torch(lambda x: torch.where(x[:, 0] > 0, torch.nan, x[:, 1]), SQUARE, name="broken")
     found = smooth(broken, WIDTH).evaluate(torch.tensor([[-0.9, 0.0], [0.9, 0.0]], dtype=torch.float64))
     assert [gs.Status(one) for one in found.status.tolist()] == [gs.Status.OK, gs.Status.NONFINITE]
+
+
+def test_a_smoothed_loss_is_the_same_with_and_without_gradients_where_some_lack() -> None:
+    """Where some pairs have a loss and no gradient, the mean is over all losses."""
+    kinked = gs.from_torch(_kinked, SQUARE, name="kinked")
+    env, x = smooth(kinked, WIDTH), torch.tensor([[0.16, 0.0]], dtype=torch.float64)
+    with_slopes, alone = env.evaluate(x), env.evaluate(x, grad=False)
+    assert kinked.evaluate(x - 0.1).status.tolist() == [gs.Status.NO_GRADIENT]
+    torch.testing.assert_close(with_slopes.loss, alone.loss, rtol=0, atol=0)
 
 
 def test_rescaling_finds_the_scale_of_even_sensitivity() -> None:
