@@ -17,6 +17,7 @@ import torch
 from ..envs.base import Environment
 from ..envs.points import point
 from ..envs.registry import entries, environment_class, make
+from ..jobs.episode import SMALL_FRAMES, SMALL_LOSS, film_episode
 from ..jobs.plan import simulation_seconds
 from ..jobs.race import RaceJob
 from ..jobs.report import ReportedSlice, ReportJob
@@ -62,12 +63,11 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from torch import Tensor
 
-FILM_CRF = 28  # constant rate factor of films
 COMPANION_RESOLUTION = 24  # points along each axis of a companion's plane; a line has the figure's own
 SWEEP_FIDELITY = "draft"  # as there are many episodes; of functions their only one
 SWEEP_FRAMES, SWEEP_RESOLUTION, SWEEP_GRADIENTS = 12, 48, 4
 SWEEP_DPI = 80
-EPISODE_HEIGHT, EPISODE_FRAMES = 480, 60  # of a film: pixels and most frames
+EPISODE_HEIGHT = 480  # of a film [pixels]
 SECONDS_PER_FRAME = 0.15  # of drawing an episode, about
 METHODS, BUDGET = ("random", "cma-es", "descents", "bo", "bo-leap"), 100  # of searches
 SEED = 0
@@ -292,7 +292,7 @@ class SweepPart(FigurePart):
         from ..landscapes.draw.figures.sweep import save_films
 
         drawn = self._open().sample(watch)
-        save_films(drawn, self.folder / files.SWEEP_FILM, None, dpi=SWEEP_DPI, loss=FILM_CRF)
+        save_films(drawn, self.folder / files.SWEEP_FILM, None, dpi=SWEEP_DPI, loss=SMALL_LOSS)
         record = self._record(drawn.label, drawn.values[0], drawn.values[-1], self.label())
         write_record(self.folder / files.SWEEP_RECORD, to_json(record))
         return f"{SWEEP_FRAMES} frames of {SWEEP_RESOLUTION} x {SWEEP_RESOLUTION} points over {drawn.label}"
@@ -322,7 +322,7 @@ class EpisodePart(FigurePart):
 
     def seconds_each(self) -> float:
         """Time an episode, and assume what drawing it takes."""
-        return super().seconds_each() + EPISODE_FRAMES * SECONDS_PER_FRAME
+        return super().seconds_each() + SMALL_FRAMES * SECONDS_PER_FRAME
 
     def make(self, watch: Watch) -> str:
         """Film every episode that is not there, and clear away those of other nodes."""
@@ -340,17 +340,10 @@ class EpisodePart(FigurePart):
         return f"{len(self._nodes)} episodes"
 
     def _film(self, env: Environment, plane: Plane, node: Node) -> None:
-        from ..landscapes.draw.film import save_film, save_still
-        from ..landscapes.draw.render import replay
-
         axes = [axis.tolist() for axis in plane.axes()]
         place = [axis[at] for axis, at in zip(axes, (node.column, node.row), strict=False)]
         episode = env.episode(plane.lift(torch.tensor([place], dtype=torch.float64))[0])
-        count = min(EPISODE_FRAMES, len(episode.time))
-        shown = np.linspace(0, len(episode.time) - 1, count).round().astype(int).tolist()
-        pictures = list(replay.frames(episode, shown, height=EPISODE_HEIGHT))
-        save_still(pictures[-1], self.folder / f"{node.name}.webp")
-        save_film(pictures, self.folder / f"{node.name}.mp4", None, count=count, rate=replay.RATE, loss=FILM_CRF)
+        film_episode(episode, self.folder / node.name, height=EPISODE_HEIGHT)
 
     @cached_property
     def _dataset(self) -> xr.Dataset:

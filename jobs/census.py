@@ -171,7 +171,8 @@ class CensusJob(CheckpointedJob["Census"]):
         from ..landscapes.measures.census import scale
 
         with replacing(self.folder / LOSSES) as partial, partial.open("wb") as file:
-            np.savez_compressed(file, **scale(found.losses))
+            scaled: Any = scale(found.losses)
+            np.savez_compressed(file, **scaled)
         return super().write(found)
 
     def verified(self) -> Environment:

@@ -73,6 +73,19 @@ function dotted(brush) {
   }
 }
 
+function crossed_(brush) {
+  for (const [thick, colour] of [[2.6, "#1a1a1a"], [1.2, "#ffffff"]]) {
+    brush.lineWidth = thick;
+    brush.strokeStyle = colour;
+    brush.beginPath();
+    brush.moveTo(1, 4);
+    brush.lineTo(7, 4);
+    brush.moveTo(4, 1);
+    brush.lineTo(4, 7);
+    brush.stroke();
+  }
+}
+
 // A bitmap of the nodes, of a pixel each, from numbers of 32 bits; row 0 is its lowest.
 function bitmap(wide, tall, colourOf) {
   const canvas_ = offscreen(wide, tall);
@@ -86,19 +99,26 @@ function bitmap(wide, tall, colourOf) {
   return canvas_;
 }
 
-const layers = { map: null, failures: [], finer: null, lines: [] };
+const layers = { map: null, failures: [], finer: null, floor: null, lines: [] };
+const FLOOR_FROM = 0.01; // of the range of the losses: replicas that differ by more are marked
+function aboveFloor() {
+  const known = losses.filter((loss) => loss === loss);
+  const range = known.reduce((most, loss) => Math.max(most, loss), -Infinity) - losses[lowest];
+  return (index) => floors[index] > FLOOR_FROM * range;
+}
 const mask = (wide, tall, where) => bitmap(wide, tall, (index) => (where(index) ? 0xff000000 : 0));
 function paintLayers() {
   if (!up) return;
   layers.map = bitmap(columns, rows, (index) => colours[index]);
   layers.lines = [];
   sharp.stale = true;
-  if (layers.failures.length || layers.finer) return; // they do not depend on the scale
+  if (layers.failures.length || layers.finer || layers.floor) return; // they do not depend on the scale
   for (const [kind, lines] of Object.entries(STRIPES)) {
     const code = Number(Object.keys(SLICE.statuses).find((one) => SLICE.statuses[one] === kind));
     if (!drawnStatuses.includes(code)) continue;
     layers.failures.push({ fill: striped(lines), mask: mask(columns, rows, (index) => drawnStatuses[index] === code) });
   }
+  if (floors) layers.floor = { fill: pattern(crossed_), mask: mask(columns, rows, aboveFloor()) };
   if (finer) layers.finer = { fill: pattern(dotted), mask: mask(columns - 1, rows - 1, (index) => finer[index]) };
 }
 
@@ -134,6 +154,7 @@ function drawCells(dots) {
   if (layers.finer && shown.has("finer")) {
     drawPatterned(layers.finer, 0.5 / columns, 0.5 / rows, 1 - 1 / columns, 1 - 1 / rows, dots);
   }
+  if (layers.floor && shown.has("floor")) drawPatterned(layers.floor, 0, 0, 1, 1, dots);
   if (shown.has("isolines")) drawIsolines(dots);
 }
 

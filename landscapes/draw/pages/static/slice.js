@@ -20,6 +20,7 @@ const drawnStatuses = unpacked(SLICE.looks, Uint8Array) || statuses;
 const slopes = SLICE.slope ? SLICE.slope.map((part) => unpacked(part, Float32Array)) : null;
 const gradients = unpacked(SLICE.gradient, Float32Array);
 const finer = unpacked(SLICE.finer, Uint8Array); // cells between four nodes
+const floors = unpacked(SLICE.floor, Float32Array); // the numerical floor of every node
 const lowest = losses.reduce((best, loss, at) => (loss < losses[best] || !(losses[best] === losses[best]) ? at : best), 0);
 const lossLabel = "loss" + (SLICE.unit ? ` [${SLICE.unit}]` : "");
 const shown = new Set(); // what the switches let through

@@ -6,23 +6,20 @@ import base64
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from io import BytesIO
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from PIL import Image
 
-from ..checks.examination import percent
-from ..measures.card import Card, CardSlice, Grade, describe_share
-from . import style
-from .style import number
+from ...checks.examination import percent
+from ...measures.card import Card, CardSlice, Grade, describe_share
+from .. import style
+from ..style import number
+from .rendering import templates
 
 if TYPE_CHECKING:
-    import jinja2
+    from ..figure import Picture
 
-    from .figure import Picture
-
-TEMPLATES = Path(__file__).parent / "templates"
 PIXELS = 360  # of a panel, along each side
 COLOURS = 96  # of a panel
 FILTERS: dict[str, Callable[..., str]] = {"percent": percent, "off": describe_share}  # of the table's template
@@ -58,20 +55,9 @@ def card_scenes(card: Card) -> list[CardScene]:
 
 def card_page(card: Card) -> str:
     """Return a page that holds all it shows, light and dark."""
-    page = templates().get_template("card.html")
-    return page.render(card=card, scenes=card_scenes(card), colours=colour_stops())
-
-
-def templates() -> jinja2.Environment:
-    """Return the templates of the page and of its table."""
-    from jinja2 import Environment, FileSystemLoader, StrictUndefined
-
-    pages = Environment(
-        loader=FileSystemLoader(TEMPLATES), autoescape=True, undefined=StrictUndefined,
-        trim_blocks=True, lstrip_blocks=True,
-    )  # fmt: skip
+    pages = templates()
     pages.filters |= FILTERS
-    return pages
+    return pages.get_template("card.html").render(card=card, scenes=card_scenes(card), colours=colour_stops())
 
 
 def colour_stops() -> str:
@@ -92,7 +78,7 @@ def _scene(card: Card, name: str, places: Sequence[int]) -> CardScene:
 def _card_row(grade: Grade, cut: CardSlice | None, scale: style.Scale) -> CardRow:
     if cut is None:
         return CardRow(grade, "", ("", ""), "")
-    from .figures.multiples import card_panel, opposing
+    from ..figures.multiples import card_panel, opposing
 
     _, share = opposing(cut)
     panel = _embedded(card_panel(cut, scale, PIXELS))

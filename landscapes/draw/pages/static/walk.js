@@ -23,6 +23,7 @@ function tell() {
     lines.push("Gradient along the slice: " + slopes.map((part) => number(part[node])).join(", "));
     lines.push("Gradient\u2019s length in all dimensions: " + number(gradients[node]));
   }
+  if (floors && floors[node] === floors[node]) lines.push("Numerical floor: " + lossSaid(floors[node], ""));
   if (node === lowest && losses[node] === losses[node]) lines.push("The lowest loss of the slice");
   const episode = episodeAt(node);
   if (episode) lines.push("Episode here: " + episode.why);
