@@ -17,7 +17,7 @@ import torch
 from ..envs.base import Environment
 from ..envs.points import point
 from ..envs.registry import entries, environment_class, make
-from ..jobs.episode import SMALL_FRAMES, SMALL_LOSS, film_episode
+from ..jobs.episode import SMALL_LOSS, film_episode
 from ..jobs.plan import simulation_seconds
 from ..jobs.race import RaceJob
 from ..jobs.report import ReportedSlice, ReportJob
@@ -67,7 +67,7 @@ COMPANION_RESOLUTION = 24  # points along each axis of a companion's plane; a li
 SWEEP_FIDELITY = "draft"  # as there are many episodes; of functions their only one
 SWEEP_FRAMES, SWEEP_RESOLUTION, SWEEP_GRADIENTS = 12, 48, 4
 SWEEP_DPI = 80
-EPISODE_HEIGHT = 480  # of a film [pixels]
+EPISODE_HEIGHT, EPISODE_FRAMES = 480, 60  # of a film: pixels and most frames
 SECONDS_PER_FRAME = 0.15  # of drawing an episode, about
 METHODS, BUDGET = ("random", "cma-es", "descents", "bo", "bo-leap"), 100  # of searches
 SEED = 0
@@ -322,7 +322,7 @@ class EpisodePart(FigurePart):
 
     def seconds_each(self) -> float:
         """Time an episode, and assume what drawing it takes."""
-        return super().seconds_each() + SMALL_FRAMES * SECONDS_PER_FRAME
+        return super().seconds_each() + EPISODE_FRAMES * SECONDS_PER_FRAME
 
     def make(self, watch: Watch) -> str:
         """Film every episode that is not there, and clear away those of other nodes."""
@@ -343,7 +343,7 @@ class EpisodePart(FigurePart):
         axes = [axis.tolist() for axis in plane.axes()]
         place = [axis[at] for axis, at in zip(axes, (node.column, node.row), strict=False)]
         episode = env.episode(plane.lift(torch.tensor([place], dtype=torch.float64))[0])
-        film_episode(episode, self.folder / node.name, height=EPISODE_HEIGHT)
+        film_episode(episode, self.folder / node.name, height=EPISODE_HEIGHT, frames=EPISODE_FRAMES)
 
     @cached_property
     def _dataset(self) -> xr.Dataset:

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from ..landscapes.draw.figures.contact import Caption
 
 SHEET, FILM, LOOP, STREAM, RECORD = EPISODE.files
-SMALL_FRAMES, SMALL_LOSS = 60, 28  # of a small film: most frames, and x264's constant rate factor
+SMALL_LOSS = 28  # of a small film: x264's constant rate factor
 
 
 @dataclass(frozen=True)
@@ -159,15 +159,15 @@ class EpisodeJob(Job[EpisodeSummary]):
         )
 
 
-def film_episode(episode: Episode, stem: Path, *, height: int) -> tuple[Path, Path]:
+def film_episode(episode: Episode, stem: Path, *, height: int, frames: int) -> tuple[Path, Path]:
     """Write a small film of an episode and a picture of its end, `stem` with .mp4 and .webp; return their paths.
 
-    `height` is that of both [pixels].
+    `height` is that of both [pixels], and the film has so many `frames` at most.
     """
     from ..landscapes.draw.film import save_film, save_still
     from ..landscapes.draw.render import replay
 
-    count = min(SMALL_FRAMES, len(episode.time))
+    count = min(frames, len(episode.time))
     shown = np.linspace(0, len(episode.time) - 1, count).round().astype(int).tolist()
     pictures = list(replay.frames(episode, shown, height=height))
     film, still = (stem.with_name(f"{stem.name}.{kind}") for kind in ("mp4", "webp"))

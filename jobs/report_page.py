@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from ..envs.base import Environment
     from .report import Report
 
-FILM_PIXELS = 320  # height of a film
+FILM_PIXELS, FILM_FRAMES = 320, 60  # height of a film, and most frames
 
 
 def save_page(
@@ -100,7 +100,7 @@ def _film(env: Environment, dataset: xr.Dataset) -> Iterator[EpisodeShown]:
         if not episode.parts:
             return
         with tempfile.TemporaryDirectory() as folder:
-            film, still = film_episode(episode, Path(folder) / "episode", height=FILM_PIXELS)
+            film, still = film_episode(episode, Path(folder) / "episode", height=FILM_PIXELS, frames=FILM_FRAMES)
             mp4, webp = data_link(film.read_bytes(), "video/mp4"), data_link(still.read_bytes(), "image/webp")
         at = dict(zip(plane.labels, plane.to_values(along).tolist(), strict=True))
         yield EpisodeShown(row, column, why, float(loss[row, column]), Status.OK.name, at, mp4, webp)

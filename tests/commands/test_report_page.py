@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import gradscape as gs
-from gradscape.jobs import episode
+from gradscape.jobs import report_page
 from gradscape.jobs.report import Report
 from gradscape.landscapes.draw.pages import report as pages
 from gradscape.landscapes.storage.store import open_slice
@@ -108,7 +108,7 @@ def test_of_many_samples_the_map_has_every_so_many(told: Path, tmp_path: Path, m
 
 
 def test_a_page_shows_episodes_at_the_ends_of_the_losses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(episode, "SMALL_FRAMES", 2)
+    monkeypatch.setattr(report_page, "FILM_FRAMES", 2)
     cut = gs.slice("bounce", dims=[0, 1], resolution=8, fidelity="draft", device="cpu", out=tmp_path / "cut")
     gs.report(cut, points_per_axis=2, out=tmp_path / "told", html=True)
     shown = nodes_of(tmp_path / "told/report.html")["episodes"]
