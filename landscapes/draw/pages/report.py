@@ -17,7 +17,7 @@ from ...measures.profile import Profile
 from ...measures.verdict import QuotedWord
 from ...objective import Status
 from ...storage.arrays import parameters_of
-from .nodes import EpisodeShown, lay_runs, read_off_nodes
+from .nodes import EpisodeShown, Trajectory, lay_runs, read_off_nodes
 from .rendering import STATIC, STYLE, scripts, templates
 from .words import words_of
 
@@ -87,45 +87,54 @@ def report_page(
     shown = _every(dataset, stride)
     laid = lay_runs(shown, runs)
     nodes = read_off_nodes(shown, [] if stride > 1 else episodes, laid, None if stride > 1 else floor)
-    identity, provenance = stored_identity(dataset), stored_provenance(dataset)
-    rank = plane_of(dataset).rank
-    names = [*scripts(rank), DOWNLOAD]
-    return (
-        templates()
-        .get_template("report.html")
-        .render(
-            title=title,
-            entry={
-                "id": title,
-                "env": identity["objective"],
-                "labels": identity["plane"]["labels"],
-                "identity": identity,
-                "loss_unit": provenance.get("loss_unit", ""),
-                "episodes": episodes,
-                "runs": [run.search() for run in laid],
-            },
-            plane=rank == 2,
-            status=_statuses(dataset),
-            finer=nodes["finer"] is not None,
-            deviates=nodes["floor"] is not None,
-            stride=stride,
-            words=words_of(profile.verdict, quoted),
-            sentence=sentence(profile),
-            notes=(*profile.verdict.open, *profile.verdict.lines),
-            where=where,
-            measures=profile.measures,
-            curve=curve_of(profile.differences),
-            check=check,
-            held=list(held_parameters(dataset)),
-            provenance=provenance,
-            command=provenance.get("command", ""),
-            picture=data_link(picture, "image/png"),
-            style=(STATIC / STYLE).read_text(encoding="utf-8"),
-            scripts=[(STATIC / name).read_text(encoding="utf-8") for name in names],
-            nodes=_inert(nodes),
-            record=_inert(record),
-        )
+    page = templates().get_template("report.html")
+    return page.render(
+        **_about(dataset),
+        entry=_entry(dataset, title, laid, episodes),
+        finer=nodes["finer"] is not None,
+        deviates=nodes["floor"] is not None,
+        stride=stride,
+        words=words_of(profile.verdict, quoted),
+        sentence=sentence(profile),
+        notes=(*profile.verdict.open, *profile.verdict.lines),
+        where=where,
+        measures=profile.measures,
+        curve=curve_of(profile.differences),
+        check=check,
+        picture=data_link(picture, "image/png"),
+        nodes=_inert(nodes),
+        record=_inert(record),
     )
+
+
+def _about(dataset: xr.Dataset) -> dict[str, Any]:
+    """Return what a page says of how a slice was made, and the style and the scripts that it holds."""
+    provenance, rank = stored_provenance(dataset), plane_of(dataset).rank
+    return {
+        "plane": rank == 2,
+        "status": _statuses(dataset),
+        "held": list(held_parameters(dataset)),
+        "provenance": provenance,
+        "command": provenance.get("command", ""),
+        "style": (STATIC / STYLE).read_text(encoding="utf-8"),
+        "scripts": [(STATIC / name).read_text(encoding="utf-8") for name in (*scripts(rank), DOWNLOAD)],
+    }
+
+
+def _entry(
+    dataset: xr.Dataset, title: str, laid: Sequence[Trajectory], episodes: Sequence[EpisodeShown]
+) -> dict[str, Any]:
+    """Return what the map of a slice's page shows."""
+    identity = stored_identity(dataset)
+    return {
+        "id": title,
+        "env": identity["objective"],
+        "labels": identity["plane"]["labels"],
+        "identity": identity,
+        "loss_unit": stored_provenance(dataset).get("loss_unit", ""),
+        "episodes": episodes,
+        "runs": [run.search() for run in laid],
+    }
 
 
 def sentence(profile: Profile) -> str:
