@@ -39,7 +39,7 @@ def spec_of(scene: Scene, keywords: SceneKeywords, *, dims: Sequence[int | str] 
         return _with_preset(SceneSpec(find_environment(scene), **named), preset)
     spec = SceneSpec(scene, **named)
     if scene:
-        words = [str(dim) for dim in dims or ()] if not (spec.options or preset) else []
+        words = [str(dim) for dim in dims or ()] if not (spec.options or preset or spec.policy) else []
         refuse_unknown(scene, fidelity=spec.fidelity, device=spec.device, engine=spec.engine, dims=words)
         if spec.tolerance is not None:
             from ..jobs.scene import tolerance_of

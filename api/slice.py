@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Unpack
 
 from cyclopts import Parameter
 
-from ..jobs.scene import environment_of, with_policy
+from ..jobs.scene import environment_of
 from .call import current, verb
 from .options import (
     Device,
@@ -53,7 +53,6 @@ def slice(
     refine: Share | None = None,
     budget: Annotated[int | None, at_least(1)] = None,
     floor: bool = False,
-    policy: str | None = None,
     picture: Annotated[bool, Parameter(negative="--no-picture", show_default=False)] = True,
     gradients: Gradients = True,
     scheduler: Scheduler = None,
@@ -96,9 +95,6 @@ def slice(
     floor
         Evaluate the replicas of the environment, the same physics computed otherwise, at every sample. The standard
         deviation between their losses, the numerical floor, is drawn as a map. Each replica costs as much as the slice.
-    policy
-        Sample over the weights of a neural policy instead of the parameters of the environment: mlp:32x32 has two
-        hidden layers of 32. It has losses only.
     picture
         Draw landscape.png, which takes longer than the samples of a quick function; --no-picture leaves it out. It can
         be drawn from the samples at any time.
@@ -107,28 +103,28 @@ def slice(
 
     call, fine = current(), as_share(refine, "--refine")
     spec = PlaneSpec(dims, along, through, as_window(window), resolution)
-    env = environment(scene, keywords, dims=dims if policy is None else None)
+    env = environment(scene, keywords, dims=dims)
     from ..landscapes.objective import BoxedObjective
     from ..landscapes.sampling.refine import Refinement
     from ..landscapes.space import as_stride
 
-    objective, stride = with_policy(env, policy), as_stride(gradients or 0) if policy is None else 0
+    stride = as_stride(gradients or 0) if env.has_gradient else 0
     in_memory = is_in_memory(env, out)
     begun: dict[str, Any] = {"out": as_path(out), "gradients": stride, "refinement": Refinement.of(fine, budget)}
-    plane = spec.make(objective, None if force or in_memory else begun)
+    plane = spec.make(env, None if force or in_memory else begun)
     if in_memory:
-        boxed = BoxedObjective(objective) if along else objective
+        boxed = BoxedObjective(env) if along else env
         return _sample_in_memory(boxed, plane, begun["refinement"], stride, floor)
     from ..jobs.slice import SliceJob
     from ..jobs.workers import workers
 
     with workers(scheduler, env.device) as executor:
         job = SliceJob.of(
-            objective, plane, command=call.command, cut=spec.cut, force=force, floor=floor, picture=picture,
+            env, plane, command=call.command, cut=spec.cut, force=force, floor=floor, picture=picture,
             executor=executor, prints=as_widths(figure_width_mm), **begun,
         )  # fmt: skip
         job.run(call.watch)
-    return _opened(job.store.dataset(), job.folder, lambda: objective)
+    return _opened(job.store.dataset(), job.folder, lambda: env)
 
 
 @verb

@@ -22,6 +22,7 @@ ERROR = "error"  # the attribute of a slice or a run with what the first point t
 UNNAMED = "default"  # the fidelity of a simulator that names none
 BOUNDS = "bounds"  # of the parameters, lower and upper, by their own values: of a slice's provenance
 SCALES = "scales"  # of the parameters in an identity; not there where all are linear
+POLICY = "policy"  # in the identity of an environment over the weights of a policy: mlp:32x32
 REMEDY = "remedy"  # in the identity of an environment with remedies, as the command line spells them; and with it
 EPISODES_PER_POINT = "episodes_per_point"  # how many episodes a point takes: elsewhere one
 ABSENT = "none"  # instead of a setting's value
