@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from ..landscapes.plane import Plane
     from ..landscapes.sampling.refine import Refinement
     from ..landscapes.slice import Slice
+    from ..landscapes.training import Training
 
 
 @verb
@@ -77,14 +78,16 @@ def slice(
     dims
         One or two parameters to vary, by number or by name. An environment with at most two needs none.
     along
-        Directions to vary instead of --dims: random:SEED, gradient, hessian, pca:RUN, the line A:B through two points,
-        or the plane A:B:C through three. What lies outside the bounds is left out.
+        Directions to vary instead of --dims: random:SEED, filters:SEED (normalised by the weights of each neuron),
+        gradient, hessian, pca:RUN, training:FOLDER (of checkpoints), the line A:B through two points, or the plane
+        A:B:C through three. What lies outside the bounds is left out.
     resolution
         Number of points along each axis.
     through
-        Point that the slice passes through: center, random:SEED, example:NAME, best, best:RUN, a file of numbers, or a
-        row of a table, TABLE.csv:ROW. Row 1 of a table is its heading; without ROW it is the row with the lowest loss.
-        The command takes several points, A,B, and makes a slice in a folder of its own for each.
+        Point that the slice passes through: center, random:SEED, example:NAME, best, best:RUN, a file of numbers, a
+        checkpoint of a training (.pt, .pth, .npz, .zip), or a row of a table, TABLE.csv:ROW. Row 1 of a table is its
+        heading; without ROW it is the row with the lowest loss. The command takes several points, A,B, and makes a
+        slice in a folder of its own for each.
     window
         Range to cover: a fraction of the box around the point, or the values LOW:HIGH. The default is the whole box.
     refine
@@ -111,17 +114,17 @@ def slice(
     stride = as_stride(gradients or 0) if env.has_gradient else 0
     in_memory = is_in_memory(env, out)
     begun: dict[str, Any] = {"out": as_path(out), "gradients": stride, "refinement": Refinement.of(fine, budget)}
-    plane = spec.make(env, None if force or in_memory else begun)
+    plane, training = spec.make(env, None if force or in_memory else begun), spec.training(env)
     if in_memory:
         boxed = BoxedObjective(env) if along else env
-        return _sample_in_memory(boxed, plane, begun["refinement"], stride, floor)
+        return _sample_in_memory(boxed, plane, begun["refinement"], stride, floor, training)
     from ..jobs.slice import SliceJob
     from ..jobs.workers import workers
 
     with workers(scheduler, env.device) as executor:
         job = SliceJob.of(
             env, plane, command=call.command, cut=spec.cut, force=force, floor=floor, picture=picture,
-            executor=executor, prints=as_widths(figure_width_mm), **begun,
+            executor=executor, prints=as_widths(figure_width_mm), training=training, **begun,
         )  # fmt: skip
         job.run(call.watch)
     return _opened(job.store.dataset(), job.folder, lambda: env)
@@ -232,7 +235,12 @@ def _opened(dataset: xr.Dataset, path: Path, remake: Callable[[], Objective]) ->
 
 
 def _sample_in_memory(
-    objective: Objective, plane: Plane, refinement: Refinement | None, gradients: int, floor: bool
+    objective: Objective,
+    plane: Plane,
+    refinement: Refinement | None,
+    gradients: int,
+    floor: bool,
+    training: Training | None,
 ) -> Slice:
     from ..jobs.slice import conclude_slice
     from ..landscapes.lattice import check_gradients
@@ -249,7 +257,7 @@ def _sample_in_memory(
     with current().watch.progress(math.prod(plane.resolution), "evaluations") as advance:
         how: dict[str, Any] = {
             "progress": lambda now: advance(now.done),
-            "conclude": lambda whole: conclude_slice(objective, whole),
+            "conclude": lambda whole: conclude_slice(objective, whole, training=training),
         }
         if refinement is None:
             dataset = sample(objective, plane, gradients=gradients, **how)

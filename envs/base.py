@@ -145,7 +145,7 @@ class Environment(Objective):
     material_range: ClassVar[MaterialRange | None] = None  # where an option sets what the scene is made of
     designed_order: ClassVar[Mapping[str, float]] = {}  # of convergence in dt, resolution, joint (both at once)
     model_parts: ClassVar[tuple[ModelPart, ...]] = ()  # what the model is made of, each with options that change it
-    has_visible_gradient: ClassVar[bool] = False  # whether what a policy sees is differentiated, by `_pull_back`
+    has_visible_gradient: ClassVar[bool] = False  # whether what a policy sees is differentiated, by `_pull_back_seen`
 
     _solvers: Pool[Any] | None = None  # a scene on an engine sets both in `_setup`: what simulates,
     _capacity = 1 << 20  # and how many rows it takes at once,
@@ -345,7 +345,7 @@ class Environment(Objective):
 
         def part(both: Float[Tensor, "some dim_and_feature"]) -> Float[Tensor, "some dim"]:
             with torch.inference_mode(False), torch.enable_grad():
-                return self._pull_back(both[:, : x.shape[1]], decision, both[:, x.shape[1] :])
+                return self._pull_back_seen(both[:, : x.shape[1]], decision, both[:, x.shape[1] :])
 
         slope = torch.cat(self._map_parts(part, torch.cat([x, weight[:, :-1].to(x)], dim=1)))
         slope[:, made:] = 0
@@ -504,7 +504,7 @@ class Environment(Objective):
         """Return the state just before a decision, in units that make it about one."""
         return x.new_zeros(len(x), 0)
 
-    def _pull_back(
+    def _pull_back_seen(
         self, x: Float[Tensor, "batch dim"], decision: int, weight: Float[Tensor, "batch feature"]
     ) -> Float[Tensor, "batch dim"]:
         """Return the gradient of the weighted sum of what `_observe` returns, where `has_visible_gradient`."""

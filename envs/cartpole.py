@@ -187,7 +187,7 @@ class Cartpole(Environment):
             phi = copied(self._swing(solver, controls))
         return self._watch(controls, phi, decision)
 
-    def _pull_back(
+    def _pull_back_seen(
         self, x: Float[Tensor, "batch dim"], decision: int, weight: Float[Tensor, "batch feature"]
     ) -> Float[Tensor, "batch dim"]:
         x = x.clone().requires_grad_()

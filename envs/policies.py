@@ -7,7 +7,6 @@ each decision's parameters. What it sees is what the environment shows just befo
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -22,18 +21,16 @@ from ..landscapes.identity import POLICY
 from ..landscapes.objective import Evaluation, SimulatorError, Status
 from ..landscapes.space import ParameterSpace
 from .base import Environment
+from .records import hidden_layers
 from .remedies import RemediedEnvironment, Remedy
 
-FORM = re.compile(r"mlp:([1-9]\d{0,8}(?:x[1-9]\d{0,8})*)")
 REACH = 3.0  # times as far as torch draws weights at first: where learning may take them
 COPIES = 8  # of the weights of all rows, at most
 
 
 @dataclass(frozen=True)
 class Episodes:
-    """Hold episodes that policies decided: what they `decided`, what they `seen` before each decision, and which of
-    them are `blind`, as they saw what is not finite.
-    """
+    """Hold what policies `decided`, what was `seen` before each decision, and which are `blind`: they saw a NaN."""
 
     decided: Float[Tensor, "batch decided"]
     seen: Sequence[Float[Tensor, "batch feature"]]
@@ -54,7 +51,7 @@ class Policy(Remedy):
         Raises ValueError for another form, and where the environment decides but once or its decisions are not alike;
         TooLargeError for more weights than there is memory for.
         """
-        hidden = _hidden_layers(form)
+        hidden = hidden_layers(form)
         if env.decisions == 1 or env.space.dim % env.decisions:
             raise ValueError(
                 f"{env.name} decides {'once' if env.decisions == 1 else 'unequally'} in an episode, so that there is "
@@ -206,11 +203,3 @@ def _own(env: Environment, decision: int) -> slice:
 def _box(env: Environment, decision: int) -> tuple[Float[Tensor, " act"], Float[Tensor, " act"]]:
     own = _own(env, decision)
     return env.space.lower[own], env.space.upper[own]
-
-
-def _hidden_layers(form: str) -> list[int]:
-    """Return the sizes of the hidden layers. Raises ValueError where a policy is not so written."""
-    found = FORM.fullmatch(form)
-    if found is None:
-        raise ValueError(f"--policy takes mlp and the sizes of its hidden layers, as mlp:32x32; got {form!r}")
-    return [int(size) for size in found[1].split("x")]

@@ -253,6 +253,16 @@ def named_point(objective: Objective, text: str) -> Tensor:
     raise ValueError(f"{objective.name} can be cut through {forms}; got {text!r}")
 
 
+def given_point(objective: Objective, through: Any, who: str) -> Tensor:
+    """Return the point that is named or given. Raises ValueError, of `who` asks, where it is none of the space."""
+    from ..landscapes.objective import check_points
+    from ..landscapes.space import as_tensor
+
+    if isinstance(through, str):
+        return named_point(objective, through)
+    return check_points(as_tensor(through, who)[None], objective.space, objective.name)[0]
+
+
 def read_scene(text: str, scene: SceneSpec) -> SceneSpec:
     """Return a scene given as ENV or ENV@FIDELITY, else as `scene` has it."""
     name, at, fidelity = text.rpartition(AT)

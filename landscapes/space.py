@@ -58,8 +58,8 @@ class ParameterSpace:
     point `x` has, for each parameter, its value, or the decimal logarithm of it where its scale is "log10": such
     points are what `evaluate` takes, what slices, searches and checks work with, and what `lower` and `upper`, float64
     of shape (dim,), bound. `to_values` and `from_values` turn one into the other. The bounds say where a landscape is
-    looked at, and an objective is not asked beyond them unless it invites that (`Objective`). `arrays` are the shapes of
-    the arrays that parameters are the numbers of, in their order, by name: none but in a space `of_weights`.
+    looked at, and an objective is not asked beyond them unless it invites that (`Objective`). `arrays` are the shapes
+    of the arrays that parameters are the numbers of, in their order, by name: none but in a space `of_weights`.
 
     Raises ValueError where names, bounds, units or scales do not belong together.
     """
