@@ -107,6 +107,7 @@ def slice(
     call, fine = current(), as_share(refine, "--refine")
     spec = PlaneSpec(dims, along, through, as_window(window), resolution)
     env = environment(scene, keywords, dims=dims)
+    from ..landscapes.identity import BOXED, record_cut
     from ..landscapes.objective import BoxedObjective
     from ..landscapes.sampling.refine import Refinement
     from ..landscapes.space import as_stride
@@ -116,7 +117,7 @@ def slice(
     begun: dict[str, Any] = {"out": as_path(out), "gradients": stride, "refinement": Refinement.of(fine, budget)}
     plane, training = spec.make(env, None if force or in_memory else begun), spec.training(env)
     if in_memory:
-        boxed = BoxedObjective(env) if along else env
+        boxed = BoxedObjective(env) if BOXED in record_cut(spec.cut) else env
         return _sample_in_memory(boxed, plane, begun["refinement"], stride, floor, training)
     from ..jobs.slice import SliceJob
     from ..jobs.workers import workers

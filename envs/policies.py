@@ -158,7 +158,7 @@ class PolicyEnvironment(RemediedEnvironment):
 
     def __init__(self, inner: Environment, policy: Policy, /) -> None:
         super().__init__(inner, policy)
-        self.name, self.beyond_box = f"{inner.name} with policy {policy.form}", False
+        self.name, self.beyond_box = f"{inner.name} with policy {policy.form}", True
         self.examples, self.decisions = {}, 1  # type: ignore[misc] # of this one, as `FunctionEnvironment` has them
         self.whole_batches = True  # of every decision most of the time is no row's
 

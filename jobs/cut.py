@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ..landscapes.identity import FILTERS, TRAINED
 from ..landscapes.plain import plain_name
 from .scene import named_point, plane_through, runs_in
 
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
     from ..landscapes.training import Training
 
 ONE_OF = "a slice takes --dims, one or two parameters, or --along, directions; give one of them"
-PCA, FILTERS, TRAINED = "pca", "filters", "training"  # kinds of directions that something follows
+PCA = "pca"
 WORDS = ("center", "example", "random", "best")  # that names of points begin with
 REACH, MIN_WIDTH = 0.5, 1e-3  # of a width of the box: how far a slice reaches, and what is no width for one
 REACH_PER_ROOT = 1 / 8  # the same by the root of how many parameters there are: each moves by that share of its width
@@ -76,7 +77,7 @@ class PlaneSpec:
         """Return the training that is cut along, None where there is none; raises ValueError where it is another's."""
         from ..landscapes.training import Training
 
-        return Training.read(self.folder, objective.space, objective.name) if self.folder else None
+        return Training.read(self.folder, objective) if self.folder else None
 
     def make(self, objective: Objective, kept: Mapping[str, Any] | None = None) -> Plane:
         """Return the line or plane in an objective's space.
@@ -135,7 +136,7 @@ def _plane_along(
     if kind == TRAINED:
         from ..landscapes.training import Training
 
-        return Training.read(Path(value), space, objective.name).plane(space, resolution)
+        return Training.read(Path(value), objective).plane(space, resolution)
     point = named_point(objective, through) if isinstance(through, str) else through
     if kind == FILTERS:
         spans, labels = find.filter_directions(space, point, int(value), objective.name)

@@ -23,7 +23,7 @@ from torch import Tensor
 from ..landscapes.capacity import peak_memory, size
 from ..landscapes.cost import PICTURE_SECONDS, duration, seconds_per_episode
 from ..landscapes.directions import barrier
-from ..landscapes.identity import plane_of, stored_identity, with_stride
+from ..landscapes.identity import BOXED, plane_of, record_cut, stored_identity, with_stride
 from ..landscapes.lattice import check_gradients, count_gradients
 from ..landscapes.measures.floor import Floor
 from ..landscapes.measures.slice_floor import (
@@ -207,13 +207,13 @@ class SliceJob(SummaryJob[SliceSummary]):
         """Continue the slice in `out`, by default a folder under `root` named after it, or begin it there.
 
         Gradients are at every so many samples along each axis, `gradients`, 0 for none. `boxed` leaves out what lies
-        beyond the bounds; so does a `cut`, how it was cut along directions. `floor` is no setting of the slice.
+        beyond the bounds; so does a `cut`, how it was cut along directions but those of weights. `floor` is no setting of the slice.
         Raises ValueError for what cannot be, and where the folder holds something else or another slice.
         """
         if floor:
             refuse_without_replicas(objective, refined=refinement is not None)
         gradients = check_gradients(gradients, plane, refined=refinement is not None)
-        identity = _identity(objective, gradients, boxed=boxed, cut=cut)
+        identity = _identity(objective, gradients, cut, boxed=boxed)
         folder = out or default_folder(identity, plane.resolution, plane, gradients > 0, root, refinement)
         if refinement is not None:
             refinement.check(plane)
@@ -222,7 +222,7 @@ class SliceJob(SummaryJob[SliceSummary]):
             folder, plane, objective.space, force=force,
             identity=identity, provenance=provenance(objective, command), grad=gradients > 0,
         )  # fmt: skip
-        boxed = "boxed" in identity
+        boxed = BOXED in identity
         return cls(
             objective=BoxedObjective(objective) if boxed else objective, remake=None if boxed else recipe(objective),
             plane=plane, store=store, plot=picture_of(objective, plane), folder=folder, command=command,
@@ -392,10 +392,11 @@ class SliceJob(SummaryJob[SliceSummary]):
         )
 
 
-def _identity(objective: Objective, gradients: int, *, boxed: bool, cut: Mapping[str, Any] | None) -> dict[str, Any]:
-    """Return what decides a slice's numbers, but for its plane; one that was cut along directions is boxed."""
-    about = ({"boxed": True} if boxed or cut is not None else {}) | ({"cut": dict(cut)} if cut else {})
-    return with_stride(objective.identity(), gradients) | about
+def _identity(
+    objective: Objective, gradients: int, cut: Mapping[str, Any] | None, *, boxed: bool = False
+) -> dict[str, Any]:
+    """Return what decides a slice's numbers, but for its plane."""
+    return with_stride(objective.identity(), gradients) | record_cut(cut, boxed=boxed)
 
 
 def _open_store(folder: Path, plane: Plane, space: ParameterSpace, *, force: bool, **settings: Any) -> SliceStore:
@@ -524,7 +525,7 @@ def kept_plane(
 
     It continues along these: others may come out a little different each time, on a GPU, and some take many episodes.
     """
-    identity = _identity(objective, gradients, boxed=True, cut=cut)
+    identity = _identity(objective, gradients, cut)
     path = (out or default_folder(identity, resolution, None, gradients > 0, root, refinement)) / STORE
     if not is_slice(path):
         return None

@@ -139,7 +139,7 @@ class SweepJob(SummaryJob[SweepSummary]):
         """Continue the sweep of an environment in `out`, by default a folder named after it, or begin it there.
 
         Gradients are at every so many samples along each axis, 0 for none; of smoothed losses there are none. With a
-        `cut`, how it was cut along directions, it is boxed, and one that was begun continues along its own directions:
+        `cut`, how it was cut along directions, it is boxed but for those of weights, and one that was begun continues along its own directions:
         on a GPU they come out a little different each time. Raises ValueError for what cannot be swept or has no room,
         and where the folder holds something else or another sweep.
         """
@@ -164,7 +164,7 @@ class SweepJob(SummaryJob[SweepSummary]):
             )
             for name, plane, identity in zip(motion.stores, motion.planes, identities, strict=True)
         )
-        return cls(env=env, motion=motion, folder=folder, stores=stores, command=command, boxed=bool(cut))
+        return cls(env=env, motion=motion, folder=folder, stores=stores, command=command, boxed=BOXED in record_cut(cut))
 
     @cached_property
     def total(self) -> int:
@@ -286,7 +286,7 @@ class SweepJob(SummaryJob[SweepSummary]):
 
 
 def _identity(env: Environment, gradients: int, cut: Mapping[str, Any] | None) -> dict[str, Any]:
-    return with_stride(env.identity(), gradients) | ({"boxed": True, "cut": dict(cut)} if cut else {})
+    return with_stride(env.identity(), gradients) | record_cut(cut)
 
 
 def sweep_folder(

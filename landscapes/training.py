@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from .convert import from_json, to_json
-from .objective import Objective, evaluate
+from .objective import Objective, evaluate, in_box
 from .plane import Plane
 from .space import ParameterSpace
 
@@ -51,17 +51,21 @@ class Training:
     x: Float[Tensor, "checkpoint dim"]
 
     @classmethod
-    def read(cls, folder: Path, space: ParameterSpace, who: str) -> Training:
+    def read(cls, folder: Path, objective: Objective) -> Training:
         """Return the checkpoints in a folder, by their names, whose numbers count as numbers: 9 comes before 10.
 
-        Raises ValueError where there are fewer than three, and for one that does not hold the parameters of `who`.
+        Raises ValueError where there are fewer than three, for one that does not hold the parameters of the objective,
+        and where one lies beyond its bounds, unless points there are evaluated, too.
         """
         files = checkpoints_in(folder)
         if len(files) < 3:
             raise ValueError(
                 f"a plane takes three checkpoints and more ({', '.join(SUFFIXES)}); {folder} holds {len(files)}"
             )
-        return cls(tuple(one.name for one in files), torch.stack([read_checkpoint(one, space, who) for one in files]))
+        x = torch.stack([read_checkpoint(one, objective.space, objective.name) for one in files])
+        if not objective.beyond_box:
+            _refuse_beyond(x, objective.space, objective.name, folder)
+        return cls(tuple(one.name for one in files), x)
 
     def plane(self, space: ParameterSpace, resolution: int) -> Plane:
         """Lay a plane through the last checkpoint, along the two principal directions of the others about it.
@@ -136,6 +140,18 @@ class TrainingPath:
             return from_json(cls, json.loads(dataset.attrs[ATTRIBUTE]))
         except Exception:  # text of any content makes the converter raise anything at all
             return None
+
+
+def _refuse_beyond(x: Float[Tensor, "checkpoint dim"], space: ParameterSpace, who: str, folder: Path) -> None:
+    """Raise ValueError for checkpoints beyond the bounds, where nothing is evaluated."""
+    far = (space.to_unit(x) - 0.5).abs()
+    if beyond := int((~in_box(space, x)).sum()):
+        row, column = divmod(int(far.argmax()), space.dim)
+        value, low, high = (float(one) for one in (x[row, column], space.lower[column], space.upper[column]))
+        raise ValueError(
+            f"{beyond} of {len(x)} checkpoints in {folder} lie beyond the bounds of {who}: {space.names[column]} is "
+            f"{value:.3g}, bounds {low:.3g} to {high:.3g}; give it wider ones"
+        )
 
 
 def checkpoints_in(folder: Path) -> list[Path]:
