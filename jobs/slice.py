@@ -207,7 +207,8 @@ class SliceJob(SummaryJob[SliceSummary]):
         """Continue the slice in `out`, by default a folder under `root` named after it, or begin it there.
 
         Gradients are at every so many samples along each axis, `gradients`, 0 for none. `boxed` leaves out what lies
-        beyond the bounds; so does a `cut`, how it was cut along directions but those of weights. `floor` is no setting of the slice.
+        beyond the bounds; so does a `cut`, how it was cut along directions, but for those of weights. `floor` is no
+        setting of the slice.
         Raises ValueError for what cannot be, and where the folder holds something else or another slice.
         """
         if floor:

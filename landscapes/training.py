@@ -230,13 +230,13 @@ def _has_tensors(held: Mapping[Any, Any]) -> bool:
 
 def _chosen(arrays: Arrays, path: Path, space: ParameterSpace, who: str) -> list[NDArray[Any]]:
     """Return the arrays that hold the parameters, in their order. Raises ValueError where they are not there."""
-    wanted = space.arrays
+    wanted, there = space.arrays, list(arrays.values())
     if wanted and wanted.keys() <= arrays.keys():
         pairs = [(name, name) for name in wanted]
+    elif [one.shape for one in there] == [(space.dim,)] or (not wanted and sum(one.size for one in there) == space.dim):
+        return there
     elif wanted and len(wanted) == len(arrays):
         pairs = list(zip(arrays, wanted, strict=True))
-    elif sum(one.size for one in arrays.values()) == space.dim and not (wanted and len(arrays) > 1):
-        return list(arrays.values())
     else:
         takes = _listed(wanted) if wanted else f"{space.dim} numbers"
         held = _listed({name: one.shape for name, one in arrays.items()})

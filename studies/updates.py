@@ -1,9 +1,9 @@
 """The study `updates`: how losses are distributed after one update along the gradient, of many.
 
-Rahn et al. 2023, "Policy optimization in a noisy neighborhood", look at returns after one update by random batches. Here
-an update follows the gradient at a point that is moved at random, which takes nothing but gradients; and next to it is
-a random step as long. That is ours, and so is where returns are counted from: the loss at the centre of the box, where
-a policy has no weights and does nothing, or 0 for a function that is maximised.
+Rahn et al. 2023, "Policy optimization in a noisy neighborhood", look at returns after one update by random batches.
+Here an update follows the gradient at a point that is moved at random, which takes nothing but gradients, and each is
+held against a random step as long. Both are ours, and so is where returns are counted from: the loss at the centre of
+the box, where a policy has no weights and does nothing, or 0 for a function that is maximised.
 """
 
 from __future__ import annotations
