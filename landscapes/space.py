@@ -140,7 +140,8 @@ class ParameterSpace:
 
         A point holds the arrays one after another, each flattened row by row. `reach` may be given for each array by
         its name. The first axis of an array numbers the outputs of its layer, as torch has it, or the last one, as Flax
-        has it: what belongs to one output is a filter (`filters`).
+        has it: what belongs to one output is a filter (`filters`). Bounds say where random points are and what a share
+        of the box is; functions of weights are evaluated beyond them, too.
 
         Raises ValueError for what is no shape, and where an array has no reach.
         """

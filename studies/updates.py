@@ -21,7 +21,7 @@ from torch import Tensor
 
 from ..landscapes.objective import Evaluation, evaluate
 from ..landscapes.statistics import UNKNOWN, Estimate, mean, share
-from .samples import Follow, evaluate_parts, interval_columns, percent
+from .samples import Follow, evaluate_parts, interval_columns
 from .variants import Expected, Study, StudyRecord, read_positive
 
 if TYPE_CHECKING:
@@ -264,4 +264,5 @@ class UpdatesStudy(Study):
 
 def _percent(found: Estimate) -> str:
     """Return a share in per cent, with its interval."""
-    return f"{percent(found.value)} ({percent(found.low)} to {percent(found.high)})"
+    value, low, high = (f"{100 * end:.3g}" for end in (found.value, found.low, found.high))
+    return f"{value} % ({low} to {high} %)"
