@@ -145,7 +145,9 @@ class Environment(Objective):
     material_range: ClassVar[MaterialRange | None] = None  # where an option sets what the scene is made of
     designed_order: ClassVar[Mapping[str, float]] = {}  # of convergence in dt, resolution, joint (both at once)
     model_parts: ClassVar[tuple[ModelPart, ...]] = ()  # what the model is made of, each with options that change it
-    has_visible_gradient: ClassVar[bool] = False  # whether what a policy sees is differentiated, by `_pull_back_seen`
+    differentiates_observations: ClassVar[bool] = (
+        False  # whether what a policy sees is differentiated, by `_pull_back_observation`
+    )
 
     _solvers: Pool[Any] | None = None  # a scene on an engine sets both in `_setup`: what simulates,
     _capacity = 1 << 20  # and how many rows it takes at once,
@@ -331,7 +333,7 @@ class Environment(Objective):
         return torch.cat([seen, seen.new_full((len(x), 1), decision / self.decisions)], dim=1)
 
     @final
-    def pull_back(
+    def pull_back_observation(
         self, x: Float[Tensor, "batch dim"], decision: int, weight: Float[Tensor, "batch feature"]
     ) -> Float[Tensor, "batch dim"]:
         """Return the gradient by x of the sum of what `observe` returns, each number by its weight.
@@ -339,13 +341,13 @@ class Environment(Objective):
         It is zero by parameters that this decision and later ones set. Raises ValueError as `observe` does, and where
         what is seen is not differentiated.
         """
-        if not self.has_visible_gradient:
+        if not self.differentiates_observations:
             raise ValueError(f"{self.name} does not differentiate what it shows a policy")
         x, made = self._before(self._check_points(x), decision)
 
         def part(both: Float[Tensor, "some dim_and_feature"]) -> Float[Tensor, "some dim"]:
             with torch.inference_mode(False), torch.enable_grad():
-                return self._pull_back_seen(both[:, : x.shape[1]], decision, both[:, x.shape[1] :])
+                return self._pull_back_observation(both[:, : x.shape[1]], decision, both[:, x.shape[1] :])
 
         slope = torch.cat(self._map_parts(part, torch.cat([x, weight[:, :-1].to(x)], dim=1)))
         slope[:, made:] = 0
@@ -504,10 +506,10 @@ class Environment(Objective):
         """Return the state just before a decision, in units that make it about one."""
         return x.new_zeros(len(x), 0)
 
-    def _pull_back_seen(
+    def _pull_back_observation(
         self, x: Float[Tensor, "batch dim"], decision: int, weight: Float[Tensor, "batch feature"]
     ) -> Float[Tensor, "batch dim"]:
-        """Return the gradient of the weighted sum of what `_observe` returns, where `has_visible_gradient`."""
+        """Return the gradient of the weighted sum of what `_observe` returns, where `differentiates_observations`."""
         raise NotImplementedError
 
     def _closed_form(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, " batch"] | None:

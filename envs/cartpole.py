@@ -82,7 +82,7 @@ class Cartpole(Environment):
     }
     loss_unit = "m"
     decisions = CONTROLS
-    has_visible_gradient: ClassVar[bool] = True
+    differentiates_observations: ClassVar[bool] = True
     control_step: ClassVar[float] = SPAN
     designed_order: ClassVar[dict[str, float]] = {"dt": 4.0}  # classical Runge-Kutta; controls change between steps
     model_parts: ClassVar[tuple[ModelPart, ...]] = (
@@ -187,7 +187,7 @@ class Cartpole(Environment):
             phi = copied(self._swing(solver, controls))
         return self._watch(controls, phi, decision)
 
-    def _pull_back_seen(
+    def _pull_back_observation(
         self, x: Float[Tensor, "batch dim"], decision: int, weight: Float[Tensor, "batch feature"]
     ) -> Float[Tensor, "batch dim"]:
         x = x.clone().requires_grad_()

@@ -90,7 +90,7 @@ class Policy(Remedy):
         A policy that sees what is not finite decides on the middles of the boxes then, and its row has failed. Raises
         SimulatorError where gradients are asked for and what is seen is not differentiated.
         """
-        if grad and not env.has_visible_gradient:
+        if grad and not env.differentiates_observations:
             raise SimulatorError(
                 f"{env.name} with policy {self.form} has no gradients, as what a policy sees there is not "
                 "differentiated; sample losses only, with --no-gradients, or estimate gradients from losses, with "
@@ -133,7 +133,7 @@ class Policy(Remedy):
                 by_weights, by_seen = torch.autograd.grad(share, (weights, seen), pulled)
             slope += by_weights
             if decision:
-                adjoint += env.pull_back(played.decided, decision, by_seen)
+                adjoint += env.pull_back_observation(played.decided, decision, by_seen)
         return slope
 
     def _act(self, x: Float[Tensor, "batch dim"], seen: Float[Tensor, "batch feature"]) -> Float[Tensor, "batch act"]:
@@ -165,7 +165,7 @@ class PolicyEnvironment(RemediedEnvironment):
     @property
     def has_gradient(self) -> bool:  # type: ignore[override] # read only
         """Whether what a policy sees is differentiated, and the loss, too."""
-        return self.inner.has_visible_gradient and self.inner.has_gradient
+        return self.inner.differentiates_observations and self.inner.has_gradient
 
     def identity(self) -> dict[str, Any]:
         """Return what decides the numbers: all that does of the environment, and the policy."""

@@ -24,13 +24,13 @@ STEPS = 3
 class Cart(gs.Environment):
     """A place that each of three decisions moves by its own amount; the loss is the square of where it ends."""
 
-    name, loss_unit, decisions, model_version, has_visible_gradient = "cart", "m²", STEPS, 0, True
+    name, loss_unit, decisions, model_version, differentiates_observations = "cart", "m²", STEPS, 0, True
     space = ParameterSpace.box([f"push {k}" for k in range(STEPS)], -1.0, 3.0)
 
     def _observe(self, x, decision):
         return 2 + x[:, :decision].sum(dim=1, keepdim=True)
 
-    def _pull_back_seen(self, x, decision, weight):
+    def _pull_back_observation(self, x, decision, weight):
         return weight.expand(-1, STEPS).clone()
 
     def _evaluate(self, x, *, grad):
@@ -41,7 +41,7 @@ class Cart(gs.Environment):
 class Hidden(Cart):
     """The same, which does not differentiate what it shows."""
 
-    has_visible_gradient = False
+    differentiates_observations = False
 
 
 def loop(weights: torch.Tensor) -> torch.Tensor:
