@@ -164,6 +164,7 @@ class Verb:
         """Call the function, show what it returns, and return the exit code."""
         from .api.call import Call, calling
         from .api.plan import plan
+        from .commands.next import next_command
         from .commands.terminal import Bars, Console, command_line
 
         shown = {name: named.pop(name) for name in self.displayed.keys() & named.keys()}
@@ -179,6 +180,8 @@ class Verb:
                 show = shower(kind_of(result))
                 if show is not None:
                     code = max(code, show(result, Console(stderr=as_object), **shown) or 0)
+                if not as_object and (then := next_command(kind_of(result), result, given, bars.folder)):
+                    bars.note(f"next: {then}")
             results.append(as_json(result, bars.folder) if as_object else None)
         if as_object:
             import json

@@ -337,8 +337,8 @@ def census(
 
     A census measures each slice as `landscape report` does. It says to which fraction of the slices each word applies,
     how each measure is distributed, and how much of its variance comes from the point, the orientation, the resolution
-    and the fidelity. The folder then holds census.json, census.npz (the losses) and census.png. Stop at any time: the
-    same command continues with the next slice.
+    and the fidelity. The folder then holds census.json, census.npz (the losses, in half precision from 0 to 1 between
+    `low` and `high` of each slice) and census.png. Stop at any time: the same command continues with the next slice.
 
     Raises ValueError where the scene has one parameter, StoreMismatchError where the folder holds another census;
     Stopped where it is interrupted.

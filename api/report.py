@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Unpack
 from cyclopts import Parameter
 
 from .call import current, verb
-from .options import ARGUMENT, Data, FigureWidth, Of, Out, Scene, SceneKeywords, Seed, at_least
+from .options import ARGUMENT, Data, FigureWidth, Names, Of, Out, Scene, SceneKeywords, Seed, at_least
 from .scene import environment, spec_of
-from .values import as_path, as_widths
+from .values import as_names, as_path, as_widths
 
 if TYPE_CHECKING:
     from ..jobs.report import Report, ReportedSlice, Reports
@@ -24,6 +24,8 @@ def report(
     all: Annotated[bool, Parameter(name="--all")] = False,
     points_per_axis: Annotated[int, at_least(2)] = 6,
     features: bool = False,
+    html: bool = False,
+    include: Names = (),
     seed: Seed = 0,
     data: Data = None,
     figure_width_mm: FigureWidth = (),
@@ -33,9 +35,9 @@ def report(
     """Measure one landscape: minima, flatness, jumps, correlation and gradient quality, with a verdict in words.
 
     The folder then holds report.json, measures.json, gradient-quality.png and gradient-quality.npz (the data of the
-    picture). Several slices have a folder each, with report.json and the table report.md. Stop at any time: the same
-    command continues with the next slice. With --all a slice that fails is named at the end, and the exit code is 1.
-    docs/measures.md explains each number.
+    picture); with --html also report.html. Several slices have a folder each, with report.json and the table report.md.
+    Stop at any time: the same command continues with the next slice. With --all a slice that fails is named at the end,
+    and the exit code is 1. docs/measures.md explains each number.
 
     Raises ValueError for a slice without gradients or on no disk, for what the scene does not have, and where the
     folder holds something else or another report; Stopped where it is interrupted.
@@ -54,6 +56,10 @@ def report(
     features
         Also measure landscape features over all parameters, from 50 new points for each. A report that is there
         already gets them added.
+    html
+        Also write report.html, one page with all of it that needs no network: to read, and to send.
+    include
+        Folder of a run, a race or a check that the page shows, too. It may be repeated.
     """
     _refuse_words(what, all, keywords, env)
     from ..gallery.files import data_folder
@@ -70,11 +76,11 @@ def report(
     job = ReportJob.open(
         subjects, what=name, single=single, out=as_path(out), points=points_per_axis, seed=seed,
         device=keywords.get("device", "auto"), prints=as_widths(figure_width_mm), paper=read_paper().words,
-        command=call.command, env=env, features=features,
+        command=call.command, env=env, features=features, html=html, include=as_names(include),
     )  # fmt: skip
     found = job.run(call.watch)
     if single:
-        call.watch.finish(job.folder, REPORT.files)
+        call.watch.finish(job.folder, [one for one in REPORT.files if (job.folder / one).exists()])
         return found.reports[0]
     for failed, why in found.failed.items():
         call.watch.note(f"not reported: {failed}: {why}")

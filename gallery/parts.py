@@ -17,6 +17,7 @@ import torch
 from ..envs.base import Environment
 from ..envs.points import point
 from ..envs.registry import entries, environment_class, make
+from ..jobs.episode import SMALL_LOSS, film_episode
 from ..jobs.plan import simulation_seconds
 from ..jobs.race import RaceJob
 from ..jobs.report import ReportedSlice, ReportJob
@@ -62,7 +63,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from torch import Tensor
 
-FILM_CRF = 28  # constant rate factor of films
 COMPANION_RESOLUTION = 24  # points along each axis of a companion's plane; a line has the figure's own
 SWEEP_FIDELITY = "draft"  # as there are many episodes; of functions their only one
 SWEEP_FRAMES, SWEEP_RESOLUTION, SWEEP_GRADIENTS = 12, 48, 4
@@ -292,7 +292,7 @@ class SweepPart(FigurePart):
         from ..landscapes.draw.figures.sweep import save_films
 
         drawn = self._open().sample(watch)
-        save_films(drawn, self.folder / files.SWEEP_FILM, None, dpi=SWEEP_DPI, loss=FILM_CRF)
+        save_films(drawn, self.folder / files.SWEEP_FILM, None, dpi=SWEEP_DPI, loss=SMALL_LOSS)
         record = self._record(drawn.label, drawn.values[0], drawn.values[-1], self.label())
         write_record(self.folder / files.SWEEP_RECORD, to_json(record))
         return f"{SWEEP_FRAMES} frames of {SWEEP_RESOLUTION} x {SWEEP_RESOLUTION} points over {drawn.label}"
@@ -340,17 +340,10 @@ class EpisodePart(FigurePart):
         return f"{len(self._nodes)} episodes"
 
     def _film(self, env: Environment, plane: Plane, node: Node) -> None:
-        from ..landscapes.draw.film import save_film, save_still
-        from ..landscapes.draw.render import replay
-
         axes = [axis.tolist() for axis in plane.axes()]
         place = [axis[at] for axis, at in zip(axes, (node.column, node.row), strict=False)]
         episode = env.episode(plane.lift(torch.tensor([place], dtype=torch.float64))[0])
-        count = min(EPISODE_FRAMES, len(episode.time))
-        shown = np.linspace(0, len(episode.time) - 1, count).round().astype(int).tolist()
-        pictures = list(replay.frames(episode, shown, height=EPISODE_HEIGHT))
-        save_still(pictures[-1], self.folder / f"{node.name}.webp")
-        save_film(pictures, self.folder / f"{node.name}.mp4", None, count=count, rate=replay.RATE, loss=FILM_CRF)
+        film_episode(episode, self.folder / node.name, height=EPISODE_HEIGHT, frames=EPISODE_FRAMES)
 
     @cached_property
     def _dataset(self) -> xr.Dataset:

@@ -185,7 +185,7 @@ class CardJob(CheckpointedJob[Card]):
 
     def write(self, found: Card) -> list[str]:
         """Draw and write the card, its page, and the slices, by which the page's panels are drawn elsewhere."""
-        from ..landscapes.draw.card import card_page
+        from ..landscapes.draw.pages.card import card_page
 
         with replacing(self.folder / PAGE) as partial:
             partial.write_text(card_page(found), encoding="utf-8")

@@ -168,8 +168,11 @@ class CensusJob(CheckpointedJob["Census"]):
 
     def write(self, found: Census) -> list[str]:
         """Draw and write the census, the losses in a file of their own."""
+        from ..landscapes.measures.census import scale
+
         with replacing(self.folder / LOSSES) as partial, partial.open("wb") as file:
-            np.savez_compressed(file, loss=found.losses)
+            scaled: Any = scale(found.losses)
+            np.savez_compressed(file, **scaled)
         return super().write(found)
 
     def verified(self) -> Environment:

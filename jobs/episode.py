@@ -8,6 +8,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from .. import __version__
 from ..landscapes.convert import to_json
 from ..landscapes.objective import Status, failed, has_loss
@@ -25,6 +27,7 @@ if TYPE_CHECKING:
     from ..landscapes.draw.figures.contact import Caption
 
 SHEET, FILM, LOOP, STREAM, RECORD = EPISODE.files
+SMALL_LOSS = 28  # of a small film: x264's constant rate factor
 
 
 @dataclass(frozen=True)
@@ -154,3 +157,20 @@ class EpisodeJob(Job[EpisodeSummary]):
             loss=loss if has_loss(status) else None,
             status=status.name,
         )
+
+
+def film_episode(episode: Episode, stem: Path, *, height: int, frames: int) -> tuple[Path, Path]:
+    """Write a small film of an episode and a picture of its end, `stem` with .mp4 and .webp; return their paths.
+
+    `height` is that of both [pixels], and the film has so many `frames` at most.
+    """
+    from ..landscapes.draw.film import save_film, save_still
+    from ..landscapes.draw.render import replay
+
+    count = min(frames, len(episode.time))
+    shown = np.linspace(0, len(episode.time) - 1, count).round().astype(int).tolist()
+    pictures = list(replay.frames(episode, shown, height=height))
+    film, still = (stem.with_name(f"{stem.name}.{kind}") for kind in ("mp4", "webp"))
+    save_still(pictures[-1], still)
+    save_film(pictures, film, None, count=count, rate=replay.RATE, loss=SMALL_LOSS)
+    return film, still

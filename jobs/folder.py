@@ -71,7 +71,7 @@ EPISODE = Results(
 )
 REPORT = Results(
     "report",
-    ("report.json", "measures.json", "gradient-quality.png", "gradient-quality.npz"),
+    ("report.json", "measures.json", "gradient-quality.png", "gradient-quality.npz", "report.html"),
     "gradient-quality.png",
 )
 REPORTS = Results("set of reports", ("report.json", "report.md"))

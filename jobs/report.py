@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from ..landscapes.objective import Objective
     from ..landscapes.statistics import Estimate
 
-RECORD, MEASURES, PICTURE, ARRAYS = REPORT.files  # the arrays are what the picture is drawn from, but for the slice
+RECORD, MEASURES, PICTURE, ARRAYS, PAGE = REPORT.files  # of the arrays, and the slice, the picture is drawn
 TABLE = REPORTS.files[1]
 POINTS = 6  # along each axis where gradients are tested by new evaluations
 HORIZONS, GROWTH_POINTS = (0.2, 0.4, 0.6, 0.8, 1.0), 16  # shares of the episode, and where gradients are compared
@@ -112,6 +112,8 @@ class ReportJob:
     command: str = ""
     env: Any = None  # of the slices, where it is not registered by their name for it
     features: bool = False  # whether features over all parameters are measured, too
+    html: bool = False  # whether each report gets a page
+    include: Sequence[str] = ()  # folders of runs and checks that a page shows
 
     @classmethod
     def open(
@@ -188,6 +190,8 @@ class ReportJob:
         folder = self._place(subject)
         report = replace(self._find(subject, folder, watch), folder=folder, store=subject.store)
         self._print(report, watch)
+        if self.html:
+            report.save(folder / PAGE, include=self.include, env=self._open(subject)[1], watch=watch)
         tidy(folder)
         return report
 
@@ -598,6 +602,23 @@ class Report:
         dataset, kept = sampled_lattice(open_slice(self.store)), open_bundle(self.folder / ARRAYS)
         samples = compare_samples(dataset, deviation=float(np.nan_to_num(kept["noise"]["deviation"])))
         return partial(quality_figure, dataset, GradientQuality(kept["steps"], samples, kept["smooth"]))
+
+    def save(
+        self, path: str | Path, *, include: Sequence[str | Path] = (), env: Environment | None = None,
+        watch: Watch | None = None,
+    ) -> Path:  # fmt: skip
+        """Write a page about the landscape that anyone can open, one file that needs no network; return its path.
+
+        `include` are folders of runs, races and checks that the page shows, too. With the environment, `env`, it shows
+        the episodes at the lowest and the highest loss, where there are some to draw.
+
+        Raises ValueError where the slice is on no disk, where a folder holds none of these, and where a run searched
+        other parameters.
+        """
+        from .report_page import save_page
+
+        save_page(self, Path(path), include=include, env=env, watch=watch)
+        return Path(path)
 
     def _repr_html_(self) -> str:
         """Show words and numbers in a notebook."""

@@ -10,9 +10,8 @@ it holds nothing else.
 from __future__ import annotations
 
 import json
-import re
 import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import groupby
@@ -20,16 +19,17 @@ from pathlib import Path
 from typing import Any
 
 import xarray as xr
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from jinja2 import Environment
 
 from ... import __version__
 from ...envs.registry import entries
 from ...landscapes.convert import to_json
-from ...landscapes.draw.card import FILTERS, TEMPLATES, card_scenes, colour_stops
-from ...landscapes.identity import plane_of
+from ...landscapes.draw.pages.card import FILTERS, card_scenes, colour_stops
+from ...landscapes.draw.pages.nodes import read_off_nodes
+from ...landscapes.draw.pages.rendering import STATIC, number, scripts, templates
+from ...landscapes.draw.pages.report import held_parameters
 from ...landscapes.measures.card import Card
 from ...landscapes.measures.verdict import WORDS
-from ...landscapes.storage.arrays import parameters_of
 from ...landscapes.storage.files import check_ours, placing, resolve
 from ...landscapes.storage.paths import is_slice
 from ...landscapes.storage.records import reading
@@ -43,10 +43,9 @@ from .league import LeaguePage, place_league, rank_style
 from .page_data import (
     FigureEntry,
     enter_report,
-    lay_runs,
+    lay_own,
     quality_rows,
     read_episodes,
-    read_off_nodes,
     read_report,
     read_runs,
 )
@@ -90,7 +89,8 @@ def build_site(
     tables = read_runs(data)
     with placing(out, overwrite=True, check=partial(_check, out)) as new:
         follow(len(there))
-        shutil.copytree(HERE / "static", new / "static")
+        for scripts_of_all in (STATIC, HERE / "static"):
+            shutil.copytree(scripts_of_all, new / "static", dirs_exist_ok=True)
         places = [(data / figure.id, new / figure.id) for figure in there]
         for _, folder in places:
             folder.mkdir()
@@ -128,30 +128,20 @@ def _has_samples(store: Path) -> bool:
 
 
 def _templates() -> Environment:
-    pages = Environment(
-        loader=FileSystemLoader([HERE / "templates", TEMPLATES]), autoescape=True, undefined=StrictUndefined,
-        trim_blocks=True, lstrip_blocks=True,
-    )  # fmt: skip
-    pages.filters["number"] = _number
+    pages = templates(HERE / "templates")
     pages.filters |= FILTERS
     pages.filters["dark"] = files.dark_name
     pages.filters["beside"] = _describe_companion
     pages.filters["size"] = size_class
     pages.filters["rank_style"] = rank_style
-    pages.filters["times"] = lambda text: re.sub(r"(?<=\d) x (?=[\d(])", " \N{MULTIPLICATION SIGN} ", text)
     return pages
-
-
-def _number(value: Any, digits: int = 4) -> str:
-    """Write a number with a minus sign, and anything else as it is."""
-    return f"{value:z.{digits}g}".replace("-", "\N{MINUS SIGN}") if isinstance(value, int | float) else str(value)
 
 
 def _describe_companion(one: Companion, unit: str) -> str:
     """Say what the losses of a slice next to a page's own range over."""
     if one.lowest is None or one.highest is None:
         return f"through {one.through} all failed"
-    return f"through {one.through} from {_number(one.lowest)} to {_number(one.highest)}{unit}"
+    return f"through {one.through} from {number(one.lowest)} to {number(one.highest)}{unit}"
 
 
 @dataclass(frozen=True)
@@ -173,7 +163,7 @@ class _Site:
         """Write a slice's page and all it shows, and return its entry in the manifest."""
         source, folder = self.data / figure.id, self.folder / figure.id
         dataset = open_slice(source / files.STORE)
-        episodes, runs = read_episodes(source, dataset), lay_runs(dataset, self.tables)
+        episodes, runs = read_episodes(source, dataset), lay_own(dataset, self.tables)
         nodes = read_off_nodes(dataset, episodes, runs)
         (folder / NODES).write_text(f"const SLICE = {json.dumps(nodes, separators=(',', ':'))};\n")
         companions, report = read_companions(source), read_report(source)
@@ -196,9 +186,11 @@ class _Site:
             "slice.html",
             entry=entry,
             studies=self.studies[figure.env],
-            held=list(_held_parameters(dataset)),
+            held=list(held_parameters(dataset)),
             scene=entries().get(figure.env),
             finer=nodes["finer"] is not None,
+            deviates=nodes["floor"] is not None,
+            scripts=scripts(len(dataset["loss"].dims)),
         )
         return entry
 
@@ -259,12 +251,3 @@ class _Site:
         manifest = replace(manifest, files=sorted([*there, MANIFEST]))
         (self.folder / MANIFEST).write_text(json.dumps(to_json(manifest), indent=1) + "\n")
         return manifest
-
-
-def _held_parameters(dataset: xr.Dataset) -> Iterator[tuple[str, float, str]]:
-    """Yield the parameters that the slice holds: name, value and unit."""
-    plane = plane_of(dataset)
-    varied = plane.basis.any(dim=0).tolist()
-    for (name, unit), value, varies in zip(parameters_of(dataset), plane.origin.tolist(), varied, strict=True):
-        if not varies:
-            yield name, value, unit

@@ -400,6 +400,21 @@ class Census:
         return str(self.table().to_html())
 
 
+def scale(losses: NDArray[np.float32]) -> dict[str, NDArray[Any]]:
+    """Return the losses of slices, shape (slice, v, u), as a small file holds them.
+
+    `loss` goes from 0 at a slice's lowest loss, `low`, to 1 at its highest, `high` [loss unit], in half precision: off
+    by 0.025 % of the range at most. It is NaN where a sample has no loss, and so are the ends of a slice without any.
+    """
+    known = np.isfinite(losses)
+    low, high = (
+        np.where(known.any(axis=(1, 2)), end(np.where(known, losses, out), axis=(1, 2)), np.nan)
+        for end, out in ((np.min, np.inf), (np.max, -np.inf))
+    )
+    whole = np.where(high > low, high - low, 1.0)[:, None, None]
+    return {"loss": ((losses - low[:, None, None]) / whole).astype(np.float16), "low": low, "high": high}
+
+
 def conclude(
     design: CensusDesign,
     found: Sequence[SurveyedSlice],

@@ -14,11 +14,11 @@ from matplotlib.axis import Axis
 from torch import Tensor
 
 import gradscape as gs
-from gradscape.gallery.site.page_data import read_off_nodes
 from gradscape.jobs.scene import named_point
 from gradscape.landscapes.draw.figures.contour import landscape_figure
 from gradscape.landscapes.draw.figures.profile import profile_figure
 from gradscape.landscapes.draw.figures.sweep import Sweep
+from gradscape.landscapes.draw.pages.nodes import read_off_nodes
 from gradscape.landscapes.draw.render.relief import Relief
 from gradscape.landscapes.draw.style import Scale, decades, write_power
 from gradscape.landscapes.export import frame

@@ -14,7 +14,8 @@ import pytest
 from gradscape.gallery.league import read_standings
 from gradscape.gallery.paper import read_paper
 from gradscape.gallery.records import open_run
-from gradscape.gallery.site.build import HERE, build_site
+from gradscape.gallery.site.build import build_site
+from gradscape.landscapes.draw.pages.rendering import STATIC
 from gradscape.landscapes.identity import stored_identity
 from gradscape.landscapes.storage.store import open_slice
 
@@ -225,14 +226,14 @@ def test_a_search_lies_where_its_parameters_say(site: Path, data: Path) -> None:
 
 
 def test_a_search_of_other_options_is_not_laid_over_a_slice(data: Path) -> None:
-    from gradscape.gallery.site.page_data import lay_runs, read_runs
+    from gradscape.gallery.site.page_data import lay_own, read_runs
 
     tables, dataset = read_runs(data), open_slice(data / "full/slice.zarr")
     assert len(tables) == 4
-    assert len(lay_runs(dataset, tables)) == 2
+    assert len(lay_own(dataset, tables)) == 2
     for one, goal in ((dataset, "high"), (tables[-1], "low")):
         one.attrs["identity"] = json.dumps({**stored_identity(one), "options": {"goal": goal}})
-    assert [run.method for run in lay_runs(dataset, tables)] == ["descents"]
+    assert [run.method for run in lay_own(dataset, tables)] == ["descents"]
 
 
 def test_counts_are_multiplied_and_axes_are_not(site: Path) -> None:
@@ -336,7 +337,7 @@ def test_a_site_is_built_anew_where_its_manifest_lists_all_that_is_there(
 
 def colours(scheme: str) -> dict[str, str]:
     """Return the colours that the style sheet names for light, or for dark where it has its own."""
-    light, dark = re.findall(r":root \{(.*?)\}", (HERE / "static/style.css").read_text(), re.DOTALL)
+    light, dark = re.findall(r":root \{(.*?)\}", (STATIC / "style.css").read_text(), re.DOTALL)
     return dict(re.findall(r"--(\w+): (#\w{6})", light if scheme == "light" else light + dark))
 
 

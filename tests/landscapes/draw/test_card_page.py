@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from gradscape.landscapes.draw.card import card_page, card_scenes
+from gradscape.landscapes.draw.pages.card import card_page, card_scenes
 
 from .figures.records import card
 
