@@ -145,9 +145,7 @@ class Environment(Objective):
     material_range: ClassVar[MaterialRange | None] = None  # where an option sets what the scene is made of
     designed_order: ClassVar[Mapping[str, float]] = {}  # of convergence in dt, resolution, joint (both at once)
     model_parts: ClassVar[tuple[ModelPart, ...]] = ()  # what the model is made of, each with options that change it
-    differentiates_observations: ClassVar[bool] = (
-        False  # whether what a policy sees is differentiated, by `_pull_back_observation`
-    )
+    differentiates_observations: ClassVar[bool] = False  # whether there are gradients of what a policy sees
 
     _solvers: Pool[Any] | None = None  # a scene on an engine sets both in `_setup`: what simulates,
     _capacity = 1 << 20  # and how many rows it takes at once,
