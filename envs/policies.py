@@ -167,6 +167,15 @@ class PolicyEnvironment(RemediedEnvironment):
         """Whether what a policy sees is differentiated, and the loss, too."""
         return self.inner.differentiates_observations and self.inner.has_gradient
 
+    @property
+    def horizon(self) -> float | None:
+        """None: decisions are of whole episodes."""
+        return None
+
+    def with_horizon(self, horizon: float) -> Environment:
+        """Raise ValueError: decisions are of whole episodes."""
+        raise ValueError(f"{self.name} decides whole episodes, which have one length")
+
     def identity(self) -> dict[str, Any]:
         """Return what decides the numbers: all that does of the environment, and the policy."""
         return {**self.inner.identity(), "objective": self.name, POLICY: self.remedy.form}

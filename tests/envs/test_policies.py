@@ -98,6 +98,9 @@ def test_without_weights_every_decision_is_the_middle_of_its_box() -> None:
         "layer 3 weight": (4, 3), "layer 3 bias": (4,),
     }  # fmt: skip
     assert policy.episode(policy.space.center).time.shape == env.episode(env.space.center).time.shape
+    assert policy.horizon is None
+    with pytest.raises(ValueError, match="decides whole episodes"):
+        policy.with_horizon(0.5)
 
 
 @pytest.mark.parametrize("policy", ["mlp:", "mlp:0", "mlp:3x", "mlp:03", "cnn:3", "mlp", f"mlp:{'9' * 5000}"])
