@@ -193,7 +193,6 @@ def test_where_memory_runs_out_the_environment_takes_fewer_rows() -> None:
     assert bound.take_notes()
 
 
-def test_a_policy_is_searched_and_checked_like_any_environment() -> None:
+def test_a_policy_is_searched_like_any_environment() -> None:
     run = gs.optimize(Cart, "adam", policy="mlp:2", budget=40, seed=0)
     assert np.fmin.accumulate(run.data.loss.to_numpy())[-1] < 0.1 * float(run.data.loss[0])
-    assert gs.check(Cart, policy="mlp:2", power="20%").passed
