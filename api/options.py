@@ -129,6 +129,13 @@ class MadeKeywords(TypedDict, total=False):
         ),
     ]
     options: SceneOptions
+    policy: Annotated[
+        str | None,
+        Parameter(
+            help="Let a neural policy decide, and take its weights as the parameters: mlp:32x32 has two hidden layers "
+            "of 32. It has gradients where the environment differentiates what it shows, as cartpole does."
+        ),
+    ]
     remedy: Annotated[
         str | None,
         Parameter(

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, cast
 
+from ..envs.records import hidden_layers
 from ..envs.registry import refuse_unknown
 from ..jobs.scene import SceneSpec
 from .call import current
@@ -31,6 +32,8 @@ def spec_of(scene: Scene, keywords: SceneKeywords, *, dims: Sequence[int | str] 
         if taken := OWN & set(named["options"]):
             name = min(taken)
             raise ValueError(f"--set takes a scene's own options; {name} is none, and chosen by --{name} if at all")
+    if policy := named.get("policy"):
+        hidden_layers(policy)
     if isinstance(scene, SceneSpec):
         return _with_preset(replace(scene, **named), preset)
     if not isinstance(scene, str):
@@ -39,7 +42,7 @@ def spec_of(scene: Scene, keywords: SceneKeywords, *, dims: Sequence[int | str] 
         return _with_preset(SceneSpec(find_environment(scene), **named), preset)
     spec = SceneSpec(scene, **named)
     if scene:
-        words = [str(dim) for dim in dims or ()] if not (spec.options or preset) else []
+        words = [str(dim) for dim in dims or ()] if not (spec.options or preset or spec.policy) else []
         refuse_unknown(scene, fidelity=spec.fidelity, device=spec.device, engine=spec.engine, dims=words)
         if spec.tolerance is not None:
             from ..jobs.scene import tolerance_of

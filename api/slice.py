@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Unpack
 
 from cyclopts import Parameter
 
-from ..jobs.scene import environment_of, with_policy
+from ..jobs.scene import environment_of
 from .call import current, verb
 from .options import (
     Device,
@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from ..landscapes.plane import Plane
     from ..landscapes.sampling.refine import Refinement
     from ..landscapes.slice import Slice
+    from ..landscapes.training import Training
 
 
 @verb
@@ -53,7 +54,6 @@ def slice(
     refine: Share | None = None,
     budget: Annotated[int | None, at_least(1)] = None,
     floor: bool = False,
-    policy: str | None = None,
     picture: Annotated[bool, Parameter(negative="--no-picture", show_default=False)] = True,
     gradients: Gradients = True,
     scheduler: Scheduler = None,
@@ -78,14 +78,16 @@ def slice(
     dims
         One or two parameters to vary, by number or by name. An environment with at most two needs none.
     along
-        Directions to vary instead of --dims: random:SEED, gradient, hessian, pca:RUN, the line A:B through two points,
-        or the plane A:B:C through three. What lies outside the bounds is left out.
+        Directions to vary instead of --dims: random:SEED, filters:SEED (normalised by the weights of each neuron),
+        gradient, hessian, pca:RUN, training:FOLDER (of checkpoints), the line A:B through two points, or the plane
+        A:B:C through three. What lies outside the bounds is left out.
     resolution
         Number of points along each axis.
     through
-        Point that the slice passes through: center, random:SEED, example:NAME, best, best:RUN, a file of numbers, or a
-        row of a table, TABLE.csv:ROW. Row 1 of a table is its heading; without ROW it is the row with the lowest loss.
-        The command takes several points, A,B, and makes a slice in a folder of its own for each.
+        Point that the slice passes through: center, random:SEED, example:NAME, best, best:RUN, a file of numbers, a
+        checkpoint of a training (.pt, .pth, .npz, .zip), or a row of a table, TABLE.csv:ROW. Row 1 of a table is its
+        heading; without ROW it is the row with the lowest loss. The command takes several points, A,B, and makes a
+        slice in a folder of its own for each.
     window
         Range to cover: a fraction of the box around the point, or the values LOW:HIGH. The default is the whole box.
     refine
@@ -96,9 +98,6 @@ def slice(
     floor
         Evaluate the replicas of the environment, the same physics computed otherwise, at every sample. The standard
         deviation between their losses, the numerical floor, is drawn as a map. Each replica costs as much as the slice.
-    policy
-        Sample over the weights of a neural policy instead of the parameters of the environment: mlp:32x32 has two
-        hidden layers of 32. It has losses only.
     picture
         Draw landscape.png, which takes longer than the samples of a quick function; --no-picture leaves it out. It can
         be drawn from the samples at any time.
@@ -107,28 +106,29 @@ def slice(
 
     call, fine = current(), as_share(refine, "--refine")
     spec = PlaneSpec(dims, along, through, as_window(window), resolution)
-    env = environment(scene, keywords, dims=dims if policy is None else None)
+    env = environment(scene, keywords, dims=dims)
+    from ..landscapes.identity import BOXED, record_cut
     from ..landscapes.objective import BoxedObjective
     from ..landscapes.sampling.refine import Refinement
     from ..landscapes.space import as_stride
 
-    objective, stride = with_policy(env, policy), as_stride(gradients or 0) if policy is None else 0
+    stride = as_stride(gradients or 0) if env.has_gradient else 0
     in_memory = is_in_memory(env, out)
     begun: dict[str, Any] = {"out": as_path(out), "gradients": stride, "refinement": Refinement.of(fine, budget)}
-    plane = spec.make(objective, None if force or in_memory else begun)
+    plane, training = spec.make(env, None if force or in_memory else begun), spec.training(env)
     if in_memory:
-        boxed = BoxedObjective(objective) if along else objective
-        return _sample_in_memory(boxed, plane, begun["refinement"], stride, floor)
+        boxed = BoxedObjective(env) if BOXED in record_cut(spec.cut) else env
+        return _sample_in_memory(boxed, plane, begun["refinement"], stride, floor, training)
     from ..jobs.slice import SliceJob
     from ..jobs.workers import workers
 
     with workers(scheduler, env.device) as executor:
         job = SliceJob.of(
-            objective, plane, command=call.command, cut=spec.cut, force=force, floor=floor, picture=picture,
-            executor=executor, prints=as_widths(figure_width_mm), **begun,
+            env, plane, command=call.command, cut=spec.cut, force=force, floor=floor, picture=picture,
+            executor=executor, prints=as_widths(figure_width_mm), training=training, **begun,
         )  # fmt: skip
         job.run(call.watch)
-    return _opened(job.store.dataset(), job.folder, lambda: objective)
+    return _opened(job.store.dataset(), job.folder, lambda: env)
 
 
 @verb
@@ -236,7 +236,12 @@ def _opened(dataset: xr.Dataset, path: Path, remake: Callable[[], Objective]) ->
 
 
 def _sample_in_memory(
-    objective: Objective, plane: Plane, refinement: Refinement | None, gradients: int, floor: bool
+    objective: Objective,
+    plane: Plane,
+    refinement: Refinement | None,
+    gradients: int,
+    floor: bool,
+    training: Training | None,
 ) -> Slice:
     from ..jobs.slice import conclude_slice
     from ..landscapes.lattice import check_gradients
@@ -253,7 +258,7 @@ def _sample_in_memory(
     with current().watch.progress(math.prod(plane.resolution), "evaluations") as advance:
         how: dict[str, Any] = {
             "progress": lambda now: advance(now.done),
-            "conclude": lambda whole: conclude_slice(objective, whole),
+            "conclude": lambda whole: conclude_slice(objective, whole, training=training),
         }
         if refinement is None:
             dataset = sample(objective, plane, gradients=gradients, **how)

@@ -5,7 +5,20 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Annotated, Literal, Unpack, cast
 
 from .call import current, verb
-from .options import ARGUMENT, FigureWidth, Force, MadeKeywords, Names, Out, Scene, SceneKeywords, Seed, Share, at_least
+from .options import (
+    ARGUMENT,
+    FigureWidth,
+    Force,
+    MadeKeywords,
+    Names,
+    Out,
+    Point,
+    Scene,
+    SceneKeywords,
+    Seed,
+    Share,
+    at_least,
+)
 from .scene import spec_of
 from .values import as_names, as_path, as_share, as_widths
 
@@ -15,7 +28,7 @@ if TYPE_CHECKING:
 
 @verb
 def study(
-    kind: Annotated[Literal["fidelity", "convergence", "model", "mixed", "extremes", "symmetry"], ARGUMENT],
+    kind: Annotated[Literal["fidelity", "convergence", "model", "mixed", "extremes", "symmetry", "updates"], ARGUMENT],
     scene: Scene,
     *,
     points: Annotated[int | None, at_least(2)] = None,
@@ -30,6 +43,9 @@ def study(
     max_cost: float | None = None,
     time_limit: float | None = None,
     chaotic: bool = False,
+    through: Point | None = None,
+    noise: Share | None = None,
+    rate: float | None = None,
     figure_width_mm: FigureWidth = (),
     out: Out = None,
     force: Force = False,
@@ -54,6 +70,10 @@ def study(
     symmetry: the numerical floor: how much losses and gradients move where only the numerics change. The replicas are
     the scene's own: a moved grid, other particles, another mesh, shorter steps. A function has them by replicas=.
 
+    updates: how losses are distributed after one update along the gradient, and after random steps as long, with the
+    left-tail probability. An update follows the gradient at a point that is moved at random. Most such studies are of
+    the weights of a policy, --policy.
+
     The folder then holds KIND.json and KIND.png. Stop at any time: the same command continues with the next variant.
 
     Raises ValueError for options that the kind does not take, and where there is nothing to compare; StoreMismatchError
@@ -64,9 +84,10 @@ def study(
     Parameters
     ----------
     kind
-        Study to run: fidelity, convergence, model, mixed, extremes or symmetry.
+        Study to run: fidelity, convergence, model, mixed, extremes, symmetry or updates.
     points
-        Number of points at which every variant is measured. The default is 64, 16 for extremes and 32 for symmetry.
+        Number of points at which every variant is measured. The default is 64, 16 for extremes and 32 for symmetry. Of
+        updates: their number, by default 256.
     settings
         Settings to change, a,b or repeated. Of fidelity: dt, resolution, particles, precision, stiffness, engine,
         device. Of convergence: dt, resolution, particles, joint, precision. Of extremes: dt, resolution, box, horizon
@@ -90,6 +111,13 @@ def study(
         Of mixed: time to spend on measurements [s]. The default is 600.
     chaotic
         Of mixed: ignore gradients, because the motion is chaotic.
+    through
+        Of updates: point that they start from, as for `landscape slice`. The default is the center.
+    noise
+        Of updates: how far points are moved at random before their gradient is taken, a standard deviation as a share
+        of the box. The default is 1%.
+    rate
+        Of updates: learning rate, by which gradients are multiplied. By default updates are 1 % of the box long.
     """
     spec = spec_of(scene, cast("SceneKeywords", keywords))
     from ..jobs.study import StudyJob
@@ -100,12 +128,13 @@ def study(
         points=points, seed=seed, settings=tuple(as_names(settings)),
         pairs=None if pairs is None else tuple(as_names(pairs)), precisions=tuple(as_names(precisions)), grid=grid,
         width=width, tolerance=as_share(tolerance, "--tolerance"), reference=reference, max_cost=max_cost,
-        time_limit=time_limit, chaotic=chaotic,
+        time_limit=time_limit, chaotic=chaotic, noise=as_share(noise, "--noise"), rate=rate,
     )  # fmt: skip
     call = current()
     job = StudyJob.open(
-        kind, spec, asked, out=as_path(out), force=force, prints=as_widths(figure_width_mm), command=call.command
-    )
+        kind, spec, asked, through=through, out=as_path(out), force=force, prints=as_widths(figure_width_mm),
+        command=call.command,
+    )  # fmt: skip
     found = job.run(call.watch)
     if path := keep(found):
         call.watch.note(f"kept for other verbs: {path}")

@@ -87,8 +87,8 @@ def sweep(
     with workers(scheduler, env.device) as executor:
         with call.watch.busy(f"opening {frames} slices"):
             job = SweepJob.of(
-                env, plane, over, frames, command=call.command, gradients=as_stride(gradients or 0), force=force,
-                out=as_path(out), cut=spec.cut,
+                env, plane, over, frames, command=call.command, force=force, out=as_path(out), cut=spec.cut,
+                gradients=as_stride(gradients or 0) if env.has_gradient else 0,
             )  # fmt: skip
         replace(job, executor=executor).run(call.watch)
     return job.sample()

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from .terminal import SIMPLE, Console, Table, table
 
 if TYPE_CHECKING:
+    from ..landscapes.statistics import Estimate
     from ..studies.convergence import ConvergenceRecord
     from ..studies.divergence import Distributions
     from ..studies.extremes import ExtremesRecord
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     from ..studies.model import MeasuredPart, ModelRecord
     from ..studies.samples import Bootstrap, Comparison
     from ..studies.symmetry import SymmetryRecord
+    from ..studies.updates import UpdatesRecord
     from ..studies.variants import StudyRecord
 
 MEANING = (
@@ -164,23 +166,42 @@ def _show_extremes(found: ExtremesRecord) -> Iterable[str | Table]:
 
 
 def _show_symmetry(found: SymmetryRecord) -> Iterable[str | Table]:
-    from ..studies.samples import Bootstrap
-
     floor = found.floor
     scale = f"range of the loss {floor.range:.4g} {found.loss_unit}".rstrip()
     yield f"{found.env}: {found.fidelity} on {found.device} and its replicas at {found.points} points; {scale}"
     rows = _table("replica", "losses apart", "rank", "cosine", "lower quartile", "failed")
     for one in found.replicas:
-        ends = [None if math.isnan(end) else end for end in (one.apart.value, one.apart.low, one.apart.high)]
         slopes = ["" if math.isnan(cosine) else f"{cosine:z.3f}" for cosine in (one.cosine.value, one.cosine_low)]
         failed = str(one.failed) if one.failed else ""
-        rows.add_row(one.name, _share(Bootstrap(*ends)), _number(one.spearman), *slopes, failed)
+        rows.add_row(one.name, _share(_as_bootstrap(one.apart)), _number(one.spearman), *slopes, failed)
     yield rows
     yield (
         "losses apart: standard deviation between the scene's and the replica's, as a share of the range (95 % "
         "interval); rank: Spearman's correlation of losses; cosine: of gradients, median and lower quartile"
     )
     yield from found.sentences()
+
+
+def _show_updates(found: UpdatesRecord) -> Iterable[str | Table]:
+    yield (
+        f"{found.env}: {found.fidelity} on {found.device}, {found.points} updates from {found.through}; rate "
+        f"{found.rate:.3g}, {found.length:.2g} widths of the box long at the median, of gradients at points moved by "
+        f"{100 * found.noise:.3g} % of the box"
+    )
+    rows = _table("steps", "mean", "5 %", "25 %", "50 %", "75 %", "95 %", "worse", "left tail", "failed")
+    for one in (found.along, found.random):
+        shares = [_share(_as_bootstrap(each)) for each in (one.worse, one.tail)]
+        failed = str(one.failed) if one.failed else ""
+        rows.add_row(one.name, f"{one.mean.value:.4g}", *(f"{q:.4g}" for q in one.quantiles), *shares, failed)
+    yield rows
+    yield from found.sentences()
+
+
+def _as_bootstrap(found: Estimate) -> Bootstrap:
+    """Return an estimate as what tables show, None where it is not known."""
+    from ..studies.samples import Bootstrap
+
+    return Bootstrap(*(None if math.isnan(end) else end for end in (found.value, found.low, found.high)))
 
 
 SHOWN: dict[str, Any] = {
@@ -190,6 +211,7 @@ SHOWN: dict[str, Any] = {
     "mixed": _show_mixed,
     "extremes": _show_extremes,
     "symmetry": _show_symmetry,
+    "updates": _show_updates,
 }
 
 

@@ -44,6 +44,7 @@ class FunctionEnvironment(Environment):
             horizon_option=function.horizon or "horizon",
             own_programs=function.backend.own_programs,
         )
+        self.beyond_box = bool(function.space.arrays)  # weights mean something beyond their bounds, too
         self.loss_type = ""  # of numbers that the losses came in, once there are some
         super().__init__(**settings)
 

@@ -145,6 +145,7 @@ class Environment(Objective):
     material_range: ClassVar[MaterialRange | None] = None  # where an option sets what the scene is made of
     designed_order: ClassVar[Mapping[str, float]] = {}  # of convergence in dt, resolution, joint (both at once)
     model_parts: ClassVar[tuple[ModelPart, ...]] = ()  # what the model is made of, each with options that change it
+    differentiates_observations: ClassVar[bool] = False  # whether there are gradients of what a policy sees
 
     _solvers: Pool[Any] | None = None  # a scene on an engine sets both in `_setup`: what simulates,
     _capacity = 1 << 20  # and how many rows it takes at once,
@@ -325,15 +326,39 @@ class Environment(Objective):
         a scene is a bandit, with a single decision. Raises ValueError where there is no such decision, and at a horizon
         other than 1, where episodes are not shared by decisions.
         """
-        x = self._check_points(x)
+        x, _ = self._before(self._check_points(x), decision)
+        seen = torch.cat(self._map_parts(partial(self._observe, decision=decision), x))
+        return torch.cat([seen, seen.new_full((len(x), 1), decision / self.decisions)], dim=1)
+
+    @final
+    def pull_back_observation(
+        self, x: Float[Tensor, "batch dim"], decision: int, weight: Float[Tensor, "batch feature"]
+    ) -> Float[Tensor, "batch dim"]:
+        """Return the gradient by x of the sum of what `observe` returns, each number by its weight.
+
+        It is zero by parameters that this decision and later ones set. Raises ValueError as `observe` does, and where
+        what is seen is not differentiated.
+        """
+        if not self.differentiates_observations:
+            raise ValueError(f"{self.name} does not differentiate what it shows a policy")
+        x, made = self._before(self._check_points(x), decision)
+
+        def part(both: Float[Tensor, "some dim_and_feature"]) -> Float[Tensor, "some dim"]:
+            with torch.inference_mode(False), torch.enable_grad():
+                return self._pull_back_observation(both[:, : x.shape[1]], decision, both[:, x.shape[1] :])
+
+        slope = torch.cat(self._map_parts(part, torch.cat([x, weight[:, :-1].to(x)], dim=1)))
+        slope[:, made:] = 0
+        return slope
+
+    def _before(self, x: Float[Tensor, "batch dim"], decision: int) -> tuple[Float[Tensor, "batch dim"], int]:
+        """Return points with the middle of the box from a decision on, and how many parameters come before that."""
         if self.decisions > 1 and self.horizon not in (None, 1.0):
             raise ValueError(f"{self.name} is decided step by step at horizon 1 only; got horizon {self.horizon:g}")
         if not 0 <= decision < self.decisions:
             raise ValueError(f"{self.name} numbers its decisions 0 to {self.decisions - 1}; got {decision}")
-        ahead = self.space.center[self.space.dim * decision // self.decisions :]
-        x = torch.cat([x[:, : self.space.dim - len(ahead)], ahead.expand(len(x), -1)], dim=1)
-        seen = torch.cat(self._map_parts(partial(self._observe, decision=decision), x))
-        return torch.cat([seen, seen.new_full((len(x), 1), decision / self.decisions)], dim=1)
+        made = self.space.dim * decision // self.decisions
+        return torch.cat([x[:, :made], self.space.center[made:].expand(len(x), -1)], dim=1), made
 
     @final
     def prepare(self) -> None:
@@ -478,6 +503,12 @@ class Environment(Objective):
     def _observe(self, x: Float[Tensor, "batch dim"], decision: int) -> Float[Tensor, "batch feature"]:
         """Return the state just before a decision, in units that make it about one."""
         return x.new_zeros(len(x), 0)
+
+    def _pull_back_observation(
+        self, x: Float[Tensor, "batch dim"], decision: int, weight: Float[Tensor, "batch feature"]
+    ) -> Float[Tensor, "batch dim"]:
+        """Return the gradient of the weighted sum of what `_observe` returns, where `differentiates_observations`."""
+        raise NotImplementedError
 
     def _closed_form(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, " batch"] | None:
         """Return the losses of the scene's physics in closed form, differentiable in the parameters' own values."""

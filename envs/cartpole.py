@@ -82,6 +82,7 @@ class Cartpole(Environment):
     }
     loss_unit = "m"
     decisions = CONTROLS
+    differentiates_observations: ClassVar[bool] = True
     control_step: ClassVar[float] = SPAN
     designed_order: ClassVar[dict[str, float]] = {"dt": 4.0}  # classical Runge-Kutta; controls change between steps
     model_parts: ClassVar[tuple[ModelPart, ...]] = (
@@ -162,10 +163,10 @@ class Cartpole(Environment):
         x = x.clone().requires_grad_(grad)
         controls = self._controls(x)
         with self._solvers.lend() as solver:
-            phi = copied(self._swing(solver, controls.detach())[-1]).requires_grad_(grad)
-            tip = _joints(self._cart(controls)[:, -1], phi)[:, -1]
+            phi = copied(self._swing(solver, controls.detach())).requires_grad_(grad)
+            tip = _joints(self._cart(controls)[:, -1], phi[-1])[:, -1]
             loss = (tip - self.target).norm(dim=1)
-            slope = _pull_back(solver, loss, phi, controls, x) if grad else None
+            slope = _pull_back(solver, loss, torch.ones_like(loss), phi, controls, x) if grad else None
         return Evaluation(loss.detach(), slope, torch.full((len(x),), Status.OK, dtype=torch.int8))
 
     def _energy(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch step"]:
@@ -181,13 +182,28 @@ class Cartpole(Environment):
         return energy.T
 
     def _observe(self, x: Float[Tensor, "batch dim"], decision: int) -> Float[Tensor, "batch feature"]:
-        """Watch the cart and the sines and cosines of angles, and how fast cart and angles changed in the last step."""
-        controls, step = self._controls(x), decision * self.steps // CONTROLS
+        controls = self._controls(x)
         with self._solvers.lend() as solver:
-            phi = copied(self._swing(solver, controls)).transpose(0, 1)
-        joints = torch.cat([self._cart(controls)[:, :, None], phi], dim=2)
+            phi = copied(self._swing(solver, controls))
+        return self._watch(controls, phi, decision)
+
+    def _pull_back_observation(
+        self, x: Float[Tensor, "batch dim"], decision: int, weight: Float[Tensor, "batch feature"]
+    ) -> Float[Tensor, "batch dim"]:
+        x = x.clone().requires_grad_()
+        controls = self._controls(x)
+        with self._solvers.lend() as solver:
+            phi = copied(self._swing(solver, controls.detach())).requires_grad_()
+            return _pull_back(solver, self._watch(controls, phi, decision), weight, phi, controls, x)
+
+    def _watch(
+        self, controls: Float[Tensor, "batch control 4"], phi: Float[Tensor, "step_plus_1 batch 3"], decision: int
+    ) -> Float[Tensor, "batch feature"]:
+        """Watch the cart and the sines and cosines of angles, and how fast cart and angles changed in the last step."""
+        step = decision * self.steps // CONTROLS
+        joints = torch.cat([self._cart(controls)[:, :, None], phi.transpose(0, 1)], dim=2)
         rate = (joints[:, step] - joints[:, max(0, step - 1)]) * (TEMPO / self.fidelity.dt)
-        return torch.cat([joints[:, step, :1], phi[:, step].sin(), phi[:, step].cos(), rate], dim=1)
+        return torch.cat([joints[:, step, :1], phi[step].sin(), phi[step].cos(), rate], dim=1)
 
     def _swing(
         self, solver: Solver, controls: Float[Tensor, "batch control 4"]
@@ -228,8 +244,10 @@ def _joints(cart: Float[Tensor, "*batch"], phi: Float[Tensor, "*batch 3"]) -> Fl
     return torch.cat([hinge, hinge + links.cumsum(dim=-2)], dim=-2)
 
 
-def _pull_back(solver: Solver, loss: Tensor, phi: Tensor, controls: Tensor, x: Tensor) -> Tensor:
-    """Return the gradient by x of a loss that depends on the last angles and on the cart's path."""
-    adj_phi, adj_controls = torch.autograd.grad(loss.sum(), (phi, controls), retain_graph=True)
+def _pull_back(
+    solver: Solver, found: Tensor, weight: Tensor, phi: Tensor, controls: Tensor, x: Tensor
+) -> Float[Tensor, "batch dim"]:
+    """Return the gradient by x of what depends on angles and on the cart's path, each number by its weight."""
+    adj_phi, adj_controls = torch.autograd.grad(found, (phi, controls), weight, retain_graph=True)
     (slope,) = torch.autograd.grad(controls, x, adj_controls + solver.gradient(adj_phi).cpu().double())
     return slope

@@ -10,11 +10,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ..landscapes.training import SUFFIXES, read_checkpoint
 from .base import Environment
 
 FORMS = (
-    "center, random:SEED, example:NAME, best, best:RUN, a file with its parameters (.json, .npy, text), or a row of a "
-    "table, TABLE.csv:ROW"
+    "center, random:SEED, example:NAME, best, best:RUN, a file with its parameters (.json, .npy, text), a checkpoint "
+    "(.pt, .pth, .npz, .zip), or a row of a table, TABLE.csv:ROW"
 )
 
 
@@ -33,14 +34,14 @@ def point(environment: Environment, text: str) -> Float[Tensor, " dim"]:
     path = Path(text)
     if not path.is_file():
         raise ValueError(f"{environment.name} can be cut through {FORMS}; got {text!r}, which is none of these")
+    if path.suffix.lower() in SUFFIXES:
+        return read_checkpoint(path, environment.space, environment.name)
     return _read(environment, path)
 
 
 def _read(environment: Environment, path: Path) -> Float[Tensor, " dim"]:
     try:
-        if path.suffix == ".npy":
-            values = np.load(path, allow_pickle=False)
-        elif path.suffix == ".json":
+        if path.suffix == ".json":
             values = np.asarray(json.loads(path.read_text()), dtype=float)
         else:
             values = np.loadtxt(path, delimiter="," if "," in path.read_text() else None, ndmin=1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
@@ -65,6 +66,17 @@ class ModelPart:
     options: Mapping[str, Any]
     change: str
     missing: bool = False
+
+
+MLP = re.compile(r"mlp:([1-9]\d{0,8}(?:x[1-9]\d{0,8})*)")
+
+
+def hidden_layers(policy: str) -> list[int]:
+    """Return the sizes of a policy's hidden layers. Raises ValueError where it is not so written."""
+    found = MLP.fullmatch(policy)
+    if found is None:
+        raise ValueError(f"--policy takes mlp and the sizes of its hidden layers, as mlp:32x32; got {policy!r}")
+    return [int(size) for size in found[1].split("x")]
 
 
 def unknown_fidelity(name: str, known: Iterable[str], given: str) -> ValueError:

@@ -82,6 +82,11 @@ class RemediedEnvironment(Environment):
         """Whether a gradient takes losses alone, so that it costs no more than they do."""
         return self.remedy.from_losses or self.inner.gradients_from_losses
 
+    @property
+    def has_gradient(self) -> bool:  # type: ignore[override] # read only
+        """Whether gradients are known, or estimated from losses."""
+        return self.remedy.from_losses or self.inner.has_gradient
+
     def identity(self) -> dict[str, Any]:
         """Return what decides the numbers: all of the environment within, and the remedies, the first one first."""
         within = self.inner.identity()
@@ -134,7 +139,7 @@ class RemediedEnvironment(Environment):
 
     def with_horizon(self, horizon: float) -> Environment:
         """Return this environment with episodes of another length."""
-        return RemediedEnvironment(self.inner.with_horizon(horizon), self.remedy)
+        return type(self)(self.inner.with_horizon(horizon), self.remedy)
 
     def plain_point(self, x: Float[Tensor, "*batch dim"]) -> Float[Tensor, "*batch dim"]:
         """Return the points of the environment within its remedies that points stand for."""
@@ -145,7 +150,7 @@ class RemediedEnvironment(Environment):
         return self.inner.without()
 
     def _remake(self, **settings: Any) -> Environment:
-        return RemediedEnvironment(self.inner.remake(**settings), self.remedy)
+        return type(self)(self.inner.remake(**settings), self.remedy)
 
     def _setup(self) -> None:
         if self._max_rows < type(self)._max_rows:  # a batch took too much memory

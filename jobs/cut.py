@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ..landscapes.identity import FILTERS, TRAINED
 from ..landscapes.plain import plain_name
 from .scene import named_point, plane_through, runs_in
 
@@ -16,8 +17,10 @@ if TYPE_CHECKING:
     from ..landscapes.objective import Objective
     from ..landscapes.plane import Plane
     from ..landscapes.space import ParameterSpace
+    from ..landscapes.training import Training
 
 ONE_OF = "a slice takes --dims, one or two parameters, or --along, directions; give one of them"
+PCA = "pca"
 WORDS = ("center", "example", "random", "best")  # that names of points begin with
 REACH, MIN_WIDTH = 0.5, 1e-3  # of a width of the box: how far a slice reaches, and what is no width for one
 REACH_PER_ROOT = 1 / 8  # the same by the root of how many parameters there are: each moves by that share of its width
@@ -27,10 +30,11 @@ REACH_PER_ROOT = 1 / 8  # the same by the root of how many parameters there are:
 class PlaneSpec:
     """Say where a landscape is cut: along one or two parameters, `dims`, or `along` directions that are named.
 
-    Directions are random:SEED, gradient, hessian, pca:RUN, A:B or A:B:C, in widths of the box. Points of a line or a
-    plane are named as those it goes `through`. By default a cut along parameters covers the box; one along directions
-    reaches half a width to each side of the point, and farther where there are more than sixteen parameters. Where
-    there are no more than two parameters and neither is given, it varies all.
+    Directions are random:SEED, gradient, hessian, pca:RUN, A:B or A:B:C, in widths of the box; filters:SEED, in norms
+    of the point's filters; or training:FOLDER. Points of a line or a plane are named as those it goes `through`. By
+    default a cut along parameters covers the box; one along directions reaches half a width to each side of the point,
+    and farther where there are more than sixteen parameters; one along filters reaches one norm. Where there are no
+    more than two parameters and neither is given, it varies all.
 
     Raises ValueError for parameters beside directions, and for a word that names no directions.
     """
@@ -56,7 +60,24 @@ class PlaneSpec:
 
         names = joined_points(self.along)
         point = self.through if isinstance(self.through, str) else self.through.tolist()
-        return {"along": self.along, "through": point, "extent": self.window, **({JOINED: names} if names else {})}
+        found = {"along": self.along, "through": point, "extent": self.window, **({JOINED: names} if names else {})}
+        if self.folder is None:
+            return found
+        from ..landscapes.training import digest_training
+
+        return found | {TRAINED: digest_training(self.folder)}
+
+    @property
+    def folder(self) -> Path | None:
+        """The folder of the training that is cut along, None where there is none."""
+        kind, _, folder = (self.along or "").partition(":")
+        return Path(folder) if kind == TRAINED else None
+
+    def training(self, objective: Objective) -> Training | None:
+        """Return the training that is cut along, None where there is none; raises ValueError where it is another's."""
+        from ..landscapes.training import Training
+
+        return Training.read(self.folder, objective) if self.folder else None
 
     def make(self, objective: Objective, kept: Mapping[str, Any] | None = None) -> Plane:
         """Return the line or plane in an objective's space.
@@ -98,39 +119,53 @@ def _plane_along(
 ) -> Plane:
     import torch
 
-    from ..landscapes.directions import gradient_directions, hessian_directions, joining, random_directions
+    from ..landscapes import directions as find
     from ..landscapes.plane import Plane
 
-    names = joined_points(along)
+    names, space = joined_points(along), objective.space
     kind, value = ("", "") if names else _check_directions(along)
     elsewhere = window is not None or not isinstance(through, str) or through != "center"
-    if (names or kind == "pca") and elsewhere:
+    if (names or kind in (PCA, TRAINED)) and elsewhere:
         raise ValueError(f"--along {along} says where it goes; leave out --through and --window")
     if names:
-        return joining(objective.space, [named_point(objective, name) for name in names], names, resolution)
-    if kind == "pca":
+        return find.joining(space, [named_point(objective, name) for name in names], names, resolution)
+    if kind == PCA:
         from ..landscapes.overlay import principal_plane
 
         return principal_plane(runs_in(objective, value), resolution=(resolution, resolution))
+    if kind == TRAINED:
+        from ..landscapes.training import Training
+
+        return Training.read(Path(value), objective).plane(space, resolution)
     point = named_point(objective, through) if isinstance(through, str) else through
+    if kind == FILTERS:
+        spans, labels = find.filter_directions(space, point, int(value), objective.name)
+        ends = (-1.0, 1.0) if window is None else _ends(window)
+        return Plane.span(point, torch.from_numpy(spans), resolution=resolution, window=ends, labels=labels)
     if kind == "random":
-        directions, labels = random_directions(objective.space, int(value))
+        directions, labels = find.random_directions(space, int(value))
     elif along == "gradient":
-        directions, labels = gradient_directions(objective, point)
+        directions, labels = find.gradient_directions(objective, point)
     else:
-        directions, labels = hessian_directions(objective, point)
-    spans = torch.from_numpy(directions) * (objective.space.upper - objective.space.lower)
-    lower, upper = _reach(objective.space, point, spans) if window is None else _ends(window)
-    return Plane.span(point, spans, resolution=resolution, window=(lower, upper), labels=labels)
+        directions, labels = find.hessian_directions(objective, point)
+    wide = torch.from_numpy(directions) * (space.upper - space.lower)
+    lower, upper = _reach(space, point, wide) if window is None else _ends(window)
+    return Plane.span(point, wide, resolution=resolution, window=(lower, upper), labels=labels)
 
 
 def _check_directions(along: str) -> tuple[str, str]:
     """Return the kind of directions that a word names, and what follows it. Raises ValueError where it names none."""
     kind, _, value = along.partition(":")
-    if along in ("pca", "pca:"):
+    if kind == PCA and not value:
         raise ValueError("--along pca:RUN takes the folder of a run or of a race; got no folder")
-    if not (along in ("gradient", "hessian") or kind == "pca" or (kind == "random" and value.isdecimal())):
-        raise ValueError(f"--along takes random:SEED, gradient, hessian, pca:RUN, A:B or A:B:C; got {along!r}")
+    if kind == TRAINED and not Path(value or "none").is_dir():
+        raise ValueError(f"--along training:FOLDER takes the folder of a training's checkpoints; got {value!r}")
+    seeded = kind in ("random", FILTERS) and value.isdecimal()
+    if not (along in ("gradient", "hessian") or kind in (PCA, TRAINED) or seeded):
+        raise ValueError(
+            "--along takes random:SEED, filters:SEED, gradient, hessian, pca:RUN, training:FOLDER, A:B or A:B:C; got "
+            f"{along!r}"
+        )
     return kind, value
 
 
@@ -166,7 +201,7 @@ def folder_for(out: Path, point: str, points: Sequence[str]) -> Path:
 
 def joined_points(along: str) -> list[str]:
     """Return the names of the two or three points that a line or a plane joins, none where `along` is another word."""
-    if along in ("gradient", "hessian") or along.partition(":")[0] == "pca":
+    if along in ("gradient", "hessian") or along.partition(":")[0] in (PCA, FILTERS, TRAINED):
         return []
     names = points_in(along)
     return names if len(names) in (2, 3) else []

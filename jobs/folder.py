@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..landscapes.plain import digest, plain_json
+from ..landscapes.plain import digest, plain_json, plain_name
 from ..landscapes.storage import paths
 from ..landscapes.storage.files import other_files, refuse_others, visible_files
 from ..landscapes.storage.paths import slice_exists
@@ -86,7 +86,7 @@ CENSUS = Results("census", ("census.json", "census.npz", "census.png"), "census.
 
 def folder_named(parts: Iterable[object], settings: Any, root: Path = ROOT) -> Path:
     """Return a folder of its own for all different settings, the same for the same ones, named after `parts`."""
-    return root / "-".join([*map(str, parts), digest(settings)])
+    return root / "-".join([*(plain_name(str(part)) for part in parts), digest(settings)])
 
 
 def store_in(path: Path, store: str) -> Path:

@@ -27,14 +27,13 @@ from ..landscapes.curvature import (
     measure_spectrum,
 )
 from ..landscapes.measures.hessian import BOX_UNITS, Hessian, conclude
-from ..landscapes.objective import Evaluation, Objective, ObjectiveWrapper, check_points, evaluate
-from ..landscapes.space import as_tensor
+from ..landscapes.objective import Evaluation, Objective, ObjectiveWrapper, evaluate
 from ..landscapes.storage.checkpoint import Checkpoint
 from ..landscapes.storage.files import replacing
 from .folder import HESSIAN, folder_named
 from .job import CheckpointedJob
 from .plan import simulation_seconds
-from .scene import SceneSpec, named_point, provenance
+from .scene import SceneSpec, given_point, provenance
 from .watch import PREPARING, Watch, Work
 
 if TYPE_CHECKING:
@@ -82,7 +81,7 @@ class HessianJob(CheckpointedJob[Hessian]):
         and where the folder holds another Hessian.
         """
         env = scene.make()
-        x, dim = _point(env, through), env.space.dim
+        x, dim = given_point(env, through, "hessian"), env.space.dim
         require("eigenpairs", pairs, lambda count: Need(8.0 * COPIES * dim * 2 * count))
         require("probes", probes, lambda count: Need(8.0 * COPIES * dim * (LANCZOS + 2) * count))
         identity = {**env.identity(), "point": x.tolist(), "eigenpairs": pairs, "probes": probes, "seed": seed}
@@ -179,10 +178,3 @@ class _WithoutGradients(ObjectiveWrapper):
         """Return losses at points `x` of the space."""
         found = self.objective.evaluate(x, grad=False)
         return Evaluation.from_results(found.loss, torch.full_like(x, torch.nan) if grad else None, found.status)
-
-
-def _point(env: Environment, through: Any) -> Float[Tensor, " dim"]:
-    """Return the point that is named or given. Raises ValueError where it is none of the environment's space."""
-    if isinstance(through, str):
-        return named_point(env, through)
-    return check_points(as_tensor(through, "hessian")[None], env.space, env.name)[0]

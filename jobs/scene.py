@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from .. import __version__
 from ..envs.engines import installed_version
 from ..envs.registry import find_environment, make, registered_environment, source_of
-from ..landscapes.identity import MODEL_VERSION, PACKAGE, REMEDY, VERSIONS, stored_identity
+from ..landscapes.identity import MODEL_VERSION, PACKAGE, POLICY, REMEDY, VERSIONS, stored_identity
 from ..landscapes.options import record_options
 from ..landscapes.plain import digest, number, plain_json, read_share
 from ..landscapes.storage.files import moved_by, write_json
@@ -46,7 +46,8 @@ class SceneSpec:
     `name` is a registered name, FILE.py:NAME, an environment's class, or an environment. `fidelity` is a name or a
     record, by default the cheapest; `tolerance` chooses it by measured loss errors instead ("5%" of the losses' spread,
     or "0.05" in their unit). `device` is auto, cpu or cuda, `engine` one of the scene's, by default its first, and
-    `options` are the scene's own. `remedy` is what is done about its landscape, such as smooth:2% (`envs.remedies`).
+    `options` are the scene's own. `policy`, mlp:32x32, decides instead of the scene's parameters, and its weights are
+    the parameters. `remedy` is what is done about the landscape, such as smooth:2% (`envs.remedies`).
     """
 
     name: str | type[Environment] | Environment
@@ -56,6 +57,7 @@ class SceneSpec:
     engine: str | None = None
     deterministic: bool = False
     options: Mapping[str, Any] = field(default_factory=dict)
+    policy: str | None = None
     remedy: str | None = None
 
     @classmethod
@@ -63,7 +65,7 @@ class SceneSpec:
         """Return what makes an environment such as this one again."""
         return cls(
             source_of(env), env.fidelity, None, env.device, env.engine, env.deterministic, asdict(env.options),
-            env.identity().get(REMEDY),
+            *made_with(env.identity()),
         )  # fmt: skip
 
     @property
@@ -87,16 +89,28 @@ class SceneSpec:
             spec.name, fidelity=spec.fidelity, device=spec.device, engine=spec.engine,
             deterministic=spec.deterministic, **{**spec.options, **changes},
         )  # fmt: skip
-        return with_remedy(made, spec.remedy)
+        return made_over(made, spec.policy, spec.remedy)
 
 
-def with_remedy(env: Environment, remedy: str | None) -> Environment:
-    """Return an environment with remedies (smooth:2%,clip:1), itself without. Raises ValueError for what is none."""
-    if not remedy:
-        return env
-    from ..envs.remedies import remedied
+def made_with(identity: Mapping[str, Any]) -> tuple[str | None, str | None]:
+    """Return the policy and the remedies that the environment of an identity has."""
+    return identity.get(POLICY), identity.get(REMEDY)
 
-    return remedied(env, remedy)
+
+def made_over(env: Environment, policy: str | None, remedy: str | None) -> Environment:
+    """Return an environment over the weights of a policy (mlp:32x32), with remedies (smooth:2%,clip:1), or itself.
+
+    Raises ValueError for what is no policy or no remedy, and for a policy where there are no decisions to take.
+    """
+    if policy:
+        from ..envs.policies import with_policy
+
+        env = with_policy(env, policy)
+    if remedy:
+        from ..envs.remedies import remedied
+
+        env = remedied(env, remedy)
+    return env
 
 
 def provenance(objective: Objective, command: str) -> dict[str, Any]:
@@ -114,18 +128,6 @@ def _version(package: str) -> str:
     return installed_version(package) or ABSENT
 
 
-def with_policy(env: Environment, policy: str | None) -> Objective:
-    """Return an environment over the weights of a policy (mlp:32x32), itself where there is none.
-
-    Raises ValueError for what is no policy, and for an environment without decisions to take.
-    """
-    if policy is None:
-        return env
-    from ..landscapes.policies import PolicyObjective
-
-    return PolicyObjective(env, policy)
-
-
 def environment_of(dataset: xr.Dataset, device: str, env: Any = None) -> Environment:
     """Return the environment that a slice or a run was evaluated in, with its settings, on a device.
 
@@ -137,14 +139,13 @@ def environment_of(dataset: xr.Dataset, device: str, env: Any = None) -> Environ
     from ..envs.base import Fidelity
 
     identity = stored_identity(dataset)
-    if "policy" in identity:
-        raise ValueError(f"the slice is over the weights of a policy, {identity['objective']}, which is not made again")
     if missing := {"objective", "settings", "engine", "options", "deterministic"} - set(identity):
         raise ValueError(
             f"the slice is not one of an environment, its identity lacks {', '.join(sorted(missing))}; "
             "`landscape slice ENV` samples one"
         )
-    name = str(identity["objective"])
+    policy, remedy = made_with(identity)
+    name = str(identity["objective"]).removesuffix(f" with policy {policy}")
     try:
         found = registered_environment(name) if env is None else find_environment(env)
     except ValueError as error:
@@ -158,7 +159,7 @@ def environment_of(dataset: xr.Dataset, device: str, env: Any = None) -> Environ
         found, fidelity=Fidelity(**identity["settings"]), device=device, engine=identity["engine"],
         deterministic=identity["deterministic"], **identity["options"],
     )  # fmt: skip
-    return with_remedy(made, identity.get(REMEDY))
+    return made_over(made, policy, remedy)
 
 
 def point_of(env: Environment, text: str) -> Tensor:
@@ -250,6 +251,16 @@ def named_point(objective: Objective, text: str) -> Tensor:
         return objective.space.uniform(1, seed=int(seed))[0]
     forms = "center, random:SEED, a table (.csv, .parquet) or a tensor"
     raise ValueError(f"{objective.name} can be cut through {forms}; got {text!r}")
+
+
+def given_point(objective: Objective, through: Any, who: str) -> Tensor:
+    """Return the point that is named or given. Raises ValueError, of `who` asks, where it is none of the space."""
+    from ..landscapes.objective import check_points
+    from ..landscapes.space import as_tensor
+
+    if isinstance(through, str):
+        return named_point(objective, through)
+    return check_points(as_tensor(through, who)[None], objective.space, objective.name)[0]
 
 
 def read_scene(text: str, scene: SceneSpec) -> SceneSpec:

@@ -23,7 +23,7 @@ from torch import Tensor
 from ..landscapes.capacity import peak_memory, size
 from ..landscapes.cost import PICTURE_SECONDS, duration, seconds_per_episode
 from ..landscapes.directions import barrier
-from ..landscapes.identity import plane_of, stored_identity, with_stride
+from ..landscapes.identity import BOXED, plane_of, record_cut, stored_identity, with_stride
 from ..landscapes.lattice import check_gradients, count_gradients
 from ..landscapes.measures.floor import Floor
 from ..landscapes.measures.slice_floor import (
@@ -54,6 +54,7 @@ from ..landscapes.storage.floor_map import (
 )
 from ..landscapes.storage.paths import is_slice, slice_exists
 from ..landscapes.storage.store import SliceStore
+from ..landscapes.training import Training, TrainingPath
 from ..landscapes.verification import verify_dataset
 from .folder import ROOT, SLICE, SUMMARY, folder_named
 from .job import SummaryJob
@@ -83,7 +84,8 @@ class SliceSummary:
     Gradients are at every `gradients_every` samples along each axis. `episodes` are those of the samples;
     `undersampled` has those that looked between them, and what they found, None where nothing is known of it.
     `barrier` [loss unit] is that between the ends of a line. `error` is what the first point that raised said.
-    `floor` is what replicas of the objective differ by, None where it has none.
+    `floor` is what replicas of the objective differ by, None where it has none; `training` is the path of a training
+    that the slice was cut along.
     """
 
     env: str | None
@@ -107,6 +109,7 @@ class SliceSummary:
     barrier: float | None = None
     error: str = ""
     floor: Floor | None = None
+    training: TrainingPath | None = None
 
     def outcome(self) -> str:
         """Say in a line what the slice cost and what came out."""
@@ -122,8 +125,9 @@ class SliceSummary:
         barred = "" if self.barrier is None else f"; barrier of {self.barrier:.4g} above the line between its ends"
         hidden = f"; {said}" if self.undersampled and (said := self.undersampled.describe()) else ""
         numerics = f"; {self.floor.sentence()}" if self.floor else ""
+        trained = f"; {self.training.sentence()}" if self.training else ""
         spent = f"{self.episodes} episodes in {duration(self.seconds)}"
-        return f"{spent}; {ends}{raised}; {losses}{flat}{barred}{refined}{hidden}{numerics}"
+        return f"{spent}; {ends}{raised}; {losses}{flat}{barred}{refined}{hidden}{numerics}{trained}"
 
 
 @dataclass(frozen=True)
@@ -165,6 +169,7 @@ class SliceJob(SummaryJob[SliceSummary]):
     """A slice to sample, and how to draw it, here or by the workers of an `executor`, each with what `remake` returns.
 
     With a `refinement` it is sampled only where it has to be. With `floor` its replicas are evaluated at every sample.
+    Checkpoints of a `training` that it was cut along are evaluated, too.
     """
 
     results = SLICE
@@ -177,6 +182,7 @@ class SliceJob(SummaryJob[SliceSummary]):
     refinement: Refinement | None = None
     floor: bool = False
     drawn: bool = True
+    training: Training | None = None
 
     @classmethod
     def of(
@@ -196,17 +202,19 @@ class SliceJob(SummaryJob[SliceSummary]):
         refinement: Refinement | None = None,
         floor: bool = False,
         picture: bool = True,
+        training: Training | None = None,
     ) -> SliceJob:
         """Continue the slice in `out`, by default a folder under `root` named after it, or begin it there.
 
         Gradients are at every so many samples along each axis, `gradients`, 0 for none. `boxed` leaves out what lies
-        beyond the bounds; so does a `cut`, how it was cut along directions. `floor` is no setting of the slice.
+        beyond the bounds; so does a `cut`, how it was cut along directions, but for those of weights. `floor` is no
+        setting of the slice.
         Raises ValueError for what cannot be, and where the folder holds something else or another slice.
         """
         if floor:
             refuse_without_replicas(objective, refined=refinement is not None)
         gradients = check_gradients(gradients, plane, refined=refinement is not None)
-        identity = _identity(objective, gradients, boxed=boxed, cut=cut)
+        identity = _identity(objective, gradients, cut, boxed=boxed)
         folder = out or default_folder(identity, plane.resolution, plane, gradients > 0, root, refinement)
         if refinement is not None:
             refinement.check(plane)
@@ -215,17 +223,20 @@ class SliceJob(SummaryJob[SliceSummary]):
             folder, plane, objective.space, force=force,
             identity=identity, provenance=provenance(objective, command), grad=gradients > 0,
         )  # fmt: skip
-        boxed = "boxed" in identity
+        boxed = BOXED in identity
         return cls(
             objective=BoxedObjective(objective) if boxed else objective, remake=None if boxed else recipe(objective),
             plane=plane, store=store, plot=picture_of(objective, plane), folder=folder, command=command,
             executor=executor, prints=prints, refinement=refinement, floor=floor, drawn=picture or bool(prints),
+            training=training,
         )  # fmt: skip
 
     def work(self) -> list[Work]:
         """Return its samples and what looks between them, and the replicas' slices where those are mapped."""
         every = self.store.every if self.store.grad else 0
         whole = [slice_work(self.objective, self.plane.resolution, every)]
+        if self.training is not None:
+            whole.append(Work(self.objective, len(self.training.x)))
         replicas = self.objective.replicas().values() if self.floor else []
         return whole + [slice_work(one, self.plane.resolution, every, between=False) for one in replicas]
 
@@ -321,7 +332,7 @@ class SliceJob(SummaryJob[SliceSummary]):
 
             def conclude(dataset: xr.Dataset) -> dict[str, Any]:
                 advance(dataset["status"].size, "checks between samples")
-                return conclude_slice(self.objective, dataset, self.executor, self.remake)
+                return conclude_slice(self.objective, dataset, self.executor, self.remake, training=self.training)
 
             how: dict[str, Any] = {"executor": self.executor, "made": self.remake}
             how |= {"progress": follow, "conclude": conclude}
@@ -378,13 +389,15 @@ class SliceJob(SummaryJob[SliceSummary]):
             barrier=barrier_of(dataset),
             error=self.store.error,
             floor=floor_of(dataset),
+            training=TrainingPath.of(dataset),
         )
 
 
-def _identity(objective: Objective, gradients: int, *, boxed: bool, cut: Mapping[str, Any] | None) -> dict[str, Any]:
-    """Return what decides a slice's numbers, but for its plane; one that was cut along directions is boxed."""
-    about = ({"boxed": True} if boxed or cut is not None else {}) | ({"cut": dict(cut)} if cut else {})
-    return with_stride(objective.identity(), gradients) | about
+def _identity(
+    objective: Objective, gradients: int, cut: Mapping[str, Any] | None, *, boxed: bool = False
+) -> dict[str, Any]:
+    """Return what decides a slice's numbers, but for its plane."""
+    return with_stride(objective.identity(), gradients) | record_cut(cut, boxed=boxed)
 
 
 def _open_store(folder: Path, plane: Plane, space: ParameterSpace, *, force: bool, **settings: Any) -> SliceStore:
@@ -513,7 +526,7 @@ def kept_plane(
 
     It continues along these: others may come out a little different each time, on a GPU, and some take many episodes.
     """
-    identity = _identity(objective, gradients, boxed=True, cut=cut)
+    identity = _identity(objective, gradients, cut)
     path = (out or default_folder(identity, resolution, None, gradients > 0, root, refinement)) / STORE
     if not is_slice(path):
         return None
@@ -528,16 +541,19 @@ def conclude_slice(
     dataset: xr.Dataset,
     executor: Executor | None = None,
     remake: Callable[[], Objective] | None = None,
+    *,
+    training: Training | None = None,
 ) -> dict[str, Any]:
     """Return the attributes of a slice that say what is real of it: its numerical floor, and what its samples hide.
 
-    With an `executor` its workers evaluate.
+    With an `executor` its workers evaluate. Where it was cut along a `training`, they say its path, too.
     """
     floor = None
     with _sampled_all_the_same(f"{objective.name}'s replicas raised, so its numerical floor is not known"):
         floor = find_floor(objective, dataset, through=lambda one: evaluator(one, executor, recipe(one)))
     hidden = look_between(evaluator(objective, executor, remake), dataset, floor=counted_from(floor))
-    return {**(floor_attribute(floor) if floor else {}), **hidden}
+    path = {} if training is None else training.over(plane_of(dataset), objective).attribute()
+    return {**(floor_attribute(floor) if floor else {}), **hidden, **path}
 
 
 def look_between(objective: Objective, dataset: xr.Dataset, *, floor: float = 0.0) -> dict[str, Any]:

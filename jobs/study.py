@@ -6,14 +6,14 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from ..landscapes.cost import PICTURE_SECONDS, duration, seconds_per_episode, start_seconds
 from ..studies import study_class
-from ..studies.variants import Study, StudyOptions, StudyRecord, expected_work
+from ..studies.variants import NamedPoint, Study, StudyOptions, StudyRecord, expected_work
 from .folder import STUDIES, Results, folder_named
 from .job import CheckpointedJob
-from .scene import SceneSpec, provenance
+from .scene import SceneSpec, given_point, provenance
 from .watch import PREPARING, Watch, Work
 
 if TYPE_CHECKING:
@@ -33,6 +33,7 @@ class StudyJob(CheckpointedJob[StudyRecord]):
         scene: SceneSpec,
         options: StudyOptions | None = None,
         *,
+        through: Any = None,
         out: Path | None = None,
         force: bool = False,
         prints: Sequence[float] = (),
@@ -40,13 +41,17 @@ class StudyJob(CheckpointedJob[StudyRecord]):
     ) -> StudyJob:
         """Continue the study in its folder, by default one named after it, or begin it there.
 
-        Raises ValueError for a kind, options and a fidelity that are not to be had, where the scene has nothing to
-        compare, and where the folder holds another study.
+        `through` names the point that it is about, or is one, of a kind that is about one. Raises ValueError for a
+        kind, options, a point and a fidelity that are not to be had, where the scene has nothing to compare, and where
+        the folder holds another study.
         """
         found = study_class(kind)
         fidelity = found.choose_fidelity(scene.kind, scene.fidelity)
-        env = replace(scene, fidelity=fidelity, tolerance=None).make()
-        study = found(env, options or StudyOptions())
+        env, options = replace(scene, fidelity=fidelity, tolerance=None).make(), options or StudyOptions()
+        if through is not None:
+            name = through if isinstance(through, str) else "a point"
+            options = replace(options, through=NamedPoint(name, given_point(env, through, f"study {kind}")))
+        study = found(env, options)
         folder = out or folder_named(study.folder_parts(), study.identity())
         study.open(folder, force=force)
         return cls(study=study, checkpoint=study.checkpoint, folder=folder, prints=prints, command=command)

@@ -19,7 +19,7 @@ import xarray as xr
 
 from ..landscapes.capacity import BLOCK, Need, require, size
 from ..landscapes.cost import FRAME_SECONDS, PICTURE_SECONDS, duration
-from ..landscapes.identity import with_stride
+from ..landscapes.identity import BOXED, record_cut, with_stride
 from ..landscapes.lattice import check_gradients
 from ..landscapes.objective import BoxedObjective, Objective, failed
 from ..landscapes.plain import plain_name
@@ -139,9 +139,9 @@ class SweepJob(SummaryJob[SweepSummary]):
         """Continue the sweep of an environment in `out`, by default a folder named after it, or begin it there.
 
         Gradients are at every so many samples along each axis, 0 for none; of smoothed losses there are none. With a
-        `cut`, how it was cut along directions, it is boxed, and one that was begun continues along its own directions:
-        on a GPU they come out a little different each time. Raises ValueError for what cannot be swept or has no room,
-        and where the folder holds something else or another sweep.
+        `cut`, how it was cut along directions, it is boxed, but for those of weights. One that was begun continues
+        along its own directions: on a GPU they come out a little different each time. Raises ValueError for what cannot
+        be swept or has no room, and where the folder holds something else or another sweep.
         """
         if plane.rank != 2 or frames < 2:
             dims = ", ".join(plane.names)
@@ -164,7 +164,9 @@ class SweepJob(SummaryJob[SweepSummary]):
             )
             for name, plane, identity in zip(motion.stores, motion.planes, identities, strict=True)
         )
-        return cls(env=env, motion=motion, folder=folder, stores=stores, command=command, boxed=bool(cut))
+        return cls(
+            env=env, motion=motion, folder=folder, stores=stores, command=command, boxed=BOXED in record_cut(cut)
+        )
 
     @cached_property
     def total(self) -> int:
@@ -286,7 +288,7 @@ class SweepJob(SummaryJob[SweepSummary]):
 
 
 def _identity(env: Environment, gradients: int, cut: Mapping[str, Any] | None) -> dict[str, Any]:
-    return with_stride(env.identity(), gradients) | ({"boxed": True, "cut": dict(cut)} if cut else {})
+    return with_stride(env.identity(), gradients) | record_cut(cut)
 
 
 def sweep_folder(

@@ -21,9 +21,8 @@ from typing import TYPE_CHECKING, Any
 
 from ..envs.registry import make, source_of
 from ..landscapes.draw.loopback import LOOPBACK
-from ..landscapes.identity import REMEDY
 from ..landscapes.plain import printable
-from .scene import with_remedy
+from .scene import made_over, made_with
 
 if TYPE_CHECKING:
     from ..envs.base import Environment
@@ -124,14 +123,17 @@ def recipe(objective: Objective) -> partial[Environment] | None:
         return None
     env = objective
     how = {"fidelity": env.fidelity, "device": env.device, "engine": env.engine, "deterministic": env.deterministic}
-    remedy = env.identity().get(REMEDY)
-    return partial(_make_checked, source_of(env), env.version_on(env.engine), how | asdict(env.options), remedy)
+    over = made_with(env.identity())
+    return partial(_make_checked, source_of(env), env.version_on(env.engine), how | asdict(env.options), over)
 
 
 def _make_checked(
-    source: str | type[Environment] | Environment, model: int, settings: dict[str, Any], remedy: str | None
+    source: str | type[Environment] | Environment,
+    model: int,
+    settings: dict[str, Any],
+    over: tuple[str | None, str | None],
 ) -> Environment:
-    env = with_remedy(make(source, **settings), remedy)
+    env = made_over(make(source, **settings), *over)
     if (theirs := env.version_on(env.engine)) != model:
         raise ValueError(
             f"worker {platform.node()} has {env.name} model {theirs}; here it is model {model}: install the same "

@@ -34,6 +34,32 @@ def random_directions(space: ParameterSpace, seed: int) -> tuple[Array, list[str
     return orthonormal(np.random.default_rng(seed), space.dim), labels
 
 
+def filter_directions(space: ParameterSpace, x: Float[Tensor, " dim"], seed: int, name: str) -> tuple[Array, list[str]]:
+    """Return two random directions, filter-normalised at a point (Li et al. 2018), in the parameters' own units.
+
+    Gaussian noise is scaled filter by filter, so that each filter of a direction has the norm of that filter at the
+    point; biases do not change. Directions are not made orthogonal, as theirs are not. Raises ValueError where the
+    space, that of what is called `name`, has no filters, and where all of them are zero at the point.
+    """
+    filters, here = space.filters, x.numpy()
+    if not filters:
+        raise ValueError(
+            f"{name} does not say which of its {space.dim} parameters are the weights of one neuron; make its space by "
+            "ParameterSpace.of_weights({'weight': (8, 3), 'bias': (8,)}), or cut along random:SEED"
+        )
+    norms = np.array([np.linalg.norm(here[own]) for own in filters])
+    if not norms.any():
+        raise ValueError(
+            f"all filters of {name} are zero at this point, so directions have no length there; cut it "
+            "--through another"
+        )
+    noise, found = np.random.default_rng(seed).standard_normal((2, space.dim)), np.zeros((2, space.dim))
+    for own, norm in zip(filters, norms, strict=True):
+        drawn = noise[:, own]
+        found[:, own] = drawn * (norm / np.linalg.norm(drawn, axis=1, keepdims=True))
+    return found, [f"filter-normalised direction {axis} [filter norms]" for axis in (1, 2)]
+
+
 def gradient_directions(objective: Objective, x: Float[Tensor, " dim"]) -> tuple[Array, list[str]]:
     """Return the gradient's direction, and the one orthogonal to it that changes it most: of H g without g.
 

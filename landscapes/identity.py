@@ -22,8 +22,11 @@ ERROR = "error"  # the attribute of a slice or a run with what the first point t
 UNNAMED = "default"  # the fidelity of a simulator that names none
 BOUNDS = "bounds"  # of the parameters, lower and upper, by their own values: of a slice's provenance
 SCALES = "scales"  # of the parameters in an identity; not there where all are linear
+POLICY = "policy"  # in the identity of an environment over the weights of a policy: mlp:32x32
 REMEDY = "remedy"  # in the identity of an environment with remedies, as the command line spells them; and with it
 EPISODES_PER_POINT = "episodes_per_point"  # how many episodes a point takes: elsewhere one
+CUT, BOXED = "cut", "boxed"  # in a slice's identity: how it was cut along directions, and whether inside the box only
+FILTERS, TRAINED = "filters", "training"  # kinds of directions of weights, whose bounds are no more than a guess
 ABSENT = "none"  # instead of a setting's value
 LISTED_SETTINGS = 6  # settings that differ, in the refusal of a store
 MODEL_VERSION: Final = "model_version"  # in an identity; and so is
@@ -124,6 +127,17 @@ def stored_provenance(dataset: xr.Dataset) -> dict[str, Any]:
     Raises ValueError where the dataset is neither.
     """
     return current_provenance(_decode(dataset, "provenance"), _decode(dataset, "identity"))
+
+
+def record_cut(cut: Mapping[str, Any] | None, *, boxed: bool = False) -> dict[str, Any]:
+    """Return what an identity says of how a slice was cut along directions, by what is `along` in it.
+
+    It is boxed then, inside the bounds only, but for directions of weights.
+    """
+    if cut is None:
+        return {BOXED: True} if boxed else {}
+    boxed = boxed or str(cut["along"]).partition(":")[0] not in (FILTERS, TRAINED)
+    return {**({BOXED: True} if boxed else {}), CUT: dict(cut)}
 
 
 def simulator_parts(identity: Mapping[str, Any]) -> list[str]:

@@ -196,6 +196,7 @@ class Objective(abc.ABC):
     own_programs: bool = False  # whether each one made compiles programs of its own, for each size of batch
     episodes_per_point: int = 1  # that the evaluation of one point takes
     decisions: int = 1  # how often controls are chosen in an episode: dim / decisions of them, time first
+    has_gradient: bool = True  # False where it is known that there is none
     _named: bool = False
 
     def __init_subclass__(cls, **how: Any) -> None:
@@ -306,6 +307,7 @@ class ObjectiveWrapper(Objective):
         self.name, self.space, self.loss_unit = objective.name, objective.space, objective.loss_unit
         self.beyond_box, self.device, self.decisions = objective.beyond_box, objective.device, objective.decisions
         self.whole_batches, self.own_programs = objective.whole_batches, objective.own_programs
+        self.has_gradient = objective.has_gradient
 
 
 PASSED_ON = (

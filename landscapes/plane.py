@@ -130,12 +130,13 @@ class Plane:
         rank: int = 2,
         resolution: int | Sequence[int],
         margin: float = 0.1,
+        about: Float[Tensor, " dim"] | None = None,
     ) -> Plane:
         """Lay a plane through the principal directions of a run's points.
 
-        The origin is their mean and the directions have unit length, the largest component positive. The axes cover
-        the projected points and a `margin`, as a fraction of their range. Parameters count in their own units: where
-        these differ wildly, run it on a space of comparable ones.
+        The origin is their mean, or the point that directions are looked for `about`. Directions have unit length, the
+        largest component positive. The axes cover the projected points and a `margin`, as a fraction of their range.
+        Parameters count in their own units: where these differ wildly, run it on a space of comparable ones.
 
         Raises ValueError where the points are too few, not finite, or spread in fewer directions than `rank`.
         """
@@ -146,7 +147,7 @@ class Plane:
             )
         if not bool(points.isfinite().all()):
             raise ValueError("a principal plane takes finite points; got NaN or infinity")
-        mean = points.mean(dim=0)
+        mean = points.mean(dim=0) if about is None else about
         _, scale, directions = torch.linalg.svd(points - mean, full_matrices=False)
         if len(scale) < rank or not bool(scale[rank - 1] > 1e-12 * scale[0]):
             raise ValueError(f"{rank} principal directions need points that spread in as many; these do not")
@@ -155,7 +156,8 @@ class Plane:
         u = (points - mean) @ basis.T
         pad = margin * (u.amax(dim=0) - u.amin(dim=0))
         share = 100 * scale**2 / (scale**2).sum()
-        labels = tuple(f"principal direction {axis + 1} ({share[axis]:.0f} % of variance)" for axis in range(rank))
+        what = "variance" if about is None else "squared distances"
+        labels = tuple(f"principal direction {axis + 1} ({share[axis]:.3g} % of {what})" for axis in range(rank))
         return cls(mean, basis, u.amin(dim=0) - pad, u.amax(dim=0) + pad, _per_axis(resolution, rank), labels)
 
     @property

@@ -6,7 +6,8 @@ import math
 import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from types import MappingProxyType
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import torch
@@ -57,7 +58,8 @@ class ParameterSpace:
     point `x` has, for each parameter, its value, or the decimal logarithm of it where its scale is "log10": such
     points are what `evaluate` takes, what slices, searches and checks work with, and what `lower` and `upper`, float64
     of shape (dim,), bound. `to_values` and `from_values` turn one into the other. The bounds say where a landscape is
-    looked at, and an objective is not asked beyond them unless it invites that (`Objective`).
+    looked at, and an objective is not asked beyond them unless it invites that (`Objective`). `arrays` are the shapes
+    of the arrays that parameters are the numbers of, in their order, by name: none but in a space `of_weights`.
 
     Raises ValueError where names, bounds, units or scales do not belong together.
     """
@@ -67,6 +69,8 @@ class ParameterSpace:
     upper: Float[Tensor, " dim"]
     units: tuple[str, ...]
     scales: tuple[str, ...]
+    arrays: ClassVar[Mapping[str, tuple[int, ...]]] = MappingProxyType({})
+    outputs: ClassVar[Literal["first", "last"]] = "first"
 
     def __init__(
         self,
@@ -120,6 +124,51 @@ class ParameterSpace:
         """Return a space whose parameters share their bounds and their unit."""
         dim = len(names)
         return cls(tuple(names), [lower] * dim, [upper] * dim, (unit,) * dim)
+
+    @classmethod
+    def of_weights(
+        cls,
+        shapes: Mapping[str, Sequence[int]],
+        reach: float | Mapping[str, float] = 1.0,
+        *,
+        outputs: Literal["first", "last"] = "first",
+    ) -> ParameterSpace:
+        """Return the space of a network's weights, array by array, each number between -`reach` and `reach`.
+
+            ParameterSpace.of_weights({"hidden.weight": (8, 3), "hidden.bias": (8,), "out.weight": (1, 8)}, 3.0)
+            ParameterSpace.of_weights({name: one.shape for name, one in net.named_parameters()})
+
+        A point holds the arrays one after another, each flattened row by row. `reach` may be given for each array by
+        its name. The first axis of an array numbers the outputs of its layer, as torch has it, or the last one, as Flax
+        has it: what belongs to one output is a filter (`filters`). Bounds say where random points are and what a share
+        of the box is; functions of weights are evaluated beyond them, too.
+
+        Raises ValueError for what is no shape, and where an array has no reach.
+        """
+        if outputs not in ("first", "last"):
+            raise ValueError(f"of_weights takes outputs first or last; got {outputs!r}")
+        arrays = {str(name): tuple(as_whole(n, f"a side of {name}", least=1) for n in shapes[name]) for name in shapes}
+        if isinstance(reach, Mapping) and (lacking := [name for name in arrays if name not in reach]):
+            raise ValueError(f"of_weights takes a reach of each array; got none of {', '.join(lacking)}")
+        names, upper = list[str](), list[float]()
+        for name, shape in arrays.items():
+            names += [" ".join(filter(None, (name, ",".join(map(str, at))))) for at in np.ndindex(shape)]
+            upper += [float(reach[name] if isinstance(reach, Mapping) else reach)] * math.prod(shape)
+        found = cls(names, [-one for one in upper], upper)
+        object.__setattr__(found, "arrays", arrays)
+        object.__setattr__(found, "outputs", outputs)
+        return found
+
+    @property
+    def filters(self) -> list[NDArray[np.intp]]:
+        """The numbers of the parameters of each filter: the weights of one output of one layer, biases left out."""
+        found, first = list[NDArray[np.intp]](), 0
+        for shape in self.arrays.values():
+            own = first + np.arange(math.prod(shape)).reshape(shape)
+            first += own.size
+            if len(shape) > 1:
+                found += list(own.reshape(shape[0], -1) if self.outputs == "first" else own.reshape(-1, shape[-1]).T)
+        return found
 
     @property
     def dim(self) -> int:

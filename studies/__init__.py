@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from .variants import Study, StudyRecord
 
-KINDS = ("fidelity", "convergence", "model", "mixed", "extremes", "symmetry")
+KINDS = ("fidelity", "convergence", "model", "mixed", "extremes", "symmetry", "updates")
 
 
 def study_class(kind: str) -> type[Study]:

@@ -240,6 +240,14 @@ class StudyRecord(abc.ABC):
         return str(self.table().to_html())
 
 
+@dataclass(frozen=True, eq=False)
+class NamedPoint:
+    """A point, and what it is called."""
+
+    name: str
+    x: Tensor
+
+
 @dataclass(frozen=True)
 class StudyOptions:
     """What a study is asked for, as `gradscape.study` explains it; None is the default of its kind."""
@@ -256,6 +264,9 @@ class StudyOptions:
     max_cost: float | None = None
     time_limit: float | None = None
     chaotic: bool = False
+    through: NamedPoint | None = None
+    noise: float | None = None
+    rate: float | None = None
 
     def given(self) -> dict[str, Any]:
         """Return the options that are not those by default."""

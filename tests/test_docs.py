@@ -123,7 +123,7 @@ def small(command: str) -> list[str]:
     if "mixed" in found:
         found += [] if "--time-limit" in found else ["--time-limit", ""]
         found[found.index("--time-limit") + 1] = "0.01"
-    short = TENTH if SHORT.get(kind, set()) & {*found} else []
+    short = TENTH if SHORT.get(kind, set()) & {*found} and "--policy" not in found else []  # which decides whole ones
     return [*found, *(word for pair in pairs if pair[0] not in found for word in pair), *short]
 
 

@@ -25,10 +25,11 @@ def build(scene: Chain, asked: argparse.Namespace) -> Simulation:
     def swing(parameters: Array) -> torch.Tensor:
         torques = torch.from_numpy(scene.torques(parameters))
         controls = torch.cat([torch.zeros_like(torques[..., :1]), torques], dim=2)
-        return solver.run(rest, rest, controls)[-1].cpu().double().requires_grad_()
+        return solver.run(rest, rest, controls).cpu().double().requires_grad_()
 
     def distance(phi: torch.Tensor) -> torch.Tensor:
-        tip = torch.stack([phi.sin().sum(dim=1), -phi.cos().sum(dim=1) - scene.target], dim=1)
+        last = phi[-1]
+        tip = torch.stack([last.sin().sum(dim=1), -last.cos().sum(dim=1) - scene.target], dim=1)
         return tip.norm(dim=1).mean()
 
     def gradient(parameters: Array) -> Array:

@@ -89,11 +89,11 @@ class Solver:
         return found
 
     def gradient(self, adj_phi: torch.Tensor) -> torch.Tensor:
-        """Return the adjoint of the controls, shape (batch, control, 4), from that of the last phi, (batch, 3)."""
-        batch = len(adj_phi)
+        """Return the adjoint of the controls, shape (batch, control, 4), from that of phi, (step + 1, batch, 3)."""
+        batch = adj_phi.shape[1]
         for adjoint in (self.adj_phi, self.adj_p, self.adj_control):
             adjoint.zero_()
-        to_torch(self.adj_phi)[-1, :batch] = adj_phi.to(self.types.torch)
+        to_torch(self.adj_phi)[:, :batch] = adj_phi.to(self.types.torch)
         settings: dict[str, Any] = {"device": self.device, "adjoint": True, "record_tape": False}
         settings["adj_inputs"] = [None] * (len(self._inputs) - 3) + [self.adj_control, self.adj_phi, self.adj_p]
         wp.launch(self.kernel, batch, self._inputs, **settings)

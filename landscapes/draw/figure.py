@@ -28,6 +28,7 @@ FIGURES = {
     "MixedRecord": "landscapes.draw.figures.accuracy:mixed_figure",
     "ModelRecord": "landscapes.draw.figures.accuracy:model_figure",
     "SymmetryRecord": "landscapes.draw.figures.symmetry:symmetry_figure",
+    "UpdatesRecord": "landscapes.draw.figures.updates:updates_figure",
     "SliceComparison": "landscapes.draw.figures.comparison:comparison_figure",
 }
 _PACKAGE = __name__.partition(".landscapes.")[0]

@@ -46,6 +46,8 @@ class Wells(gs.Environment):
         ("hessian", []),
         ("gradient", []),
         ("pca:run", []),
+        ("filters:3", []),
+        ("training:a:b", []),
         ("center", []),
     ],
 )
@@ -157,8 +159,10 @@ def test_through_several_points_there_is_a_slice_for_each(run, tmp_path):
         (["--dims", "0", "--along", "hessian"], "give one of them"),
         (
             ["--along", "downhill"],
-            "--along takes random:SEED, gradient, hessian, pca:RUN, A:B or A:B:C; got",
+            "--along takes random:SEED, filters:SEED, gradient, hessian, pca:RUN, training:FOLDER, A:B or A:B:C; got",
         ),
+        (["--along", "training:nowhere"], "takes the folder of a training's checkpoints; got 'nowhere'"),
+        (["--along", "filters:0"], "bounce does not say which of its 3 parameters are the weights of one neuron"),
         (["--along", "center:random:1", "--through", "random:2"], "says where it goes; leave out --through"),
         (["--along", "center:center"], "not zero and not parallel"),
         (["--along", "pca:nothing"], "nothing"),

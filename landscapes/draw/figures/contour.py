@@ -22,6 +22,7 @@ from ...plane import Plane
 from ...space import labelled
 from .. import style
 from . import page
+from .path import draw_path, path_scale
 
 Grid = NDArray[np.float64]
 
@@ -37,7 +38,8 @@ def landscape_figure(
     interpolated. All
     arrows are equally long and point down the steepest slope of the picture as it is seen, its axes scaled to the same
     length; their colour is the magnitude of the gradient along the plane. Failures are hatched and counted, and
-    among the arrows samples with a loss and no gradient are dotted. `floor` is the map of the slice's numerical floor,
+    among the arrows samples with a loss and no gradient are dotted. Over a slice along a training lies its path.
+    `floor` is the map of the slice's numerical floor,
     a panel of its own. `width` is that of a page for print [mm]; as for every picture, without it the picture is as
     large as suits a screen.
 
@@ -48,7 +50,9 @@ def landscape_figure(
         raise ValueError(f"landscape_figure draws planes; got a slice of rank {plane.rank}, so use profile_figure")
     panels = 1 + ("grad" in dataset) + (floor is not None)
     picture, axes = page.panels(style.Sheet.of(width, pitch=PITCH, panels=panels), panels, share=True)
-    loss_panel(axes[0], in_unit(dataset))
+    scale = path_scale(in_unit(dataset))
+    loss_panel(axes[0], in_unit(dataset), scale)
+    path = draw_path(axes[0], in_unit(dataset), scale)
     if floor is not None:
         floor_panel(axes[1], dataset, floor)
     if "grad" in dataset:
@@ -57,7 +61,7 @@ def landscape_figure(
         frame(ax, dataset, plane)
         page.name_outer(ax, *plane.labels)
     page.head(picture, axes[0], dataset)
-    page.finish(picture, page.sampling_key(dataset))
+    page.finish(picture, [*path, *page.sampling_key(dataset)])
     return picture
 
 

@@ -37,6 +37,7 @@ from gradscape.studies.order import Shapes
 from gradscape.studies.samples import Bootstrap
 from gradscape.studies.stability import STABLE, Cell
 from gradscape.studies.symmetry import MeasuredReplica, SymmetryRecord
+from gradscape.studies.updates import ALONG, RANDOM, Outcomes, UpdatesRecord
 
 from ....made_studies import VARIANTS, fidelities, variant
 
@@ -107,6 +108,18 @@ def symmetry() -> SymmetryRecord:
         env="swing-stiffness", fidelity="standard", points=64, seed=0, loss_unit="m", refused=(), identity={},
         floor=Floor(names, 64, 0, 0.02, 1.0, near, Estimate(0.9, 0.8, 0.95)), replicas=replicas, provenance=MEASURED,
         command=COMMAND.format("study symmetry"),
+    )  # fmt: skip
+
+
+def updates() -> UpdatesRecord:
+    """Return updates of which some fail and some end far off."""
+    losses = np.array([*np.geomspace(0.5, 2.0, 60), 4e4, np.nan])
+    both = [Outcomes.of(name, losses * (1 + k), before=1.0, zero=3.0) for k, name in enumerate((ALONG, RANDOM))]
+    return UpdatesRecord(
+        env="cartpole with policy mlp:32x32", fidelity="standard", points=62, seed=0, loss_unit="m", refused=(),
+        identity={}, provenance=MEASURED, command=COMMAND.format("study updates"), through="training/step-60.pt",
+        before=1.0, noise=0.01, rate=1e-3, length=0.01, zero=3.0, along=both[0], random=both[1],
+        lower=Estimate(0.9, 0.8, 0.95), unknown=0, clamped=2,
     )  # fmt: skip
 
 

@@ -35,7 +35,7 @@ from gradscape.optim.registry import methods
 
 from ....made_studies import fidelities, study
 from ...test_overlay import LAID, SLICE
-from .records import card, census, checked, convergence, extremes, hessian, league, mixed, symmetry
+from .records import card, census, checked, convergence, extremes, hessian, league, mixed, symmetry, updates
 from .test_contour import BOUNCES, DATASET, LINE, Bowl, plane
 from .test_search import race, table
 from .test_sweep import SWEEP
@@ -124,6 +124,7 @@ FIGURES: dict[str, list[Callable[[Callable[..., page.Picture]], page.Picture]]] 
     ],
     "extremes_figure": [lambda draw: draw(extremes())],
     "symmetry_figure": [lambda draw: draw(symmetry())],
+    "updates_figure": [lambda draw: draw(updates())],
     "league_figure": [lambda draw: draw(league())],
     "frame_figure": [lambda draw: draw(SWEEP, 1, Scales.of(SWEEP))],
     "episode_figure": [lambda draw: draw(EPISODE, caption=CAPTION)],
