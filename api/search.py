@@ -1,4 +1,4 @@
-"""`gs.advise`, `gs.optimize`, `gs.race`, `gs.league`, `gs.open_run`: how to begin, and search by one method or several."""
+"""`gs.advise`, `gs.optimize`, `gs.race`, `gs.league`, `gs.open_run`: search scenes by one method or by several."""
 
 from __future__ import annotations
 

@@ -3,15 +3,14 @@
     python -m benchmarks.advice score                             # from the published cases: seconds
     python -m benchmarks.advice rows --races FOLDER [--jobs 2]    # all cases again: some 45 minutes of one core
 
-Cases are the 24 functions of BBOB in 2, 5 and 10 parameters, the functions of known character of `benchmarks.words`,
-BoTorch's functions, and the scenes of the league. Nine methods race in each within 500 forward equivalents. In
-functions, one seed each, a gradient counts as two losses, about the median of our scenes; there the races in FOLDER are
-continued. The scenes' ten seeds are those of the gallery's league, cut off at that cost. Losses that are nearer to the
-best than 1e-8 of the first one's distance count as the same.
+Cases are the 24 functions of BBOB in 2 and 5 parameters and every second one in 10, the functions of known character
+of `benchmarks.words`, BoTorch's functions, and the scenes of the league. Nine methods race in each within 500 forward
+equivalents. In functions, one seed each, a gradient counts as two losses, about the median of our scenes. The races in
+FOLDER are continued. The scenes' ten seeds are those of the gallery's league, cut off at that cost.
 
-Of methods that are level the one that was there first is ahead. A function in which no
-method gets beyond its first loss says nothing, and is left out. The cases are `optim/advice.json`, which the
-package brings.
+Losses that are nearer to the best of the race than 1e-8 of the first one's distance are level, and of level methods the
+one that was there first is ahead. A function in which no method gets beyond its first loss says nothing, and is left
+out. The cases are `optim/advice.json`, which the package brings.
 """
 
 from __future__ import annotations
@@ -27,40 +26,62 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
-
-from docs.pages.text import table
-
-import gradscape as gs
 from benchmarks import words
 from benchmarks.bbob import BBOB, FORMULAS
+from docs.pages.text import table
+from numpy.typing import NDArray
+
+import gradscape as gs
 from gradscape.gallery.files import DATA
 from gradscape.gallery.league import METHODS, KeptRuns, read_league
 from gradscape.jobs.search import make_optimizer
 from gradscape.landscapes.convert import to_json
 from gradscape.landscapes.measures.character import Character, measure_character
 from gradscape.landscapes.objective import Objective
-from gradscape.landscapes.threads import one_torch_thread
 from gradscape.landscapes.statistics import Estimate
-from gradscape.optim.advice import EVALUATIONS, FILE, Case, Cases, Score, hold_out, read_cases, score_held_out
+from gradscape.landscapes.threads import one_torch_thread
+from gradscape.optim.advice import (
+    EVALUATIONS,
+    FILE,
+    Case,
+    Cases,
+    Score,
+    expected_ranks,
+    hold_out,
+    read_cases,
+    score_held_out,
+)
 from gradscape.optim.race import Competitor, race
+from gradscape.optim.registry import optimizer_class
 from gradscape.optim.runs.store import RunStore
 from gradscape.optim.statistics import seed_ranks
 
 FORWARDS, GRADIENT_COST = 500, 2.0  # of a race, and what a gradient of a function counts as
-DIMS = (2, 5, 10)  # of BBOB's functions
+DIMS = {2: 1, 5: 1, 10: 2}  # of BBOB's functions, and which of them: each, or every second one
 SAMPLES = 3  # of points that a landscape is measured at
 LATE = 0.9  # of the cost, which is left where a tenth was measured
 SAME = 1e-8  # of the way from the first loss to the best: nearer ones are level
 DIGITS = 4  # of what is published
 GRADIENTS_ALONE = ("descents", "bo-descents", "l-bfgs-b", "adam")  # ask for a gradient at every point
-FUNCTIONS = ("ackley", "beale", "branin", "griewank", "levy", "rastrigin", "rosenbrock", "six-hump-camel", "styblinski-tang")
+FUNCTIONS = (
+    "ackley",
+    "beale",
+    "branin",
+    "griewank",
+    "levy",
+    "rastrigin",
+    "rosenbrock",
+    "six-hump-camel",
+    "styblinski-tang",
+)
 FAMILIES = {  # of our scenes
     **dict.fromkeys(("bounce", "pinball-2", "pinball-16"), "balls"),
     "cartpole": "cartpole",
     "fluid": "fluid",
     **dict.fromkeys(("flip", "swing-stiffness", "swing-velocity"), "cloth"),
-    **dict.fromkeys(("assembly", "pinch", "rolling-pin", "rope", "table", "torus", "triple-move", "writer"), "plasticine"),
+    **dict.fromkeys(
+        ("assembly", "pinch", "rolling-pin", "rope", "table", "torus", "triple-move", "writer"), "plasticine"
+    ),
 }
 Found = Mapping[str, Mapping[str, Sequence[float]]]  # method -> forwards and loss of each improvement of its run
 
@@ -80,11 +101,10 @@ def functions() -> dict[str, Subject]:
     """Return the functions that methods race in, by name."""
     found = [
         Subject(f"BBOB f{number}, {dim} parameters", f"BBOB {BBOB(number, dim).group}", partial(BBOB, number, dim))
-        for dim in DIMS
-        for number in range(1, len(FORMULAS) + 1)
+        for dim, every in DIMS.items()
+        for number in range(every, len(FORMULAS) + 1, every)
     ]
-    kinds = {"smooth": words._smooth_functions(), "rough": words._rough_functions(), "awkward": words._awkward_functions()}
-    for kind, members in kinds.items():
+    for kind, members in words.KINDS.items():
         found += [Subject(one.name, f"words, {kind}", partial(words.KnownObjective, one)) for one in members]
     found += [Subject(name, "BoTorch", partial(gs.make, name)) for name in FUNCTIONS]
     return {one.name: one for one in found}
@@ -102,7 +122,7 @@ def scenes() -> list[Subject]:
 
 
 def race_in(name: str) -> Found:
-    """Let the methods race in a function, and return the improvements of each; noisy losses are judged without noise."""
+    """Let the methods race in a function, and return the improvements of each; noise is left out of their losses."""
     objective = functions()[name].make()
     env, found = gs.as_environment(objective), dict[str, Mapping[str, Sequence[float]]]()
     torch.set_num_threads(1)
@@ -207,7 +227,9 @@ def write(folder: Path, jobs: int) -> None:
     """Make all cases, and publish them."""
     whole = Cases(FORWARDS, GRADIENT_COST, tuple(cases(folder, jobs)))
     path = Path(__file__).parents[1] / "optim" / FILE
-    path.write_text(json.dumps(_rounded(to_json(whole)), separators=(",", ":")).replace('},{"name"', '},\n{"name"') + "\n")
+    path.write_text(
+        json.dumps(_rounded(to_json(whole)), separators=(",", ":")).replace('},{"name"', '},\n{"name"') + "\n"
+    )
 
 
 def _rounded(value: Any) -> Any:
@@ -247,7 +269,14 @@ def score_table() -> str:
         ]
         for said, one in scores().items()
     ]  # fmt: skip
-    head = ("judged by", "cases (families)", "advised", "advised, a tenth spent", "best single method", "best in hindsight")
+    head = (
+        "judged by",
+        "cases (families)",
+        "advised",
+        "advised, a tenth spent",
+        "best single method",
+        "best in hindsight",
+    )
     return table((*head, "advised less single"), rows)
 
 
@@ -263,6 +292,51 @@ def scene_table() -> str:
         best = ", ".join(f"`{method}`" for method in case.best)
         rows.append([f"`{name}`", near, advised, single, f"{best} {min(case.ranks.values()):.1f}"])
     return table(("scene", "nearest case", "advised, its rank", f"rank of `{scores_single()}`", "best there"), rows)
+
+
+KINDS: dict[str, Callable[[Case], bool]] = {  # of landscapes, by measures whose names are those of `measures_of`
+    "Gradients hold over steps of 0.1 % (at least 90 % of what they promise)": lambda case: promised(case) >= 0.9,
+    "Gradients mislead there (less than half of what they promise)": lambda case: promised(case) < 0.5,
+}
+
+
+def promised(case: Case) -> float:
+    """Return how much of what gradients promise the shortest steps keep, a mean over samples; 0 if nothing tells."""
+    return float(np.nan_to_num([one.agreement[0] for one in case.characters]).mean())
+
+
+def prose() -> str:
+    """Return which methods are best in which kinds of landscapes, as a list."""
+    known, lines = read_cases().cases, list[str]()
+    for said, fits in KINDS.items():
+        lines.append(f"- {said}: {_best([one for one in known if fits(one)], METHODS)}.")
+    alone = [method for method in METHODS if not optimizer_class(method).needs_grad]
+    lines.append(f"- Without gradients: {_best(known, alone)}.")
+    for said, found in (("scenes", scores()["our scenes"]), ("functions", scores()["functions"])):
+        lines.append(
+            f"- Advice by the nearest cases, in {said} whose family was left out: mean rank "
+            f"{_interval(found.advised, '.1f')}. `{found.method}` everywhere: {_interval(found.single, '.1f')}. The "
+            f"difference is {_interval(found.difference, '+.2f')}, so that {_verdict(found)}."
+        )
+    return "".join(f"{line}\n" for line in lines)
+
+
+def _verdict(found: Score) -> str:
+    if found.helps:
+        return "it helps"
+    return "it harms" if found.difference.low > 0 else "there is no evidence that it helps"
+
+
+def _best(cases: Sequence[Case], methods: Sequence[str]) -> str:
+    """Say which methods are best in some cases, and in the scenes among them."""
+    scenes = [one for one in cases if one.scene]
+    ours = f"in the {len(scenes)} scenes among them {_ranked_first(scenes, methods)}"
+    return f"{_ranked_first(cases, methods)} ({len(cases)} cases); {ours}"
+
+
+def _ranked_first(cases: Sequence[Case], methods: Sequence[str]) -> str:
+    found = expected_ranks(cases, methods)
+    return ", ".join(f"`{method}` {rank:.1f}" for method, rank in list(found.items())[:3])
 
 
 def scores_single() -> str:

@@ -39,7 +39,8 @@ class Advice:
 
     `choice` is the method with its evidence, `unable` says why methods cannot search it. `fidelity_advice` and
     `remedy_advice` say in words what is measured of these, or what measures it. `gradient_cost` is about what an
-    episode with gradient costs in episodes without, NaN where that is not known. `best` is the best point that was evaluated.
+    episode with gradient costs in episodes without, NaN where that is not known. `best` is the best point of those that
+    were evaluated.
     """
 
     env: str

@@ -2,7 +2,7 @@
 
 A case is a function or a scene. Its landscape was measured by few evaluations, and the ranks of nine methods in it are
 known at equal cost. Of a new landscape the expected rank of each method is its mean over the nearest cases. Whether
-that helps is measured by leaving out whole families of cases (`hold_out`): only where it is better than to take one
+that helps is measured by leaving out whole families of cases (`hold_out`). Only if in our scenes it is better than one
 method everywhere, beyond chance, is the method of the nearest cases advised, and else that one.
 
 `python -m benchmarks.advice rows` makes the cases, and `python -m benchmarks.advice score` measures the score.
@@ -33,7 +33,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Case:
-    """A landscape in which methods raced, by several samples, and the mean `ranks` of methods at equal cost, 1 for best.
+    """A landscape that was measured at several samples, and the mean `ranks` of methods at equal cost, 1 for best.
 
     `late` has the rank of each method if it alone had nine tenths of that cost, as it has after a tenth was measured.
     `scene` is whether it is one of our simulated scenes.
@@ -51,7 +51,8 @@ class Case:
         """The means of its measures over the samples, NaN where none tells."""
         table = np.array([measures_of(one) for one in self.characters])
         known = np.isfinite(table)
-        return np.where(known.any(axis=0), np.where(known, table, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1), np.nan)
+        means = np.where(known, table, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
+        return np.where(known.any(axis=0), means, np.nan)
 
     @property
     def best(self) -> tuple[str, ...]:
@@ -99,17 +100,34 @@ class Score:
     difference: Estimate
 
     @property
+    def said(self) -> str:
+        """Say in words what the mean ranks are."""
+        apart = self.difference
+        return (
+            f"the nearest cases advise what has mean rank {self.advised.value:.1f}, and {self.method} everywhere has "
+            f"{self.single.value:.1f} (difference {apart.value:+.2f}, 95 %: {apart.low:+.2f} to {apart.high:+.2f})"
+        )
+
+    @property
     def helps(self) -> bool:
         """Whether advice is better than one method everywhere, beyond chance."""
         return self.difference.high < 0
 
 
 @dataclass(frozen=True)
+class Scores:
+    """How good advice is in our scenes, which decides whether it is given, and in functions."""
+
+    scenes: Score
+    functions: Score
+
+
+@dataclass(frozen=True)
 class Choice:
     """The method to begin with, why, and what the nearest cases let expect: mean ranks of methods, the best first.
 
-    `by_cases` is whether it is the choice of the nearest cases, rather than the best single method. `score` says how
-    good such choices are.
+    `by_cases` is whether it is the choice of the nearest cases, rather than the best single method of our scenes.
+    `scores` say how good choices of the nearest cases are.
     """
 
     method: str
@@ -117,7 +135,7 @@ class Choice:
     reason: str
     expected: Mapping[str, float]
     nearest: tuple[Near, ...]
-    score: Score
+    scores: Scores
 
 
 @cache
@@ -224,9 +242,10 @@ def raced_methods() -> tuple[str, ...]:
 
 
 @cache
-def published_score() -> Score:
-    """Return the score of the cases that the package brings."""
-    return score_held_out(hold_out(read_cases().cases))
+def published_scores() -> Scores:
+    """Return the scores of the cases that the package brings."""
+    found = hold_out(read_cases().cases)
+    return Scores(*(score_held_out([one for one in found if one.case.scene == scene]) for scene in (True, False)))
 
 
 def choose(character: Character, methods: Sequence[str] = ()) -> Choice:
@@ -234,28 +253,29 @@ def choose(character: Character, methods: Sequence[str] = ()) -> Choice:
 
     Raises ValueError where none of them raced.
     """
-    cases, score = read_cases().cases, published_score()
+    cases, scores = read_cases().cases, published_scores()
     able = [one for one in methods_of(cases) if not methods or one in methods]
     if not able:
         raise ValueError(f"there is no evidence on {', '.join(methods)}; there is on {', '.join(methods_of(cases))}")
     near = Neighbourhood.of(cases).nearest(character)
     expected = expected_ranks([case for _, case in near], able)
-    advised, single = next(iter(expected)), next(iter(expected_ranks(cases, able)))
-    method = advised if score.helps else single
+    advised = next(iter(expected))
+    single = next(iter(expected_ranks([one for one in cases if one.scene], able)))
+    method = advised if scores.scenes.helps else single
     found = tuple(Near(one.name, one.family, far, one.best, one.ranks[method]) for far, one in near)
-    return Choice(method, score.helps, _reason(method, advised, found, score), expected, found, score)
+    return Choice(method, scores.scenes.helps, _reason(method, advised, found, scores), expected, found, scores)
 
 
-def _reason(method: str, advised: str, near: Sequence[Near], score: Score) -> str:
-    """Say in a sentence why a method is advised."""
+def _reason(method: str, advised: str, near: Sequence[Near], scores: Scores) -> str:
+    """Say in a sentence why a method is advised, and how sure that is."""
     first = sum(method in one.best for one in near)
-    alike = f"it was best in {first} of the {len(near)} nearest cases, as in {near[0].name} and {near[1].name}"
-    apart = score.difference
-    measured = (
-        f"in families left out such advice had a mean rank of {score.advised.value:.1f}, {score.method} everywhere "
-        f"{score.single.value:.1f} (difference {apart.value:+.2f}, 95 %: {apart.low:+.2f} to {apart.high:+.2f})"
+    known = [one.name for one in near if method in one.best]
+    alike = f"it was best in {first} of the {len(near)} nearest cases"
+    alike += f", as in {' and '.join(known[:2])}" if known else ""
+    if scores.scenes.helps:
+        return f"{alike}; in scenes of other kinds {scores.scenes.said}"
+    other = "" if advised == method else f", which would say {advised}"
+    return (
+        f"no evidence beyond that one method: in scenes of other kinds {scores.scenes.said}; "
+        f"in functions {scores.functions.said}. {alike[0].upper()}{alike[1:]}{other}"
     )
-    if score.helps:
-        return f"{alike}; {measured}"
-    other = "" if advised == method else f"; the nearest cases would say {advised}"
-    return f"no evidence beyond the best single method: {measured}; {alike}{other}"

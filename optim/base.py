@@ -24,7 +24,16 @@ from .lockstep import Asking, answer_alone
 from .memory import FLOAT, SearchSize
 
 Points = NDArray[np.float64]
-COMMON = {"space", "seed", "options", "random", "worst", "objective", "remark", "_told_any"}  # attributes of every optimiser
+COMMON = {
+    "space",
+    "seed",
+    "options",
+    "random",
+    "worst",
+    "objective",
+    "remark",
+    "_told_any",
+}  # attributes of every optimiser
 
 
 LARGE = 1e100  # a loss: the squares of a billion of them still have a sum
@@ -120,8 +129,9 @@ class Optimizer(abc.ABC):
             known[name] = value
 
     @classmethod
-    def require_budget(cls, options: Any, budget: int) -> None:  # noqa: B027 -- most search with any
+    def require_budget(cls, options: Any, budget: int) -> None:
         """Refuse a budget with which the method cannot search. Raises ValueError."""
+        return
 
     @classmethod
     def _need_with(cls, options: Mapping[str, Any], size: SearchSize, option: str, value: int) -> Need:

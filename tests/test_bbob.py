@@ -32,7 +32,9 @@ def test_gradients_are_slopes(number: int) -> None:
     if number in FRACTAL:
         return
     moves = step * torch.eye(3, dtype=torch.float64)
-    ends = [ours.evaluate((x[:, None] + side * moves).reshape(-1, 3), grad=False).loss.reshape(12, 3) for side in (1, -1)]
+    ends = [
+        ours.evaluate((x[:, None] + side * moves).reshape(-1, 3), grad=False).loss.reshape(12, 3) for side in (1, -1)
+    ]
     slopes = (ends[0] - ends[1]) / (2 * step)
     off = ((slopes - found.grad).norm(dim=1) / (slopes.norm(dim=1) + found.grad.norm(dim=1) + 1e-3)).sort().values
     assert float(off[:6].max()) < 1e-3  # of half of the points: steps cross edges, and waves of f19 are shorter

@@ -88,10 +88,10 @@ class Character:
 
 @dataclass(frozen=True)
 class CharacterSample:
-    """The points of the unit cube that a character is measured at: some with gradients, then losses that depend on them.
+    """The points of the unit cube that a character is measured at: some with gradients, then others by these.
 
-    Points are `first`, with gradients, and `others`: steps down some of the gradients, two points again, and points
-    that continue the Sobol' sequence of the first ones.
+    The `first` are with gradients. The `others`, with losses, are steps down some of the gradients, two points again,
+    and points that continue the Sobol' sequence of the first ones.
     """
 
     dim: int
@@ -142,7 +142,9 @@ class CharacterSample:
 
         What is not finite is missing. Slopes are by sides of the box.
         """
-        largest = np.abs(np.concatenate([loss, others])).max(initial=0.0, where=np.isfinite(np.concatenate([loss, others])))
+        largest = np.abs(np.concatenate([loss, others])).max(
+            initial=0.0, where=np.isfinite(np.concatenate([loss, others]))
+        )
         with np.errstate(over="ignore", invalid="ignore"):
             known = (np.where(np.isfinite(one), one / (largest or 1.0), np.nan) for one in (loss, slopes, others))
             return self._measure(*known)

@@ -59,7 +59,12 @@ ARRAY = "__array__"  # stands in the outline for the number of an array
 STATE = "state"
 CHUNK = 64  # rows
 REMARK = "remark"  # the attribute of a run with what its method had to say of the search
-CHANGING = {"budget", "gradient_cost", ERROR, REMARK}  # attributes of a run that are not what they were when it was made
+CHANGING = {
+    "budget",
+    "gradient_cost",
+    ERROR,
+    REMARK,
+}  # attributes of a run that are not what they were when it was made
 FORMAT = 2
 DEEP = ("x", "grad")
 COLUMNS: dict[str, tuple[str, dict[str, Any]]] = {  # status last: a row that has one is whole

@@ -69,19 +69,21 @@ def test_a_choice_says_no_evidence_and_takes_the_best_single_method(monkeypatch:
     worse = [replace(one, ranks={**one.ranks, "turbo": one.ranks["turbo"] + 0.1}) for one in cases]
     found = chosen(monkeypatch, worse, character(bowl))
     assert (found.method, found.by_cases) == ("l-bfgs-b", False)
-    assert found.reason.startswith("no evidence beyond the best single method")
+    assert found.reason.startswith("no evidence beyond that one method")
     told = chosen(monkeypatch, made(6, lambda number: True), character(bowl, agreement=(-0.3, 0.0, 0.1), across=0.0))  # type: ignore[arg-type]
     assert (told.method, told.by_cases) == ("turbo", True)
     assert told.reason.startswith("it was best in 10 of the 10 nearest cases")
 
 
 def chosen(monkeypatch: pytest.MonkeyPatch, cases: list[Case], of: Character) -> Choice:
-    monkeypatch.setattr(advice, "read_cases", lambda: Cases(500, 2.0, tuple(cases)))
-    advice.published_score.cache_clear()
+    """Choose by cases that are scenes and, the same again, functions."""
+    scenes = [replace(one, name=f"scene {one.name}", scene=True) for one in cases]
+    monkeypatch.setattr(advice, "read_cases", lambda: Cases(500, 2.0, (*cases, *scenes)))
+    advice.published_scores.cache_clear()
     try:
         return choose(of)
     finally:
-        advice.published_score.cache_clear()
+        advice.published_scores.cache_clear()
 
 
 def test_in_a_bowl_gradient_methods_are_expected_ahead_and_in_noise_they_are_not() -> None:

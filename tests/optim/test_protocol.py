@@ -22,7 +22,12 @@ EGGS = from_torch(  # Rastrigin's function
     ParameterSpace.box(("a", "b"), -4.0, 5.0),
     name="rastrigin",
 )
-QUICK = {"bo-leap": {"local_budget": 30}, "bo": {"initial": 5}, "bo-descents": {"initial": 5}, "auto": {"evaluations": 20}}
+QUICK = {
+    "bo-leap": {"local_budget": 30},
+    "bo": {"initial": 5},
+    "bo-descents": {"initial": 5},
+    "auto": {"evaluations": 20},
+}
 
 
 @pytest.mark.parametrize("name", [name for name in methods() if name not in (*ELSEWHERE, *MEASURING)])

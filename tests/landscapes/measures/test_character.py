@@ -8,7 +8,13 @@ import torch
 from torch import Tensor
 
 from gradscape.envs.adapters import from_torch
-from gradscape.landscapes.measures.character import MIN_EVALUATIONS, STEPS, Character, CharacterSample, measure_character
+from gradscape.landscapes.measures.character import (
+    MIN_EVALUATIONS,
+    STEPS,
+    Character,
+    CharacterSample,
+    measure_character,
+)
 from gradscape.landscapes.objective import Evaluation, Objective
 from gradscape.landscapes.space import ParameterSpace
 
@@ -114,7 +120,7 @@ def test_steps_are_as_long_as_they_say() -> None:
 def test_words_are_said_of_every_measure() -> None:
     rows = measured(bowl).rows()
     assert ("Points without a loss", "0 %", "") in rows
-    assert [row.value for row in rows if "promises" in row.name][0].startswith("100 %, 9")
+    assert next(row.value for row in rows if "promises" in row.name).startswith("100 %, 9")
     assert all(row.value for row in measured(lambda x: bowl(x) * torch.nan).rows())
     env = from_torch(bowl, SPACE)
     assert measure_character(env, evaluations=20).character.evaluations == 20
