@@ -287,7 +287,7 @@ def scene_table() -> str:
         mine = [one for one in found if one.case.name == name]
         case, said = mine[0].case, list(dict.fromkeys(one.method for one in mine))
         single = f"{case.ranks[scores_single()]:.1f}"
-        near = ", ".join(dict.fromkeys(one.name for held in mine for one in held.near[:1]))
+        near = "; ".join(dict.fromkeys(one.name for held in mine for one in held.near[:1]))
         advised = ", ".join(f"`{method}` {case.ranks[method]:.1f}" for method in said)
         best = ", ".join(f"`{method}`" for method in case.best)
         rows.append([f"`{name}`", near, advised, single, f"{best} {min(case.ranks.values()):.1f}"])
@@ -345,6 +345,8 @@ def scores_single() -> str:
 
 
 def _interval(one: Estimate, form: str = ".2f") -> str:
+    if not np.isfinite(one.value):
+        return ""
     return f"{one.value:{form}} ({one.low:{form}} to {one.high:{form}})".replace("-", "\N{MINUS SIGN}")
 
 

@@ -10,6 +10,7 @@ method everywhere, beyond chance, is the method of the nearest cases advised, an
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
@@ -87,7 +88,7 @@ class Score:
 
     `advised` is the rank of what the nearest cases advise, `single` that of one `method` everywhere, the best of these
     cases in hindsight, `best` that of the best in each case in hindsight, and `difference` the first less the second.
-    `late` is `advised` if measuring has cost a tenth.
+    `late` is `advised` if measuring has cost a tenth, NaN where that is not known.
     """
 
     cases: int
@@ -216,14 +217,18 @@ def hold_out(cases: Sequence[Case]) -> list[HeldOut]:
 
 
 def score_held_out(found: Sequence[HeldOut], ranks: Callable[[Case], Mapping[str, float]] | None = None) -> Score:
-    """Compare what was advised with what is best, by `ranks` of each case, by default its own."""
+    """Compare what was advised with what is best, by `ranks` of each case, by default its own.
+
+    By others there is no `late`, which is NaN.
+    """
     known = {one.case.name: ranks(one.case) if ranks else one.case.ranks for one in found}
     rows, methods = [known[one.case.name] for one in found], methods_of([one.case for one in found])
     single = min(methods, key=lambda method: float(np.mean([row[method] for row in rows])))
+    late = [math.nan if ranks else one.case.late[one.method] for one in found]
     columns = np.array(
         [
-            [row[one.method], one.case.late[one.method], row[single], min(row[method] for method in methods)]
-            for row, one in zip(rows, found, strict=True)
+            [row[one.method], after, row[single], min(row[method] for method in methods)]
+            for row, after, one in zip(rows, late, found, strict=True)
         ]
     )
     families, of_family = np.unique([one.case.family for one in found], return_inverse=True)
@@ -231,9 +236,9 @@ def score_held_out(found: Sequence[HeldOut], ranks: Callable[[Case], Mapping[str
     times = np.random.default_rng(0).multinomial(len(families), np.full(len(families), 1 / len(families)), RESAMPLES)
     drawn = times @ sums
     means, whole = drawn[:, :-1] / drawn[:, -1:], columns.mean(axis=0)
-    advised, late, alone, best = (middle_95(float(whole[k]), means[:, k]) for k in range(4))
+    advised, spent, alone, best = (middle_95(float(whole[k]), means[:, k]) for k in range(4))
     apart = middle_95(float(whole[0] - whole[2]), means[:, 0] - means[:, 2])
-    return Score(len(known), len(families), single, advised, late, alone, best, apart)
+    return Score(len(known), len(families), single, advised, spent, alone, best, apart)
 
 
 def raced_methods() -> tuple[str, ...]:

@@ -12,7 +12,17 @@ from torch import Tensor
 import gradscape as gs
 from gradscape.landscapes.measures.character import Character, measure_character
 from gradscape.optim import advice
-from gradscape.optim.advice import EVALUATIONS, Case, Cases, Choice, choose, hold_out, read_cases, score_held_out
+from gradscape.optim.advice import (
+    EVALUATIONS,
+    Case,
+    Cases,
+    Choice,
+    choose,
+    expected_ranks,
+    hold_out,
+    read_cases,
+    score_held_out,
+)
 from gradscape.optim.registry import optimizer_class
 
 SPACE = gs.ParameterSpace.box([f"x{k}" for k in range(5)], -3.0, 1.0)
@@ -118,3 +128,14 @@ def test_the_published_cases_are_whole() -> None:
         assert len(one.characters) == 3
         assert {each.evaluations for each in one.characters} == {EVALUATIONS}
         assert np.isfinite(one.measures[0])
+
+
+def test_what_the_page_on_advice_says_of_its_evidence_is_what_the_cases_say() -> None:
+    """Sentences are written by hand: that there is no evidence, and which method is advised instead."""
+    found = choose(character(bowl))
+    assert not found.by_cases
+    assert found.method == found.scores.scenes.method == "l-bfgs-b"
+    assert (
+        next(iter(expected_ranks([one for one in read_cases().cases if one.scene], ["random", "cma-es", "turbo"])))
+        == "turbo"
+    )
