@@ -45,7 +45,13 @@ GROUPS = {  # of the help: heading -> verbs, each with the module of `api` that 
         "bench": "measure",
         "plan": "plan",
     },
-    "Search": {"methods": "environments", "optimize": "search", "race": "search", "league": "search"},
+    "Search": {
+        "advise": "search",
+        "methods": "environments",
+        "optimize": "search",
+        "race": "search",
+        "league": "search",
+    },
     "Publish": {
         "export": "export",
         "gallery compute": "gallery",

@@ -1,4 +1,4 @@
-"""`gs.optimize`, `gs.race`, `gs.league` and `gs.open_run`: search scenes by one method or by several."""
+"""`gs.advise`, `gs.optimize`, `gs.race`, `gs.league`, `gs.open_run`: search scenes by one method or by several."""
 
 from __future__ import annotations
 
@@ -23,12 +23,14 @@ from .options import (
     Scheduler,
     Seed,
     Settings,
+    at_least,
 )
 from .scene import environment, is_in_memory, spec_of
 from .values import as_method_settings, as_names, as_path, as_settings, as_widths
 
 if TYPE_CHECKING:
     from ..envs.base import Environment
+    from ..jobs.advise import Advice
     from ..jobs.scene import SceneSpec
     from ..optim.base import Optimizer
     from ..optim.league import League
@@ -59,6 +61,45 @@ Workers = Annotated[
 
 
 @verb
+def advise(
+    scene: Scene,
+    *,
+    budget: Annotated[int, at_least(200)] = 1000,
+    seed: Seed = 0,
+    out: Annotated[str | Path | None, Parameter(help="Folder of the advice; without it nothing is kept.")] = None,
+    force: Force = False,
+    **keywords: Unpack[SceneKeywords],
+) -> Advice:
+    """Advise with which method, remedy and fidelity to begin a search, by evidence from landscapes that were alike.
+
+    It evaluates 50 points, or a tenth of the budget if that is less: a quarter of them with gradients. It measures how
+    far gradients hold, what fails, how losses are distributed, and compares that with cases in which nine methods were
+    raced: the 24 functions of BBOB, functions of known character and our scenes. docs/advice.md says how often such
+    advice is right. Where it was not better than one method for everything, it says so, and advises that method. The
+    folder then holds advice.json.
+
+    Raises ValueError for what the scene does not have, TooLargeError for a budget that would not fit here,
+    StoreMismatchError where the folder holds other advice; Stopped where it is interrupted.
+
+    Example: landscape advise branin
+
+    Parameters
+    ----------
+    budget
+        Number of episodes that the search is to have. A tenth of them is what the advice takes at most.
+    """
+    call, folder = current(), as_path(out)
+    env = environment(scene, keywords)
+    from ..jobs.advise import AdviseJob
+
+    job = AdviseJob.of(env, budget=budget, seed=seed, out=folder, force=force, command=call.command)
+    if folder is not None:
+        return job.run(call.watch)
+    call.watch.plan(job.work())
+    return job.compute(call.watch)
+
+
+@verb
 def optimize(
     scene: Scene,
     method: str = "bo-leap",
@@ -85,7 +126,8 @@ def optimize(
     Parameters
     ----------
     method
-        Method to search with. `landscape methods` lists them.
+        Method to search with. `landscape methods` lists them. `auto` first measures the landscape, at a tenth of the
+        budget at most, and then takes the method that `landscape advise` would advise.
     budget
         Number of episodes to evaluate. It is never exceeded.
     method_options
@@ -261,6 +303,10 @@ def _search_in_memory(env: Environment, optimizer: Optimizer, budget: int) -> Ru
     from ..landscapes.threads import one_torch_thread
     from ..optim.search import search
 
+    points = points_within(env, budget)
+    optimizer.require_budget(optimizer.options, points)
     with one_torch_thread(), current().watch.progress(budget) as advance:
-        store = search(env, optimizer, budget=points_within(env, budget), progress=lambda now: advance(now.done))
+        store = search(env, optimizer, budget=points, progress=lambda now: advance(now.done))
+    if store.read().remark:
+        current().watch.note(store.read().remark)
     return store.read()

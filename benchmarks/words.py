@@ -319,7 +319,8 @@ def _awkward_functions() -> list[Known]:
     ]
 
 
-FUNCTIONS = (*_smooth_functions(), *_rough_functions(), *_awkward_functions())
+KINDS = {"smooth": _smooth_functions(), "rough": _rough_functions(), "awkward": _awkward_functions()}
+FUNCTIONS = tuple(one for members in KINDS.values() for one in members)
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ from typing import Any
 # Type -> "module:function", imported once such a result is there. A function's own keyword-only parameters are options
 # of the verbs that return the type; what it returns is the exit code, 0 for None.
 SHOWN = {
+    "Advice": "advise:show",
     "Bench": "bench:show",
     "Card": "card:show",
     "Census": "census:show",

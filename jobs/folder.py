@@ -81,6 +81,7 @@ PAIRS = Results("study of pairs", ("pairs.json",))
 CHECK = Results("check", ("check.json", "check.png"), "check.png")
 HESSIAN = Results("Hessian", ("hessian.json", "hessian.npz", "hessian.png"), "hessian.png")
 REMEDY = Results("study of remedies", ("remedy.json", "remedy.npz", "remedy.png"), "remedy.png")
+ADVICE = Results("advice", ("advice.json",))
 CENSUS = Results("census", ("census.json", "census.npz", "census.png"), "census.png")
 
 

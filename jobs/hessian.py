@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -27,7 +26,7 @@ from ..landscapes.curvature import (
     measure_spectrum,
 )
 from ..landscapes.measures.hessian import BOX_UNITS, Hessian, conclude
-from ..landscapes.objective import Evaluation, Objective, ObjectiveWrapper, evaluate
+from ..landscapes.objective import LossesOnly, Objective, evaluate
 from ..landscapes.storage.checkpoint import Checkpoint
 from ..landscapes.storage.files import replacing
 from .folder import HESSIAN, folder_named
@@ -141,7 +140,7 @@ class HessianJob(CheckpointedJob[Hessian]):
 
     def verified(self) -> Objective:
         """Return the environment, without the gradients that it does not have."""
-        return self.env if self.has_gradients else _WithoutGradients(self.env)
+        return self.env if self.has_gradients else LossesOnly(self.env)
 
     def _episodes(self) -> int:
         """Return how many episodes it takes at most."""
@@ -169,12 +168,3 @@ class HessianJob(CheckpointedJob[Hessian]):
             f"gradients, about {duration(seconds)}{lower}",
             seconds,
         )
-
-
-class _WithoutGradients(ObjectiveWrapper):
-    """An objective whose losses alone are known: its gradients are NaN."""
-
-    def evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool = True) -> Evaluation:
-        """Return losses at points `x` of the space."""
-        found = self.objective.evaluate(x, grad=False)
-        return Evaluation.from_results(found.loss, torch.full_like(x, torch.nan) if grad else None, found.status)

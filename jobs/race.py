@@ -85,7 +85,7 @@ class RaceJob(Job[Race]):
         budget, seeds = points_within(env, budget), as_whole(seeds, "a number of seeds", least=1)
         workers = as_whole(workers, "a number of workers", least=1)
         if not (methods := check_methods(methods)):
-            methods, unable = divide_methods(env)
+            methods, unable = divide_methods(env, budget=budget)
             for method, why in unable.items():
                 watch.note(f"without {method}: {why}")
         # More methods, seeds or episodes continue in the same folder.
@@ -98,6 +98,7 @@ class RaceJob(Job[Race]):
         for method in methods:
             optimizer = make_optimizer(method, env, options=options.get(method))
             optimizer.require_memory(optimizer.options, SearchSize(env.space.dim, env.decisions, budget))
+            optimizer.require_budget(optimizer.options, budget)
         competitors = []
         with watch.busy(f"opening {len(methods) * seeds} runs"):
             for seed in range(seeds):

@@ -68,6 +68,7 @@ class SearchSummary:
     command: str
     files: list[str]
     error: str = ""
+    remark: str = ""
 
     def outcome(self) -> str:
         """Say in a line what the run cost and found."""
@@ -80,7 +81,8 @@ class SearchSummary:
             f"{lacking} without a gradient" if lacking else "",
             describe_errors(counts[Status.ERROR], self.error),
         ]
-        return "; ".join([f"{self.episodes} episodes in {duration(self.seconds)}", found, *filter(None, parts)])
+        said = "; ".join([f"{self.episodes} episodes in {duration(self.seconds)}", found, *filter(None, parts)])
+        return f"{said}\n{self.remark}".rstrip()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,6 +116,7 @@ class SearchJob(SummaryJob[SearchSummary]):
         folder = out or folder_named(parts, identity)
         require_runs(env.space.dim, budget, 1, folder)
         optimizer.require_memory(optimizer.options, SearchSize(env.space.dim, env.decisions, budget))
+        optimizer.require_budget(optimizer.options, budget)
         RUN.check(folder)
         if replaced := force and (folder / STORE).exists():
             check_free(folder)
@@ -215,6 +218,7 @@ class SearchJob(SummaryJob[SearchSummary]):
             command=self.command,
             files=files,
             error=self.store.error,
+            remark=run.remark,
         )
 
 
@@ -253,6 +257,8 @@ def divide_methods(env: Environment, names: Sequence[str] = (), *, budget: int =
         try:
             made = make_optimizer(method, env)
             made.require_memory(made.options, SearchSize(env.space.dim, env.decisions, budget))
+            if budget:
+                made.require_budget(made.options, budget)
         except ValueError as error:
             unable[method] = " ".join(str(error).split())
         else:

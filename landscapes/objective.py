@@ -334,6 +334,15 @@ class BoxedObjective(ObjectiveWrapper):
         return {name: BoxedObjective(replica) for name, replica in self.objective.replicas().items()}
 
 
+class LossesOnly(ObjectiveWrapper):
+    """An objective whose losses alone are known: its gradients are NaN."""
+
+    def evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool = True) -> Evaluation:
+        """Return losses at points `x` of the space."""
+        found = self.objective.evaluate(x, grad=False)
+        return Evaluation.from_results(found.loss, torch.full_like(x, torch.nan) if grad else None, found.status)
+
+
 class SimulatorError(ValueError):
     """What a simulator returned is not what it has to return; no status of a single point can say that."""
 

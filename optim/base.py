@@ -24,7 +24,16 @@ from .lockstep import Asking, answer_alone
 from .memory import FLOAT, SearchSize
 
 Points = NDArray[np.float64]
-COMMON = {"space", "seed", "options", "random", "worst", "objective", "_told_any"}  # attributes of every optimiser
+COMMON = {
+    "space",
+    "seed",
+    "options",
+    "random",
+    "worst",
+    "objective",
+    "remark",
+    "_told_any",
+}  # attributes of every optimiser
 
 
 LARGE = 1e100  # a loss: the squares of a billion of them still have a sum
@@ -38,6 +47,7 @@ class Kind(IntEnum):
     DESCENT = 2
     ACQUISITION = 3
     POLICY = 4
+    MEASUREMENT = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,6 +97,7 @@ class Optimizer(abc.ABC):
         self.options = self.Options() if options is None else options
         self.random = np.random.default_rng(seed)
         self.worst = 0.0  # the largest finite loss so far
+        self.remark = ""  # what it has to say of this search, which the run keeps
         self._told_any = False
         self.objective: Objective | None = None
         self._setup()
@@ -116,6 +127,11 @@ class Optimizer(abc.ABC):
             if type(value) is int and value > 0:
                 require(f"{cls.name} option {name}", value, partial(cls._need_with, known, size, name))
             known[name] = value
+
+    @classmethod
+    def require_budget(cls, options: Any, budget: int) -> None:
+        """Refuse a budget with which the method cannot search. Raises ValueError."""
+        return
 
     @classmethod
     def _need_with(cls, options: Mapping[str, Any], size: SearchSize, option: str, value: int) -> Need:
@@ -196,6 +212,13 @@ class Optimizer(abc.ABC):
             if hasattr(type(self), name):
                 raise ValueError(f"{name} is no attribute that {self.name} keeps")
             setattr(self, name, _from_data(value, getattr(self, name, None)))
+
+    def learn(self, z: Points, loss: Points) -> None:  # noqa: B027 -- nothing, for a method that remembers nothing
+        """Take in points of the scaled box that were evaluated before the search, one of which has a loss.
+
+        Their shapes are (count, dim) and (count,); losses are +inf where an episode failed. A descent starts at the
+        best of them, a model is of all of them.
+        """
 
     @abc.abstractmethod
     def _ask(self) -> Proposal | Asking[Proposal]:

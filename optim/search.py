@@ -104,6 +104,7 @@ def _fill(optimizer: Optimizer | None, run: RunStore, budget: int, report: Calla
         seconds, mark = now - mark, now
         if complete:
             optimizer.tell(x, evaluation)
+            run.keep_remark(optimizer.remark)
         run.append(x, evaluation, proposal.kind, seconds, optimizer.state if complete else None)
         report()
     run.save(optimizer.state if complete else None)

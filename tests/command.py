@@ -25,6 +25,7 @@ info
 slice bounce --dims 0 1 --resolution 4 --fidelity draft --device cpu --out cut
 sweep bounce --dims 0 1 --over 2 --frames 2 --resolution 2 --fidelity draft --device cpu
 methods
+advise branin --device cpu
 optimize bounce --method random --budget 4 --fidelity draft --device cpu --out run
 race bounce --methods random --seeds 1 --budget 2 --fidelity draft --device cpu
 league branin --methods random --seeds 1 --budget 2 --device cpu

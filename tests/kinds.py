@@ -85,6 +85,7 @@ KINDS = {
     "pairs": Kind(f"pairs ackley --set dim=3 --samples 2 --out {MADE} --json"),
     "hessian": Kind(f"hessian ackley --set dim=3 --through random:1 --out {MADE} --json"),
     "remedy": Kind(f"remedy ackley --set dim=3 --starts 6 --budget 16 --remedies smooth:2%:first:4 --out {MADE}"),
+    "advise": Kind(f"advise ackley --set dim=3 --budget 200 --device cpu --out {MADE} --json"),
     "census": Kind(f"census ackley --set dim=3 --slices 4 --resolution 6 --out {MADE} --json"),
     "check": Kind(f"check branin --power 50% --device cpu --out {MADE} --json"),
     "card": Kind(f"card --scene control --resolution 3 --out {MADE} --json"),

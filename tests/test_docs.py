@@ -116,6 +116,7 @@ def small(command: str) -> list[str]:
     scenes = SCENES.get(kind, {})
     found = [scenes.get(word, WORDS.get(word, word)) for word in words[1:]]
     values = VALUES | ({"--budget": "16", "--starts": "6"} if verb == "remedy" else {})
+    values |= {"--budget": "500"} if "auto" in words else {}
     for at, word in enumerate(found[:-1]):
         found[at + 1] = values.get(word, found[at + 1])
     added = ADDED.get(verb, []) + (TAICHI if "taichi" in found else [])

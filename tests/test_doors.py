@@ -65,7 +65,7 @@ own = Own()
 """
 NAMES = ("of_torch", "of_jax", "of_numpy", "of_warp", "Bowl", "bowl", "own")
 WALKED = ("of_jax", "Own")  # by all functions and verbs; others by the functions that evaluate, keep and send them
-SHORT = ("as_environment", "make", "check", "slice", "sample", "optimize")
+SHORT = ("as_environment", "make", "check", "slice", "sample", "optimize", "advise")
 LACKING = {  # what some verbs need of a simulator
     "replay": "has no episode to draw; a class with a method `episode` has",
     "study": "has one fidelity, default, so there is nothing",
@@ -100,6 +100,7 @@ def functions(f: Any, name: str) -> dict[str, Callable[[], Any]]:
         "open_slice": lambda: gs.open_slice(f"{name}/slice", env=f).report(points=2),
         "report": lambda: gs.report(f"{name}/slice", env=f, points_per_axis=2, out=f"{name}/report"),
         "sweep": lambda: gs.sweep(f, (0, 1), "smoothing", frames=2, resolution=4, out=f"{name}/sweep"),
+        "advise": lambda: gs.advise(f, budget=200),
         "optimize": lambda: gs.optimize(f, "random", budget=6, out=f"{name}/run"),
         "open_run": lambda: gs.open_run(f"{name}/run"),
         "race": lambda: gs.race(f, ["random", "cma-es"], **small, out=f"{name}/race"),
@@ -128,6 +129,7 @@ def commands(f: str, name: str) -> dict[str, str]:
         "report": f"report {name}/s --env {f} --points-per-axis 2 --out {name}/r",
         "check": f"check {f} --power 20%",
         "sweep": f"sweep {f} --dims 0 1 --over smoothing --frames 2 --resolution 4 --out {name}/w",
+        "advise": f"advise {f} --budget 200",
         "optimize": f"optimize {f} --method random --budget 6 --out {name}/o",
         "race": f"race {f} --methods random,cma-es --budget 6 --seeds 2 --out {name}/a",
         "league": f"league {f} --methods random,cma-es --budget 6 --seeds 2 --out {name}/l",

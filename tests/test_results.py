@@ -71,6 +71,7 @@ RESULTS = {
     "census": Left(
         "census.json census.png census.npz pieces", "4 of 4 slices are kept", "census", "", THERE, DIM
     ),
+    "advise": Left("advice.json -", "nothing of the advice is kept", "advice", other="--seed 1"),
     "check": Left("check.json check.png", "nothing of the check is kept", "check", other="--seed 1"),
     "card": Left(
         "card.json card.png card.html card.npz pieces", "1 of 1 engines in scenes are kept", "report card", "", "",
@@ -89,7 +90,7 @@ RESULTS = {
     "surface": Left("- surface.png surface.gltf", "each file in", "surface", "surface.png"),
 }  # fmt: skip
 VERBS = {kind: KINDS[kind].make.split()[0] for kind in RESULTS}
-PRINTED = [kind for kind in RESULTS if VERBS[kind] not in ("sweep", "pairs")]
+PRINTED = [kind for kind in RESULTS if VERBS[kind] not in ("sweep", "pairs", "advise")]
 REPLACING = [kind for kind, one in RESULTS.items() if one.other]
 
 

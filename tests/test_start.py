@@ -62,6 +62,8 @@ REFUSED = (
     *(
         "slice nosuch --dims 0 1",
         "check missing.py:Bowl",
+        "advise nosuch",
+        "advise branin --budget 100",
         "replay nosuch",
         "study fidelity nosuch",
     ),

@@ -17,6 +17,8 @@ from itertools import product
 from pathlib import Path
 from typing import Any, cast
 
+from benchmarks import advice
+
 from gradscape.envs.registry import entries, environment_class
 from gradscape.gallery.figures import read_figures
 from gradscape.gallery.files import DATA, DEVICES
@@ -352,6 +354,9 @@ def known_causes() -> str:
 TABLES: dict[tuple[str, str], Callable[[], str]] = {  # by page and name
     ("README.md", "censuses"): short_censuses,
     ("README.md", "league"): short_league,
+    ("README.md", "advice"): advice.prose,
+    ("docs/advice.md", "advice"): advice.score_table,
+    ("docs/advice.md", "advised"): advice.scene_table,
     ("docs/races.md", "league"): league,
     ("docs/races.md", "rivals"): rivals,
     ("docs/races.md", "defaults"): method_defaults,

@@ -72,6 +72,7 @@ METHODS: dict[str, dict[str, Any]] = {
     "bo-gradient": {"color": "#999933", "linestyle": (0, (2, 0.8)), "marker": "8"},
     "ppo": {"color": "#cc79a7", "linestyle": (0, (8, 1.5, 1, 1.5, 1, 1.5)), "marker": "P"},
     "sac": {"color": "#5b2a86", "linestyle": (0, (8, 2.5)), "marker": "*", "markersize": 9.0},
+    "auto": {"color": "#b00020", "linestyle": (0, (4, 1, 1, 1)), "marker": (4, 1, 0)},
 }
 OTHER_METHOD: dict[str, Any] = {"color": INK, "linestyle": "solid", "marker": "h"}
 METHOD_LINE: dict[str, Any] = {"linewidth": 1.4, "markersize": 6.0, "markeredgewidth": 0.7, "markeredgecolor": "white"}
@@ -81,6 +82,7 @@ POINT_MARKS: dict[str, dict[str, Any]] = {  # what a run evaluated a point for
     "descent": {"color": "#b5367a", "marker": "v"},
     "acquisition": {"color": "#009e73", "marker": "D"},
     "policy": {"color": "#5b2a86", "marker": "s"},
+    "measurement": {"color": "#8c564b", "marker": "h"},
     "given": {"color": "#c47a00", "marker": "^"},  # by another program
 }
 TINTED = ("#0b0b18", "#ffffdc")  # inks on a colour that are no greys, so that they stay where a page is dark

@@ -68,6 +68,10 @@ class BO(Optimizer):
     def _setup(self) -> None:
         self.surrogate = Surrogate(self.space.dim, self.options)
 
+    def learn(self, z: Points, loss: Points) -> None:
+        """Model these points, too."""
+        self.surrogate.add(z, loss)
+
     def _ask(self) -> Asking[Proposal]:
         kind = Kind.ACQUISITION if self.surrogate.informed else Kind.RANDOM
         z = yield from self.surrogate.minimise(self.random)
@@ -154,6 +158,10 @@ class BOGradient(BO):
                 f"this space has {self.space.dim}"
             )
         self.surrogate = SlopeSurrogate(self.space.dim, self.options, points)
+
+    def learn(self, z: Points, loss: Points) -> None:
+        """Model these points, too, without slopes."""
+        self.surrogate.learn(z, loss, np.full_like(z, np.nan))
 
     def _tell(self, z: Points, loss: Points, grad: Points | None) -> None:
         assert grad is not None  # as asked
@@ -278,6 +286,11 @@ class TuRBO(Optimizer):
     def _setup(self) -> None:
         self.failures = math.ceil(max(4.0, self.space.dim) / self.options.batch_size)
         self._begin()
+
+    def learn(self, z: Points, loss: Points) -> None:
+        """Begin with these points instead of random ones."""
+        self.surrogate.add(z, loss)
+        self.first, self.best = self.first[:0], float(loss.min())
 
     def _begin(self) -> None:
         self.surrogate = Surrogate(self.space.dim, MODELLED)

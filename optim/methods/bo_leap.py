@@ -74,6 +74,10 @@ class BOLeap(Optimizer):
         self.descent = Descent(np.zeros(self.space.dim), self.options, done=True)
         self.spent = 0  # episodes, by this semi-local search
 
+    def learn(self, z: Points, loss: Points) -> None:
+        """Model these points, too."""
+        self.surrogate.add(z, loss)
+
     def _ask(self) -> Asking[Proposal]:
         if not self.descent.done:
             return Proposal(torch.from_numpy(self.descent.at[None]), Kind.DESCENT, grad=True)

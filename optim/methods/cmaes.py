@@ -66,7 +66,12 @@ class CMAES(Optimizer):
             raise ValueError(f"cma-es searches two parameters or more; this space has {self.space.dim}")
         self._start()
 
-    def _start(self) -> None:
+    def learn(self, z: Points, loss: Points) -> None:
+        """Begin with the mean at the best point."""
+        self._start(z[np.argmin(loss)])
+
+    def _start(self, mean: Points | None = None) -> None:
+        self._given = mean
         self._began = self.random.bit_generator.state
         self._told: list[tuple[Points, Points]] = []  # populations and their losses since then
         options = quiet_options(self.random) | {
@@ -75,7 +80,7 @@ class CMAES(Optimizer):
         }
         if self.options.population:
             options["popsize"] = self.options.population
-        start = self.random.uniform(-1.0, 1.0, self.space.dim)
+        start = self.random.uniform(-1.0, 1.0, self.space.dim) if mean is None else mean
         self.strategy = cma.CMAEvolutionStrategy(start, self.options.sigma, options)
 
     def _ask(self) -> Proposal:
@@ -94,11 +99,11 @@ class CMAES(Optimizer):
     def _state(self) -> dict[str, Any]:
         """Return what the library has been told since it began last: its own state could only be pickled."""
         points, losses = ([told[part] for told in self._told] for part in (0, 1))
-        return {"began": self._began, "points": np.array(points), "losses": np.array(losses)}
+        return {"began": self._began, "mean": self._given, "points": np.array(points), "losses": np.array(losses)}
 
     def _restore(self, own: Mapping[str, Any]) -> None:
         self.random.bit_generator.state = own["began"]
-        self._start()
+        self._start(own.get("mean"))  # which earlier versions did not write
         for points, loss in zip(own["points"], own["losses"], strict=True):
             self._repeat()
             self._asked = self.strategy.ask()
@@ -159,8 +164,8 @@ class CMAESGradient(CMAES):
     Options: ClassVar[type[CMAESOptions]] = CMAESGradientOptions
     needs_grad = True
 
-    def _start(self) -> None:
-        super()._start()
+    def _start(self, mean: Points | None = None) -> None:
+        super()._start(mean)
         self._injected: list[Points] = []  # for each population so far, NaN for none
 
     def _ask(self) -> Proposal:

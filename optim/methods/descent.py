@@ -142,6 +142,11 @@ class Descents(Optimizer):
             descent.tell(float(one_loss), one_grad)
         self.descents = [self._begin() if one.done else one for one in self.descents]
 
+    def learn(self, z: Points, loss: Points) -> None:
+        """Begin the first descents at the best points."""
+        best = z[np.argsort(loss, kind="stable")[: len(self.descents)]]
+        self.descents[: len(best)] = [self.Descent(start, self.options) for start in best]
+
     def _begin(self) -> Descending:
         descent: Descending = self.Descent(self.random.uniform(-1.0, 1.0, self.space.dim), self.options)
         return descent

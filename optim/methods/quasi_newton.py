@@ -104,6 +104,10 @@ class LBFGSB(Optimizer):
     def _setup(self) -> None:
         self.local = self._begin(self.random.uniform(-1.0, 1.0, self.space.dim))
 
+    def learn(self, z: Points, loss: Points) -> None:
+        """Search from the best point first."""
+        self.local = self._begin(z[np.argmin(loss)])
+
     def _begin(self, start: Points) -> LocalSearch:
         return LocalSearch(start, self.options.evaluations)
 
@@ -150,6 +154,11 @@ class BasinHopping(LBFGSB):
         self.here = self.local.start
         self.here_loss, self.here_failed = math.inf, True
         self.length, self.hops, self.accepted = self.options.step, 0, 0
+
+    def learn(self, z: Points, loss: Points) -> None:
+        """Search from the best point first, and hop from there."""
+        super().learn(z, loss)
+        self.here = self.local.start
 
     def _next_start(self) -> Points:
         if self.hops == 0 or self._accept():

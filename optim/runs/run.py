@@ -77,6 +77,11 @@ class Run:
         return BestEpisode(x, float(loss[row]), row + 1)
 
     @property
+    def remark(self) -> str:
+        """What the method had to say of its search, such as which method `auto` took; empty for most."""
+        return str(self.data.attrs.get("remark", ""))
+
+    @property
     def errors(self) -> str:
         """How many episodes raised and what the first of them said, in a line; empty where none did."""
         return errors_of(self.data)
@@ -107,7 +112,7 @@ class Run:
         count = self.data.sizes["evaluation"]
         found = f"best loss {self.best.loss:.6g}" if np.isfinite(self.data["loss"]).any() else "none succeeded"
         where = f", in {self.folder}" if self.folder else ""
-        raised = f"; {self.errors}" if self.errors else ""
+        raised = "".join(f"; {one}" for one in (self.errors, self.remark) if one)
         return f"<Run of {self._name()}: {count} of {self.data.attrs['budget']} episodes, {found}{raised}{where}>"
 
     def _name(self) -> str:

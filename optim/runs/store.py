@@ -58,7 +58,13 @@ from .run import Run
 ARRAY = "__array__"  # stands in the outline for the number of an array
 STATE = "state"
 CHUNK = 64  # rows
-CHANGING = {"budget", "gradient_cost", ERROR}  # attributes of a run that are not what they were when it was made
+REMARK = "remark"  # the attribute of a run with what its method had to say of the search
+CHANGING = {
+    "budget",
+    "gradient_cost",
+    ERROR,
+    REMARK,
+}  # attributes of a run that are not what they were when it was made
 FORMAT = 2
 DEEP = ("x", "grad")
 COLUMNS: dict[str, tuple[str, dict[str, Any]]] = {  # status last: a row that has one is whole
@@ -422,6 +428,11 @@ class RunStore:
         self.attributes["gradient_cost"] = gradient_cost
         self._write_journal()
         self._set(gradient_cost=gradient_cost)
+
+    def keep_remark(self, remark: str) -> None:
+        """Keep what the method has to say of its search."""
+        if remark != self.attributes.get(REMARK, ""):
+            self._set(**{REMARK: remark})
 
     def extend(self, budget: int) -> None:
         """Make room for so many episodes, if there is less."""

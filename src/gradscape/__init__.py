@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from .api.plan import plan
     from .api.replay import replay
     from .api.report import report
-    from .api.search import league, open_run, optimize, race
+    from .api.search import advise, league, open_run, optimize, race
     from .api.slice import bounce, open_slice, sample, slice, slices
     from .api.study import study
     from .api.surface import surface
@@ -43,7 +43,7 @@ _HOMES = {
     "api.plan": ("plan",),
     "api.replay": ("replay",),
     "api.report": ("report",),
-    "api.search": ("league", "open_run", "optimize", "race"),
+    "api.search": ("advise", "league", "open_run", "optimize", "race"),
     "api.slice": ("bounce", "open_slice", "sample", "slice", "slices"),
     "api.study": ("study",),
     "api.surface": ("surface",),

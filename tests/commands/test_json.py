@@ -19,7 +19,19 @@ plan slice branin --resolution 4
 gallery list .
 """.strip().splitlines()
 ELSEWHERE = {  # whose JSON other tests read
-    *("bench", "bounce", "card", "census", "check", "compare", "gallery compute", "hessian", "league", "optimize"),
+    *(
+        "advise",
+        "bench",
+        "bounce",
+        "card",
+        "census",
+        "check",
+        "compare",
+        "gallery compute",
+        "hessian",
+        "league",
+        "optimize",
+    ),
     *("overlay", "pairs", "race", "remedy", "replay", "report", "slice", "study", "surface", "sweep"),
 }
 

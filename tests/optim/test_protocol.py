@@ -16,15 +16,21 @@ SPACE = ParameterSpace.box(("a", "b", "c"), -1.0, 1.0)
 BOWL = from_torch(lambda x: (x**2).sum(dim=1), SPACE, name="bowl")
 AROUND = ("cma-es", "cma-es-gradient", "bo-leap")  # draw a population around their first point
 ELSEWHERE = ("ppo", "sac")  # begin with a policy; see test_policy.py
+MEASURING = ("auto",)  # begins with points of its own; see test_auto.py
 EGGS = from_torch(  # Rastrigin's function
     lambda x: (x**2 - 10.0 * torch.cos(2.0 * math.pi * x) + 10.0).sum(dim=1),
     ParameterSpace.box(("a", "b"), -4.0, 5.0),
     name="rastrigin",
 )
-QUICK = {"bo-leap": {"local_budget": 30}, "bo": {"initial": 5}, "bo-descents": {"initial": 5}}
+QUICK = {
+    "bo-leap": {"local_budget": 30},
+    "bo": {"initial": 5},
+    "bo-descents": {"initial": 5},
+    "auto": {"evaluations": 20},
+}
 
 
-@pytest.mark.parametrize("name", [name for name in methods() if name not in ELSEWHERE])
+@pytest.mark.parametrize("name", [name for name in methods() if name not in (*ELSEWHERE, *MEASURING)])
 def test_methods_with_the_same_seed_begin_at_the_same_point(name):
     first = optimizer_class("random").on(BOWL, seed=7).ask().x[0]
     optimizer = optimizer_class(name).on(BOWL, seed=7)
