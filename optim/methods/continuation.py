@@ -69,7 +69,7 @@ class Continuation(LBFGSB):
     def memory(cls, options: Mapping[str, Any], size: SearchSize) -> float:
         """Estimate what is kept of the longest polish, and what the estimate of a gradient takes [bytes]."""
         estimate = FLOAT * options["pairs"] * (20 * size.dim + 6 * options["pairs"])
-        return super().memory(options, size) + estimate
+        return super().memory(options, size) + float(estimate)
 
     def _setup(self) -> None:
         self.needs_grad = self.options.order != "zeroth"
@@ -129,8 +129,8 @@ class Continuation(LBFGSB):
         if largest == 0:
             return self.centre
         known = torch.ones(1, shape[1], dtype=torch.bool)
-        pairs = [torch.from_numpy(one) for one in (half[None] / largest, first[None] / largest, self.w)]
-        uphill = shrunk_gradient(*pairs, known)[0].numpy()
+        differences, slopes = torch.from_numpy(half[None] / largest), torch.from_numpy(first[None] / largest)
+        uphill = shrunk_gradient(differences, slopes, torch.from_numpy(self.w), known)[0].numpy()
         length = float(np.linalg.norm(uphill)) or 1.0
         move = self.options.step * self.width * math.sqrt(self.space.dim) / length * uphill
         return np.asarray(np.clip(self.centre - move, 0.0, 1.0))
