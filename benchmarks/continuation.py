@@ -1,6 +1,6 @@
 """Race `continuation` against the nine methods of the league, at equal episodes and at equal forward equivalents.
 
-    python -m benchmarks.continuation bounce@standard flip rastrigin [--budget 1000] [--seeds 10]
+    python -m benchmarks.continuation bounce@standard flip rastrigin [--budget 1000] [--seeds 10] [--order zeroth]
 
 In a scene of the league the nine have the runs that are kept of it, truncated to the budget, and only continuation
 searches here; a gradient costs what it cost there. Elsewhere all ten search here. Each prints two rows of
@@ -26,6 +26,7 @@ from gradscape.jobs.scene import SceneSpec
 from gradscape.jobs.search import make_optimizer, run_identity
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.landscapes.threads import one_torch_thread
+from gradscape.optim.methods.continuation import ORDERS
 from gradscape.optim.race import Competitor, race
 from gradscape.optim.runs.store import RunStore
 from gradscape.optim.statistics import EqualCost, seen_from
@@ -65,12 +66,13 @@ def function(name: str) -> Environment:
     return from_torch(lambda x: formula(x - shift), space, name=name)
 
 
-def runs(env: Environment, methods: tuple[str, ...], budget: int, seeds: int, cost: float) -> list[KeptRun]:
+def runs(env: Environment, methods: tuple[str, ...], budget: int, seeds: int, cost: float, order: str) -> list[KeptRun]:
     """Return what is kept of runs of methods that search here."""
     competitors = []
     for method in methods:
         for seed in range(seeds):
-            make = partial(make_optimizer, method, env, seed=seed)
+            options = {"order": order} if method == OURS else {}
+            make = partial(make_optimizer, method, env, seed=seed, options=options)
             store = RunStore.in_memory(env.space, identity=run_identity(env, make()), budget=budget)
             competitors.append(Competitor(method, seed, store, make))
     with one_torch_thread():
@@ -112,6 +114,7 @@ def main() -> None:
     parser.add_argument("scenes", nargs="+")
     parser.add_argument("--budget", type=int, default=1000)
     parser.add_argument("--seeds", type=int, default=10)
+    parser.add_argument("--order", choices=ORDERS, default=ORDERS[0])
     given = parser.parse_args()
     budget, seeds = given.budget, given.seeds
     for scene in given.scenes:
@@ -121,10 +124,10 @@ def main() -> None:
             kept = list(KeptRuns.read(files.runs).runs)
             cost = next(run.spent / run.episodes for run in kept if run.method == PLAIN)
             env = SceneSpec(name, fidelity or "draft", device="cpu").make()
-            found = [*kept, *runs(env, (OURS,), budget, seeds, cost)]
+            found = [*kept, *runs(env, (OURS,), budget, seeds, cost, given.order)]
         else:
             env = function(name) if name in FUNCTIONS else SceneSpec(name, fidelity or None, device="cpu").make()
-            found = runs(env, (*METHODS, OURS), budget, seeds, GRADIENT_COST)
+            found = runs(env, (*METHODS, OURS), budget, seeds, GRADIENT_COST, given.order)
         for what, forwards in (("episodes", math.inf), ("forward equivalents", budget)):
             cells = row(least(found, seeds, episodes=budget, forwards=forwards))
             print("|", " | ".join([f"`{name}`", f"{budget} {what}", *cells]), "|", flush=True)

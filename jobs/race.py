@@ -167,8 +167,7 @@ class RaceJob(Job[Race]):
     def work(self) -> list[Work]:
         """Return the budget of every run, with gradients where its method asks for them."""
         losses, gradients = (
-            sum(self.budget for one in self.competitors if self._needs_grad[one.method] == way)
-            for way in (False, True)
+            sum(self.budget for one in self.competitors if self._needs_grad[one.method] == way) for way in (False, True)
         )
         need = run_need(self.env.space.dim, self.budget).times(len(self.competitors))
         return [Work(self.env, losses, gradients, need.disk, need.memory)]

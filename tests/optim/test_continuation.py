@@ -11,6 +11,8 @@ from scipy.optimize import minimize
 
 import gradscape as gs
 from gradscape.envs.adapters import from_numpy, from_torch
+from gradscape.jobs.race import RaceJob
+from gradscape.jobs.watch import Watch
 from gradscape.landscapes.objective import Objective
 from gradscape.landscapes.space import ParameterSpace
 from gradscape.optim.base import Kind
@@ -53,13 +55,11 @@ def test_a_strongly_smoothed_step_goes_down_the_bowl_and_not_down_the_ripples(or
 def test_it_finds_the_lower_of_two_wells_where_l_bfgs_b_from_the_same_start_does_not() -> None:
     """Under a Gaussian of 0.6 the wells x^4 - 2 x^2 + 0.6 x have one minimum, since 6 * 0.6^2 > 2."""
     lower = float(min(np.roots([4, 0, -4, 0.6]).real))
-    seeds = [seed for seed in range(20) if 0.6 < Continuation(LINE, seed=seed).centre[0] < 0.75]
-    assert len(seeds) > 2
-    for seed in seeds:
-        optimizer = Continuation(LINE, seed=seed, options=ContinuationOptions(widths=8, pairs=50))
-        start = 6 * optimizer.centre - 3
-        alone = minimize(lambda x: (x[0] ** 2 - 1) ** 2 + 0.6 * x[0], start, method="L-BFGS-B", bounds=[(-3, 3)])
+    for seed, start in enumerate((0.7, 1.0)):
+        alone = minimize(lambda x: (x[0] ** 2 - 1) ** 2 + 0.6 * x[0], [start], method="L-BFGS-B", bounds=[(-3, 3)])
         assert alone.x[0] > 0.8
+        optimizer = Continuation(LINE, seed=seed, options=ContinuationOptions(widths=8, pairs=50))
+        optimizer.centre = np.array([(start + 3) / 6])
         run = search(WELLS, optimizer, budget=8 * 100 + 20, gradient_cost=1.0).read()  # no more than its first schedule
         assert run.best.x[0] == pytest.approx(lower, abs=1e-4)
 
@@ -69,11 +69,11 @@ def test_a_budget_is_kept_to_and_a_run_goes_on_as_if_never_stopped(tmp_path: Pat
     options = ContinuationOptions(order=order)
     identity = {"objective": "ripples", "method": "continuation", "seed": 3}
     parted = RunStore.open_or_create(tmp_path / "parted", SQUARE, identity=identity, budget=7)
-    for budget in (1, 7, 8, 37, 90):  # within the first pairs, after them, and within L-BFGS-B
+    for budget in (1, 8, 60):  # within the first pairs, after them, and within L-BFGS-B
         parted = RunStore.open_or_create(tmp_path / "parted", SQUARE, identity=identity, budget=budget)
         search(RIPPLES, Continuation(SQUARE, seed=3, options=options), parted, budget=budget, gradient_cost=2.0)
         assert parted.count == budget
-    whole = search(RIPPLES, Continuation(SQUARE, seed=3, options=options), budget=90, gradient_cost=2.0)
+    whole = search(RIPPLES, Continuation(SQUARE, seed=3, options=options), budget=60, gradient_cost=2.0)
     kept, wanted = parted.dataset(), whole.dataset()
     for column in ("x", "loss", "forwards", "kind"):
         np.testing.assert_array_equal(kept[column], wanted[column])
@@ -106,8 +106,9 @@ def test_a_function_without_gradients_is_never_asked_for_them(tmp_path: Path) ->
         gs.optimize(bowl, "continuation", budget=20)
     assert gs.optimize(bowl, "continuation", budget=200, method_options={"order": "zeroth"}).best.loss < 1e-3
     options = {"continuation": {"order": "zeroth"}}
-    race = gs.race(bowl, ["random", "continuation"], budget=30, seeds=2, method_options=options, out=tmp_path / "race")
-    assert race.statistics.ranks[0].forwards == 30
+    job = RaceJob.of(bowl, ["random", "continuation"], budget=30, seeds=2, command="", options=options, out=tmp_path)
+    assert sum(one.gradients for one in job.work()) == 0
+    assert job.compute(Watch()).statistics.ranks[0].forwards == 30
 
 
 def test_schedules_begin_at_the_best_point_until_they_bring_less_than_the_floor() -> None:
