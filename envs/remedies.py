@@ -9,7 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal, get_args
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int
@@ -19,12 +19,11 @@ from ..landscapes.episode import Episode
 from ..landscapes.identity import EPISODES_PER_POINT, REMEDY
 from ..landscapes.objective import Evaluation, Status
 from ..landscapes.plain import read_share
+from ..landscapes.randomised import ORDERS, Order, mean_of_pairs, reflect, smoothed_gradient
 from ..landscapes.space import LINEAR, LOG10, ParameterSpace, as_whole
 from .base import Environment
 from .registry import as_environment
 
-Estimator = Literal["first", "zeroth", "mixed"]
-ESTIMATORS: tuple[Estimator, ...] = get_args(Estimator)
 MIN_SUCCEEDED = 0.5  # share of the samples around a point that must succeed for a smoothed loss
 DECADE = 10.0  # upper over lower bound from which on a parameter may run on a logarithmic scale
 SENSITIVITY_POINTS = 64  # points at which `rescale` measures gradients
@@ -186,15 +185,15 @@ class Smooth(Remedy):
     """
 
     width: float
-    estimator: Estimator = "mixed"
+    estimator: Order = "mixed"
     samples: int = 16
     seed: int = 0
 
     def __post_init__(self) -> None:
         if not 0 < self.width <= 1:
             raise ValueError(f"smooth takes a width above 0 and up to 100 % of the box; got {self.width:g}")
-        if self.estimator not in ESTIMATORS:
-            raise ValueError(f"smooth estimates by {', '.join(ESTIMATORS)}; got {self.estimator!r}")
+        if self.estimator not in ORDERS:
+            raise ValueError(f"smooth estimates by {', '.join(ORDERS)}; got {self.estimator!r}")
         if as_whole(self.samples, "samples of smooth", least=2) % 2 or (self.samples < 6 and self.estimator == "mixed"):
             raise ValueError(f"smooth takes an even number of samples, from 6 where it is mixed; got {self.samples}")
 
@@ -225,7 +224,7 @@ class Smooth(Remedy):
         loss, status = found.loss.double().reshape(shape), found.status.reshape(shape)
         known = (status == Status.OK).all(dim=1)  # of pairs
         valued = ((status == Status.OK) | (status == Status.NO_GRADIENT)).all(dim=1)
-        mean, verdict = _mean_of_pairs(loss.mean(dim=1), valued), _joint_status(status, valued)
+        mean, verdict = mean_of_pairs(loss.mean(dim=1), valued), _joint_status(status, valued)
         if not grad:
             return Evaluation.from_results(mean, None, verdict, found.error)
         half = (loss[:, 0] - loss[:, 1]) / (2 * self.width)
@@ -233,32 +232,16 @@ class Smooth(Remedy):
         if found.grad is not None:
             sides = space.upper - space.lower
             first = (found.grad.double().reshape(moved.shape) * sides * signs).mean(dim=1)
-        slope = self._estimate(half, first, w, known) / (space.upper - space.lower)
+        slope = smoothed_gradient(half, first, w, known, self.estimator) / (space.upper - space.lower)
         return Evaluation.from_results(mean, slope, verdict, found.error)
 
     def _directions(self, dim: int) -> Float[Tensor, "pair dim"]:
         generator = torch.Generator().manual_seed(self.seed)
         return torch.randn(self.samples // 2, dim, generator=generator, dtype=torch.float64)
 
-    def _estimate(
-        self,
-        half: Float[Tensor, "batch pair"],
-        first: Float[Tensor, "batch pair dim"] | None,
-        w: Float[Tensor, "pair dim"],
-        known: Tensor,
-    ) -> Float[Tensor, "batch dim"]:
-        """Return gradients per side of the box, from halved differences and gradients of the pairs that are known."""
-        half = torch.where(known, half, 0.0)
-        if first is None:
-            return _mean_of_pairs(half[..., None] * w, known)
-        first = torch.where(known[..., None], first, 0.0)
-        if self.estimator == "first":
-            return _mean_of_pairs(first, known)
-        return _mean_of_pairs(mix_orders(half, first, w, known), known)
-
 
 def smooth(
-    f: Any, width: float, *, estimator: Estimator = "mixed", samples: int = 16, seed: int = 0
+    f: Any, width: float, *, estimator: Order = "mixed", samples: int = 16, seed: int = 0
 ) -> RemediedEnvironment:
     """Return an environment whose loss is averaged over a Gaussian around each point.
 
@@ -275,44 +258,6 @@ def smooth(
     Raises ValueError for a width, an estimator or a number of samples that there is not.
     """
     return RemediedEnvironment(as_environment(f), Smooth(width, estimator, samples, seed))
-
-
-def reflect(u: Float[Tensor, "*batch dim"]) -> tuple[Float[Tensor, "*batch dim"], Float[Tensor, "*batch dim"]]:
-    """Return points of the unit cube that points beyond it are mirrored to, and the sign of that map's derivative."""
-    folded = torch.remainder(u, 2.0)
-    return 1 - (1 - folded).abs(), torch.where(folded <= 1, 1.0, -1.0)
-
-
-def mix_orders(
-    half: Float[Tensor, "batch pair"],
-    first: Float[Tensor, "batch pair dim"],
-    w: Float[Tensor, "pair dim"],
-    known: Tensor,
-) -> Float[Tensor, "batch pair dim"]:
-    """Return each pair's gradient estimate: zeroth order, with first order of the other pairs as a control variate.
-
-    With g the mean first-order gradient of the other pairs, (half - c g.w) w + c g has the mean of half w whatever g
-    and c are, as both are independent of w. `c`, from 0 to 1, is the slope of half over g.w among the other pairs: near
-    1 where gradients explain the differences of losses, near 0 where they do not.
-    """
-    count = known.sum(dim=1, keepdim=True).double()
-    others = (count - 1).clamp(min=1)[..., None]
-    g = (first.sum(dim=1, keepdim=True) - first) / others
-    along = torch.einsum("bkd,jd->bkj", g, w)  # of pair j, by the gradient that leaves out pair k
-    apart = known[:, None, :] & ~torch.eye(len(w), dtype=torch.bool)
-    along_others = torch.where(apart, along, 0.0)
-    size = along_others.square().sum(dim=2)
-    c = torch.where(size > 0, (along_others * half[:, None, :]).sum(dim=2) / size.clamp(min=torch.finfo().tiny), 0.0)
-    g = c.clamp(0, 1)[..., None] * g
-    mixed: Tensor = (half - (g * w).sum(dim=-1))[..., None] * w + g
-    return mixed
-
-
-def _mean_of_pairs(values: Tensor, known: Tensor) -> Tensor:
-    """Return means over the pairs that are known, NaN where none is."""
-    seen = known.reshape(*known.shape, *[1] * (values.ndim - known.ndim))
-    mean: Tensor = torch.where(seen, values, 0.0).sum(dim=1) / seen.sum(dim=1)
-    return mean
 
 
 def _joint_status(status: Int[Tensor, "batch part pair"], known: Tensor) -> Int[Tensor, " batch"]:

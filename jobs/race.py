@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +21,7 @@ from ..optim.claims import Claims, check_claims
 from ..optim.memory import SearchSize, require_runs, run_need
 from ..optim.processes import workers_worth
 from ..optim.race import Competitor, Race, name_seeds, race
-from ..optim.registry import check_methods, optimizer_class
+from ..optim.registry import check_methods
 from ..optim.runs.store import RunStore
 from ..optim.search import SearchProgress
 from .folder import RACE, RUN_STORE, folder_named
@@ -168,8 +168,7 @@ class RaceJob(Job[Race]):
     def work(self) -> list[Work]:
         """Return the budget of every run, with gradients where its method asks for them."""
         losses, gradients = (
-            sum(self.budget for one in self.competitors if optimizer_class(one.method).needs_grad == way)
-            for way in (False, True)
+            sum(self.budget for one in self.competitors if self._needs_grad[one.method] == way) for way in (False, True)
         )
         need = run_need(self.env.space.dim, self.budget).times(len(self.competitors))
         return [Work(self.env, losses, gradients, need.disk, need.memory)]
@@ -217,7 +216,7 @@ class RaceJob(Job[Race]):
         """Say what is left to compute, and return what an episode with gradient costs if any method asks for it."""
         env = self.env
         watch.note(f"{env.name} · {env.fidelity.name} · {env.device} · {self.folder}")
-        needs = {method: optimizer_class(method).needs_grad for method in self.methods}
+        needs = self._needs_grad
         left = {
             way: sum(self._count_left(one) for one in self.competitors if needs[one.method] == way) for way in (0, 1)
         }
@@ -247,6 +246,11 @@ class RaceJob(Job[Race]):
         concurrent = sum(self._count_left(one) > 0 for one in self.competitors)
         seconds = simulation_seconds(self.env, left[0], left[1], concurrent)
         return episode_cost(self.env, grad=grad), f"{duration(seconds)} to simulate, and what the methods take"
+
+    @cached_property
+    def _needs_grad(self) -> dict[str, bool]:
+        """Whether each method asks for gradients, with its options."""
+        return {one.method: one.make().needs_grad for one in self.competitors if one.seed == 0}
 
     @property
     def _sent(self) -> PortableObjective:

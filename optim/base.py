@@ -24,16 +24,9 @@ from .lockstep import Asking, answer_alone
 from .memory import FLOAT, SearchSize
 
 Points = NDArray[np.float64]
-COMMON = {
-    "space",
-    "seed",
-    "options",
-    "random",
-    "worst",
-    "objective",
-    "remark",
-    "_told_any",
-}  # attributes of every optimiser
+COMMON = {  # attributes of every optimiser
+    *("space", "seed", "options", "random", "worst", "objective", "needs_grad", "remark", "_told_any"),
+}
 
 
 LARGE = 1e100  # a loss: the squares of a billion of them still have a sum
@@ -90,7 +83,7 @@ class Optimizer(abc.ABC):
     name: ClassVar[str]
     method_version: ClassVar[int] = 1  # raised by hand when other points are asked for of the same seed
     Options: ClassVar[type[Any]]  # a frozen dataclass: every unstated choice with its default
-    needs_grad: ClassVar[bool] = False
+    needs_grad: bool = False  # `_setup` may set it by the options
 
     def __init__(self, space: ParameterSpace, *, seed: int = 0, options: Any = None) -> None:
         self.space, self.seed = space, as_whole(seed, f"the seed of {self.name}")

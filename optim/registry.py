@@ -50,6 +50,7 @@ BUILTIN = (
     _own("adam", "descent:Adam", "Adam from random starts"),
     _own("cma-es-gradient", "cmaes:CMAESGradient", "CMA-ES with a step down the gradient at its mean injected"),
     _own("turbo", "bayes:TuRBO", "TuRBO-1: Bayesian optimisation in a trust region, restarted when it has shrunk"),
+    _own("continuation", "continuation:Continuation", "descents on a smoothed loss, strong to weak, then L-BFGS-B"),
     _own("bo-gradient", "bayes:BOGradient", "Bayesian optimisation by a Gaussian process of losses and slopes"),
     _own("auto", "auto:Auto", "measures the landscape, then takes the method that is advised for such a one"),
     _own("ppo", "policy:PPO", "proximal policy optimisation of a neural policy", "rl"),

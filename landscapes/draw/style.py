@@ -70,6 +70,7 @@ METHODS: dict[str, dict[str, Any]] = {
     "cma-es-gradient": {"color": "#997700", "linestyle": (0, (3, 1, 1, 1)), "marker": "d"},
     "turbo": {"color": "#117733", "linestyle": "solid", "marker": ">"},
     "bo-gradient": {"color": "#999933", "linestyle": (0, (2, 0.8)), "marker": "8"},
+    "continuation": {"color": "#aa4499", "linestyle": (0, (4, 1, 1, 1)), "marker": "h"},
     "ppo": {"color": "#cc79a7", "linestyle": (0, (8, 1.5, 1, 1.5, 1, 1.5)), "marker": "P"},
     "sac": {"color": "#5b2a86", "linestyle": (0, (8, 2.5)), "marker": "*", "markersize": 9.0},
     "auto": {"color": "#b00020", "linestyle": (0, (4, 1, 1, 1)), "marker": (4, 1, 0)},

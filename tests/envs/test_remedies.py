@@ -11,18 +11,16 @@ from torch import Tensor
 import gradscape as gs
 from gradscape.envs.base import Environment
 from gradscape.envs.remedies import (
-    ESTIMATORS,
-    Estimator,
     RemediedEnvironment,
     average,
     clip,
-    reflect,
     remedied,
     rescale,
     shorten,
     smooth,
     soften,
 )
+from gradscape.landscapes.randomised import ORDERS, Order, reflect
 
 SQUARE = gs.ParameterSpace({"a": (-1, 1), "b": (-1, 1)})
 WIDTH = 0.05  # of the box, whose sides are 2 long
@@ -58,7 +56,7 @@ def _smoothed_cubic(x: Tensor) -> Tensor:
     return torch.stack([2 * a + 3 * b, 3 * a + 3 * b**2 + 3 * (2 * WIDTH) ** 2], dim=1)
 
 
-def _estimates(env: Environment, estimator: Estimator, count: int = 200) -> Tensor:
+def _estimates(env: Environment, estimator: Order, count: int = 200) -> Tensor:
     """Return gradients of as many seeds, shape (seed, point, axis)."""
     found = [smooth(env, WIDTH, estimator=estimator, seed=seed).evaluate(POINTS).grad for seed in range(count)]
     return torch.stack([grad for grad in found if grad is not None])
@@ -72,10 +70,10 @@ def _differences(env: Environment, x: Tensor, step: float = 1e-5) -> Tensor:
 
 @pytest.mark.parametrize(
     ("env", "truth", "unbiased"),
-    [(STEP, _smoothed_step, ("zeroth", "mixed")), (CUBIC, _smoothed_cubic, ESTIMATORS)],
+    [(STEP, _smoothed_step, ("zeroth", "mixed")), (CUBIC, _smoothed_cubic, ORDERS)],
     ids=["step", "cubic"],
 )
-@pytest.mark.parametrize("estimator", ESTIMATORS)
+@pytest.mark.parametrize("estimator", ORDERS)
 def test_smoothed_gradients_have_the_mean_of_the_closed_form(env, truth, unbiased, estimator) -> None:
     """First order knows nothing of a step."""
     found = _estimates(env, estimator)
@@ -88,7 +86,7 @@ def test_variances_are_those_of_theory() -> None:
     """Of a linear loss g.x: first order has none, zeroth order has (|g|^2 + g_i^2) / pairs, mixed has none."""
     slope = torch.tensor([3.0, -1.0], dtype=torch.float64)
     line = gs.from_torch(lambda x: x @ slope, SQUARE, name="line")
-    variance = {one: _estimates(line, one).var(dim=0)[0] for one in ESTIMATORS}
+    variance = {one: _estimates(line, one).var(dim=0)[0] for one in ORDERS}
     assert variance["first"].max() < 1e-20
     assert variance["mixed"].max() < 1e-20
     torch.testing.assert_close(variance["zeroth"], (slope.square().sum() + slope**2) / 8, rtol=0.35, atol=0.0)

@@ -14,7 +14,7 @@ from .states import restored
 
 SPACE = ParameterSpace.box(("a", "b", "c"), -1.0, 1.0)
 BOWL = from_torch(lambda x: (x**2).sum(dim=1), SPACE, name="bowl")
-AROUND = ("cma-es", "cma-es-gradient", "bo-leap")  # draw a population around their first point
+AROUND = ("cma-es", "cma-es-gradient", "bo-leap", "continuation")  # draw a population around their first point
 ELSEWHERE = ("ppo", "sac")  # begin with a policy; see test_policy.py
 MEASURING = ("auto",)  # begins with points of its own; see test_auto.py
 EGGS = from_torch(  # Rastrigin's function

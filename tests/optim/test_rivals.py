@@ -14,6 +14,7 @@ from gradscape.landscapes.space import ParameterSpace
 from gradscape.optim.base import Kind
 from gradscape.optim.methods.bayes import BO, BOGradient, GradientProcess, TuRBO, TuRBOOptions, region, standardised
 from gradscape.optim.methods.cmaes import CMAES, CMAESGradient
+from gradscape.optim.methods.continuation import Continuation
 from gradscape.optim.methods.descent import Adam, AdamOptions
 from gradscape.optim.methods.process import GradientCovariance, Process, closure_of, covariance_of
 from gradscape.optim.methods.quasi_newton import LBFGSB, BasinHopping
@@ -65,7 +66,7 @@ def evaluated(objective, optimizer, budget):
     return (2.0 * objective.space.to_unit(x) - 1.0).numpy(), table["loss"].to_numpy()
 
 
-@pytest.mark.parametrize("kind", RIVALS)
+@pytest.mark.parametrize("kind", [*RIVALS, Continuation])
 def test_minima_are_found(kind):
     _, losses = evaluated(BRANIN, kind.on(BRANIN, seed=1), FEW.get(kind, 200))
     assert losses.min() == pytest.approx(0.397887, abs=0.05 if kind in (Adam, TuRBO) else 1e-3)
