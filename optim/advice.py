@@ -15,6 +15,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from importlib import resources
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -142,7 +143,7 @@ class Choice:
 @cache
 def read_cases() -> Cases:
     """Return the cases that the package brings."""
-    return from_json(Cases, read_json(resources.files("gradscape.optim") / FILE))
+    return from_json(Cases, read_json(Path(str(resources.files("gradscape.optim"))) / FILE))
 
 
 def measures_of(one: Character) -> Array:

@@ -283,6 +283,8 @@ class TuRBO(Optimizer):
         samples = 8 * FLOAT * (candidates**2 + candidates * size.dim)
         return float(surrogate_memory(MODELLED.max_points, size) + samples + 4 * FLOAT * size.dim**2)
 
+    first: Points
+
     def _setup(self) -> None:
         self.failures = math.ceil(max(4.0, self.space.dim) / self.options.batch_size)
         self._begin()
@@ -296,7 +298,7 @@ class TuRBO(Optimizer):
         self.surrogate = Surrogate(self.space.dim, MODELLED)
         self.length, self.best = self.options.length, math.inf
         self.succeeded = self.failed = 0
-        self.first: Points = self.random.uniform(-1.0, 1.0, (2 * self.space.dim, self.space.dim))
+        self.first = self.random.uniform(-1.0, 1.0, (2 * self.space.dim, self.space.dim))
 
     def _ask(self) -> Asking[Proposal]:
         if len(self.first):
