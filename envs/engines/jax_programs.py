@@ -12,6 +12,7 @@ import glob
 import hashlib
 import json
 import os
+import re
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
@@ -94,19 +95,21 @@ def traced(fn: Program, shape: tuple[int, ...], precision: str, key: str) -> Pro
         return fn
     path = folder / f"{_digest(key, shape, precision)}.stablehlo"
     argument = jax.ShapeDtypeStruct(shape, precision)
-    program = _read(path, argument)
-    if program is None:
+    found = _read(path, argument)
+    if found is None:
         try:
             program = replace(export.export(jax.jit(fn))(argument), fun_name="traced")
         except (ValueError, NotImplementedError):
             return fn  # it holds what JAX does not export; tracing says what else may be wrong
+        found = program, _name(program)
         if program.module_kept_var_idx == (0,) and not (program.ordered_effects or program.unordered_effects):
-            _write(path, program)
+            _write(path, *found)
+    program, name = found
 
     def run(x: Any) -> Any:
         return program.call(x)
 
-    run.__name__ = path.stem  # what JAX files it under
+    run.__name__ = name
     return run
 
 
@@ -137,10 +140,19 @@ def _digest(key: str, shape: tuple[int, ...], precision: str) -> str:
     return hashlib.sha256(whole.encode()).hexdigest()[:32]
 
 
-def _write(path: Path, program: export.Exported) -> None:
+def _name(program: export.Exported) -> str:
+    """Return what JAX files a program under: a digest of its operations, not of the lines of code that made them.
+
+    The same operations of other code are not compiled again.
+    """
+    operations = re.sub(r"^#loc.*\n| loc\(.*?\)", "", program.mlir_module(), flags=re.MULTILINE)
+    return hashlib.sha256(operations.encode()).hexdigest()[:32]
+
+
+def _write(path: Path, program: export.Exported, name: str) -> None:
     """Keep a program where that is possible, and delete those that were not used for longest."""
-    outputs = json.dumps([(one.shape, str(one.dtype)) for one in program.out_avals])
-    content = outputs.encode() + b"\n" + program.mlir_module_serialized
+    outputs = [(one.shape, str(one.dtype)) for one in program.out_avals]
+    content = json.dumps([name, outputs]).encode() + b"\n" + program.mlir_module_serialized
     with contextlib.suppress(OSError):
         with replacing(path) as partial:
             partial.write_bytes(hashlib.sha256(content).digest() + content)
@@ -148,8 +160,8 @@ def _write(path: Path, program: export.Exported) -> None:
             old.unlink(missing_ok=True)
 
 
-def _read(path: Path, argument: jax.ShapeDtypeStruct) -> export.Exported | None:
-    """Return the program of a file; None where there is none, or where it is damaged."""
+def _read(path: Path, argument: jax.ShapeDtypeStruct) -> tuple[export.Exported, str] | None:
+    """Return the program of a file, and its name; None where there is none, or where it is damaged."""
     try:
         content = path.read_bytes()
     except OSError:
@@ -160,10 +172,10 @@ def _read(path: Path, argument: jax.ShapeDtypeStruct) -> export.Exported | None:
     with contextlib.suppress(OSError):
         os.utime(path)
     said, _, module = content.partition(b"\n")
-    outputs = json.loads(said)
+    name, outputs = json.loads(said)
 
     def alike(x: Any) -> Any:
         found = tuple(jnp.full(shape, x.sum(), dtype) for shape, dtype in outputs)
         return found if len(found) > 1 else found[0]
 
-    return replace(export.export(jax.jit(alike))(argument), fun_name="traced", mlir_module_serialized=module)
+    return replace(export.export(jax.jit(alike))(argument), fun_name="traced", mlir_module_serialized=module), name

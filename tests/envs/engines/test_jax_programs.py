@@ -65,6 +65,18 @@ def test_a_kept_program_gives_the_same_bits_and_calls_no_function():
     assert torch.equal(steep, grad)
 
 
+def test_the_same_operations_of_other_code_are_not_compiled_again(folder):
+    """Other code has another key, and its lines are elsewhere."""
+    evaluate = compile("def evaluate(wave, key): return wave.evaluate(key)", "elsewhere", "exec")
+    wave, elsewhere = Wave(), {}
+    exec(evaluate, elsewhere)
+    (loss, _, _), _ = wave.evaluate("wave")
+    (again, _, _), traced = elsewhere["evaluate"](wave, "edited")
+    assert traced == 1
+    assert torch.equal(again, loss)
+    assert [len(list(folder.glob(kept))) for kept in ("traced/*.stablehlo", "*-cache")] == [2, 1]
+
+
 @pytest.mark.parametrize(
     "other",
     [{"key": "other"}, {"precision": "float32"}, {"mode": "forward"}, {"rows": 1}],
