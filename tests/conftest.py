@@ -42,8 +42,16 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker("browser")
 
 
+@pytest.fixture(scope="session", autouse=True)
+def frozen() -> Iterator[None]:
+    """Let what is frozen stay so: a study of fidelities thaws all, and each later one looks through millions of objects."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(gc, "unfreeze", lambda: None)
+        yield
+
+
 @pytest.fixture(scope="module", autouse=True)
-def freeze() -> None:
+def freeze(frozen: None) -> None:
     """Spare what was loaded before a module to every collection of garbage in it: studies ask for one at each step."""
     gc.collect()
     gc.freeze()
