@@ -29,6 +29,8 @@ if (worker := os.environ.get("PYTEST_XDIST_WORKER")) and not alone and hasattr(o
     cores = sorted(os.sched_getaffinity(0))
     os.sched_setaffinity(0, {cores[int(worker.removeprefix("gw")) % len(cores)]})
 
+MANY = 20_000  # objects
+
 # Hypothesis gives an example 200 ms, and complains of those that take long to make.
 settings.register_profile("timeless", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("timeless")
@@ -44,17 +46,21 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture(scope="session", autouse=True)
 def frozen() -> Iterator[None]:
-    """Let what is frozen stay so: a study of fidelities thaws all, and each later one looks through millions of objects."""
+    """Let what is frozen stay so: a study of fidelities thaws it at its end."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(gc, "unfreeze", lambda: None)
         yield
 
 
-@pytest.fixture(scope="module", autouse=True)
+@pytest.fixture(autouse=True)
 def freeze(frozen: None) -> None:
-    """Spare what was loaded before a module to every collection of garbage in it: studies ask for one at each step."""
-    gc.collect()
-    gc.freeze()
+    """Spare what earlier tests have loaded to every collection of garbage: studies ask for one at each step.
+
+    A process that has loaded all engines holds millions of objects, and one look through them takes a second.
+    """
+    if len(gc.get_objects(generation=2)) > MANY:
+        gc.collect()
+        gc.freeze()
 
 
 @pytest.fixture(autouse=True)
