@@ -23,6 +23,7 @@ from .pictures import draw_slice
 from .text import render
 
 ROOT = Path(__file__).resolve().parents[2]
+WAY_BACK = re.compile("<!-- documentation (.*?) -->")  # a place in the gallery's pages
 INCLUDED = {  # what stands at the repository's root, and the page that shows it
     "README.md": "index.md",
     "BENCHMARKS.md": "benchmarks.md",
@@ -93,12 +94,17 @@ def gallery_site(app: Sphinx) -> Path | None:
 
 
 def take_gallery(app: Sphinx, error: Exception | None) -> None:
-    """Copy the gallery's site to the pages, instead of an earlier one; nothing where there is none."""
+    """Copy the gallery's site to the pages, instead of an earlier one, with a way back; nothing where there is none."""
     if error is None and app.builder.format == "html":
         place = Path(app.outdir) / "gallery"
         shutil.rmtree(place, ignore_errors=True)
         if found := gallery_site(app):
             shutil.copytree(found, place)
+            for page in place.rglob("*.html"):
+                text = page.read_text(encoding="utf-8")
+                page.write_text(
+                    WAY_BACK.sub(r'<li><a href="\1../index.html">Documentation</a></li>', text), encoding="utf-8"
+                )
 
 
 def write_inline(writer: HTML5Translator, node: nodes.math) -> None:

@@ -23,11 +23,12 @@ from jinja2 import Environment
 
 from ... import __version__
 from ...envs.registry import entries
+from ...jobs.report import Report
 from ...landscapes.convert import to_json
 from ...landscapes.draw.pages.card import FILTERS, card_scenes, colour_stops
 from ...landscapes.draw.pages.nodes import read_off_nodes
 from ...landscapes.draw.pages.rendering import STATIC, number, scripts, templates
-from ...landscapes.draw.pages.report import held_parameters
+from ...landscapes.draw.pages.report import shown_of
 from ...landscapes.measures.card import Card
 from ...landscapes.measures.verdict import WORDS
 from ...landscapes.storage.files import check_ours, placing, resolve
@@ -36,6 +37,7 @@ from ...landscapes.storage.records import reading
 from ...landscapes.storage.store import SliceStore, open_slice
 from .. import files
 from ..figures import Figure
+from ..files import LEAGUE
 from ..paper import read_paper
 from ..records import Companion, read_companions
 from .downloads import save_slice, save_table
@@ -51,7 +53,7 @@ from .page_data import (
 )
 from .studies import StudyEntry, place_studies
 from .studio import Studio, draws
-from .wall import GRADIENTS, SIZES, Tile, draw_wall, make_tiles, place_card, size_class
+from .wall import GRADIENTS, SIZES, Tile, answers, draw_wall, make_tiles, place_card, size_class
 
 HERE = Path(__file__).parent
 MANIFEST, NODES = "manifest.json", "nodes.js"
@@ -97,15 +99,15 @@ def build_site(
         with Studio(places) as studio:
             envs = [figure.env for figure in there]
             studies = place_studies(data, new, envs, studio)
-            site = _Site(new, data, _templates(), studio, tables, studies)
-            shown = [site.write_slice(figure) for figure in there]
             card, league = place_card(data, new, studio), place_league(data, new, read_paper())
+            site = _Site(new, data, _templates(card, league), studio, tables, studies)
+            shown = [site.write_slice(figure) for figure in there]
             tiles = make_tiles(shown, data, new, studio)
             draw_wall(tiles, data, new)
         if card is not None:
             site.write_page(CARD_PAGE, card=card, scenes=card_scenes(card), colours=colour_stops())
         if league is not None:
-            site.write_page(LEAGUE_PAGE, page=league)
+            site.write_league(league)
         return site.write_index(shown, [one.id for one in figures if one not in there], tiles, card, league)
 
 
@@ -127,8 +129,16 @@ def _has_samples(store: Path) -> bool:
     return is_slice(store) and bool((SliceStore.open(store).status() > 0).any())
 
 
-def _templates() -> Environment:
+def _templates(card: Card | None, league: LeaguePage | None) -> Environment:
+    """Return the templates, which know the pages that every page leads to."""
     pages = templates(HERE / "templates")
+    doors = (
+        ("All landscapes", "index.html", True),
+        ("Optimisers", LEAGUE_PAGE, league is not None),
+        ("Report card of gradients", CARD_PAGE, card is not None),
+        ("Your simulator", "index.html#yours", True),
+    )
+    pages.globals["doors"] = [(said, page) for said, page, there in doors if there]
     pages.filters |= FILTERS
     pages.filters["dark"] = files.dark_name
     pages.filters["beside"] = _describe_companion
@@ -170,8 +180,9 @@ class _Site:
         given = [name for episode in episodes for name in episode.files]
         given += [files.COMPANION_PICTURE] if companions else []
         tables: dict[str, Sequence[Mapping[str, Any]]] = {files.COMPANION_TABLE: to_json(companions)}
-        if (source / files.QUALITY).exists() and report is not None:
-            tables[files.QUALITY_TABLE] = quality_rows(report.profile)
+        profile = report.profile if report is not None else None
+        if (source / files.QUALITY).exists() and profile is not None:
+            tables[files.QUALITY_TABLE] = quality_rows(profile)
         taken = self._place(dataset, source, folder, given, {name: rows for name, rows in tables.items() if rows})
         entry = replace(
             FigureEntry.of(figure, dataset, source),
@@ -180,19 +191,47 @@ class _Site:
             companions=companions,
             runs=[run.search() for run in runs],
             report=enter_report(report) if report is not None else None,
+            measures=profile.measures if profile is not None else {},
+        )
+        self._write_slice_page(entry, dataset, report, nodes)
+        return entry
+
+    def _write_slice_page(
+        self, entry: FigureEntry, dataset: xr.Dataset, report: Report | None, nodes: Mapping[str, Any]
+    ) -> None:
+        paper = report.paper if report is not None else None
+        said = shown_of(
+            dataset,
+            report.profile if report is not None else None,
+            nodes,
+            quoted=paper.words if paper is not None else (),
+            where=paper.where if paper is not None else "",
         )
         self.write_page(
             entry.page,
             "slice.html",
+            **said,
             entry=entry,
-            studies=self.studies[figure.env],
-            held=list(held_parameters(dataset)),
-            scene=entries().get(figure.env),
-            finer=nodes["finer"] is not None,
-            deviates=nodes["floor"] is not None,
+            stride=1,
+            check=None,
+            picture=files.PICTURE,
+            studies=self.studies[entry.env],
+            scene=entries().get(entry.env),
             scripts=scripts(len(dataset["loss"].dims)),
         )
-        return entry
+
+    def write_league(self, page: LeaguePage) -> None:
+        """Write the page of all races, and a page of each."""
+        self.write_page(LEAGUE_PAGE, page=page)
+        for scene in page.league.scenes:
+            self.write_page(
+                f"{LEAGUE}/{scene.env}.html",
+                "league_scene.html",
+                scene=scene,
+                slice=page.slices.get(scene.env, ""),
+                found=page.claims(scene.env),
+                python=page.python([scene]),
+            )
 
     def _place(
         self,
@@ -208,7 +247,7 @@ class _Site:
         """
         for name, rows in tables.items():
             save_table(rows, folder / name)
-        found = (*files.SURFACES, files.SWEEP_FILM, files.REPORT, files.MEASURES, files.QUALITY)
+        found = (*files.SURFACES, files.SWEEP_FILM, files.REPORT, files.QUALITY)
         given = [*(name for name in found if (source / name).exists()), *given]
         for name in given:
             shutil.copyfile(source / name, folder / name)
@@ -238,6 +277,7 @@ class _Site:
             "index.html",
             manifest=manifest,
             tiles=tiles,
+            answers=answers(tiles),
             card=card,
             league=league,
             scenes=entries(),

@@ -1,4 +1,4 @@
-"""The page of the league: methods against scenes, what the paper claims of them, and each scene's race."""
+"""The pages of the league: methods against scenes, what the paper claims of them, and the race of each scene."""
 
 from __future__ import annotations
 
@@ -84,23 +84,35 @@ class LeaguePage:
         first = self.league.scenes[0]
         return f"{len(self.league.methods)} methods, {first.seeds} seeds each, {first.budget} episodes a run"
 
-    @property
-    def python(self) -> str:
-        """The lines of Python that make it again, as large as its first scene."""
-        first = self.league.scenes[0]
-        scenes = [f"{scene.env}@{scene.fidelity}" for scene in self.league.scenes]
-        call = (
-            f"league = gs.league({scenes!r}, {list(self.league.methods)!r}, budget={first.budget}, seeds={first.seeds})"
-        )
+    def python(self, scenes: Sequence[SceneStandings]) -> str:
+        """Return the lines of Python that race scenes again, all with as many seeds and episodes as the first."""
+        first, names = scenes[0], [f"{scene.env}@{scene.fidelity}" for scene in scenes]
+        methods = list(self.league.methods if len(scenes) > 1 else first.methods)
+        call = f"league = gs.league({names!r}, {methods!r}, budget={first.budget}, seeds={first.seeds})"
         return "\n".join(["import gradscape as gs", "", call, "league.plot()"])
+
+    def claims(self, env: str) -> Sequence[tuple[ClaimFinding, str]]:
+        """Return the paper's claims of a scene, each with what this league makes of it in a word."""
+        return [(finding, word) for name, finding, word in self.verdicts if name == env]
 
     def describe(self) -> str:
         """Say what the map of ranks shows."""
+        return f"Mean ranks of {len(self.league.methods)} methods in {len(self.league.scenes)} scenes; {self.best}"
+
+    @property
+    def best(self) -> str:
+        """Which method has the best mean rank over all scenes, in words."""
         best = self.league.overall[0]
-        return (
-            f"Mean ranks of {len(self.league.methods)} methods in {len(self.league.scenes)} scenes; over all scenes "
-            f"{best.method} has the best, {best.rank:.2f} (95 % interval {best.low:.2f} to {best.high:.2f})"
-        )
+        interval = f"95 % interval {best.low:.2f} to {best.high:.2f}"
+        return f"over all scenes {best.method} has the best, {best.rank:.2f} ({interval})"
+
+    @property
+    def answer(self) -> str:
+        """Which optimiser gets anywhere, in a sentence."""
+        many = len(self.league.scenes)
+        first = f"A method is ahead of all others in {len(self.first)} of {many} scenes"
+        named = f": {', '.join(self.first)}" if self.first else ""
+        return f"Of mean ranks of {len(self.league.methods)} methods {self.best}. {first}{named}."
 
 
 def place_league(data: Path, out: Path, paper: Paper) -> LeaguePage | None:

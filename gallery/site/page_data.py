@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,11 +23,10 @@ from ...landscapes.measures.profile import Profile
 from ...landscapes.measures.slice_floor import floor_of
 from ...landscapes.measures.undersampled import Undersampled
 from ...landscapes.objective import NOT_EVALUATED
-from ...landscapes.plain import number
 from ...landscapes.plane import Plane
 from ...landscapes.storage.records import read_json, reading
 from ..figures import Figure
-from ..files import EPISODES, MEASURES, REMAKE, REPORT, RUN_SUFFIX, RUNS
+from ..files import EPISODES, REMAKE, REPORT, RUN_SUFFIX, RUNS
 from ..parts import changes_since
 from ..records import Companion, Node, SweepRecord, open_run, read_nodes, read_sweep, searched
 
@@ -90,7 +89,7 @@ class FigureEntry:
     provenance: Mapping[str, Any]
     sweep: SweepRecord | None
     changed: Mapping[str, Sequence[Any]]
-    measures: Mapping[str, str | float]
+    measures: Mapping[str, str] = field(default_factory=dict)
     files: Sequence[str] = ()
     episodes: Sequence[EpisodeShown] = ()
     companions: Sequence[Companion] = ()
@@ -121,7 +120,6 @@ class FigureEntry:
             provenance=provenance,
             sweep=read_sweep(source),
             changed=changes_since(identity),
-            measures=read_measures(source),
         )
 
     @property
@@ -216,15 +214,6 @@ def quality_rows(profile: Profile) -> list[dict[str, Any]]:
     """Return what the picture of gradient quality shows by scale, a row for each scale of each of its three parts."""
     parts = ("differences", "differences_of_samples", "smoothing")
     return [{"part": part.replace("_", " "), **to_json(row)} for part in parts for row in getattr(profile, part)]
-
-
-def read_measures(folder: Path) -> dict[str, str | float]:
-    """Return the numbers of a slice's report by their names, none where there is no report."""
-    path = folder / MEASURES
-    if not path.exists():
-        return {}
-    with reading(path, REMAKE.format("reports")):
-        return {name: value if isinstance(value, str) else number(value) for name, value in read_json(path).items()}
 
 
 def read_runs(data: Path) -> list[xr.Dataset]:

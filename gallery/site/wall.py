@@ -28,6 +28,7 @@ GRADIENTS = FOLLOWING_WORDS
 SHAPES = tuple(word for word in WORDS if word not in (*GRADIENTS, FLAT))
 MIN_SHARE = 1 / 3  # of the slices: from this share on a word is said of an environment
 SHOWN_WORDS = 3  # of how smooth an environment is
+RUGGED = ("rugged", "extremely rugged")
 REMAKE_CENSUS = "delete it, and `landscape census {} --device {}` measures it again"
 REMAKE_CARD = "delete it, and `landscape card --out {}` measures it again"
 SIZES = {"1-3": "1 to 3", "4-16": "4 to 16", "17-": "17 or more"}  # numbers of parameters, by the name in a link
@@ -88,6 +89,30 @@ class Tile:
     def share(self, word: str) -> WordShare | None:
         """Return the share of a word, None where nothing is known of it."""
         return next((one for one in self.words if one.word == word), None)
+
+
+def answers(tiles: Sequence[Tile]) -> tuple[str, str]:
+    """Say how smooth the environments are, and in which of them gradients follow, by those that have a census."""
+    counted = [tile for tile in tiles if tile.census and tile.slices]
+    if not counted:
+        return ("No environment was cut many times yet.",) * 2
+    smooth, minima, rugged = (
+        _names(counted, words) for words in (["very smooth"], ["smooth with local minima"], RUGGED)
+    )
+    follow = _names(counted, ["gradients follow"])
+    many = f"{len(counted)} environment{'s' if len(counted) > 1 else ''}"
+    return (
+        f"Of {many} many slices were measured. Most are very smooth in {smooth}, smooth with local minima in {minima}, "
+        f"and rugged in {rugged}.",
+        f"Gradients follow the loss over 1 % of the box in most slices of {follow}. In the others they follow loosely, "
+        "in fewer slices, or not at all.",
+    )
+
+
+def _names(tiles: Sequence[Tile], words: Sequence[str]) -> str:
+    """Return the environments in which any of some words, of which a slice has one at most, fits most slices."""
+    shares = {tile.env: sum(one.share for one in tile.words if one.word in words) for tile in tiles}
+    return " and ".join(", ".join(env for env, share in shares.items() if share > 0.5).rsplit(", ", 1)) or "none"
 
 
 def size_class(dim: int) -> str:

@@ -146,7 +146,10 @@ def test_balls_that_miss_one_another_fly_on() -> None:
     assert end.tolist() == [[-1.0, 1.0]]
 
 
-BY_OTHERS = ("mjx-bounce-once", "mjx-ground-wall", "mjx-two-balls", "newton-bounce-once", "newton-ground-wall")
+BY_OTHERS = (
+    "mjx-ground-wall", "newton-bounce-once", "newton-ground-wall",
+    *(pytest.param(name, marks=pytest.mark.nightly) for name in ("mjx-bounce-once", "mjx-two-balls")),  # JAX takes long
+)  # fmt: skip
 
 
 @pytest.mark.slow

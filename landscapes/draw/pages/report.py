@@ -89,35 +89,42 @@ def report_page(
     nodes = read_off_nodes(shown, [] if stride > 1 else episodes, laid, None if stride > 1 else floor)
     page = templates().get_template("report.html")
     return page.render(
-        **_about(dataset),
+        **shown_of(dataset, profile, nodes, quoted=quoted, where=where),
         entry=_entry(dataset, title, laid, episodes),
-        finer=nodes["finer"] is not None,
-        deviates=nodes["floor"] is not None,
         stride=stride,
-        words=words_of(profile.verdict, quoted),
-        sentence=sentence(profile),
-        notes=(*profile.verdict.open, *profile.verdict.lines),
-        where=where,
-        measures=profile.measures,
-        curve=curve_of(profile.differences),
         check=check,
         picture=data_link(picture, "image/png"),
         nodes=_inert(nodes),
         record=_inert(record),
+        style=(STATIC / STYLE).read_text(encoding="utf-8"),
+        scripts=[(STATIC / name).read_text(encoding="utf-8") for name in (*scripts(len(shown.loss.dims)), DOWNLOAD)],
     )
 
 
-def _about(dataset: xr.Dataset) -> dict[str, Any]:
-    """Return what a page says of how a slice was made, and the style and the scripts that it holds."""
-    provenance, rank = stored_provenance(dataset), plane_of(dataset).rank
+def shown_of(
+    dataset: xr.Dataset,
+    profile: Profile | None,
+    nodes: Mapping[str, Any],
+    *,
+    quoted: Sequence[QuotedWord] = (),
+    where: str = "",
+) -> dict[str, Any]:
+    """Return what a page says of a slice, of how it was made, and of what was measured of it, if anything was."""
+    provenance = stored_provenance(dataset)
     return {
-        "plane": rank == 2,
+        "plane": plane_of(dataset).rank == 2,
         "status": _statuses(dataset),
         "held": list(held_parameters(dataset)),
         "provenance": provenance,
         "command": provenance.get("command", ""),
-        "style": (STATIC / STYLE).read_text(encoding="utf-8"),
-        "scripts": [(STATIC / name).read_text(encoding="utf-8") for name in (*scripts(rank), DOWNLOAD)],
+        "finer": nodes["finer"] is not None,
+        "deviates": nodes["floor"] is not None,
+        "sentence": sentence(profile) if profile else "",
+        "words": words_of(profile.verdict, quoted) if profile else (),
+        "notes": (*profile.verdict.open, *profile.verdict.lines) if profile else (),
+        "where": where,
+        "measures": profile.measures if profile else {},
+        "curve": curve_of(profile.differences) if profile else None,
     }
 
 
@@ -130,6 +137,7 @@ def _entry(
         "id": title,
         "env": identity["objective"],
         "labels": identity["plane"]["labels"],
+        "resolution": identity["plane"]["resolution"],
         "identity": identity,
         "loss_unit": stored_provenance(dataset).get("loss_unit", ""),
         "episodes": episodes,
