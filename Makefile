@@ -19,7 +19,7 @@ endif
 # A gallery that was built (`landscape gallery build`) becomes a part of the documentation.
 GALLERY ?= out/gallery
 
-.PHONY: demo test test-all wheel docs setup setup-test setup-docs check clean
+.PHONY: demo test test-all test-nightly wheel docs setup setup-test setup-docs check clean
 
 demo: setup
 	$(BIN)/landscape slice fluid --dims 6 8 --resolution 14
@@ -36,6 +36,9 @@ test: setup-test
 
 test-all: setup-test
 	$(PYTEST) $(TESTS)
+
+test-nightly: setup-test
+	$(PYTEST) -m nightly $(TESTS)
 
 # Builds the wheel, installs it with all it needs into an empty environment, and tries it there; tests borrow the rest.
 wheel: setup-test
