@@ -210,11 +210,11 @@ class _Site:
         self.write_page(
             entry.page,
             "slice.html",
-            **said,
+            **{**said, "command": entry.command},
             entry=entry,
             stride=1,
             check=None,
-            picture=files.PICTURE,
+            still=files.PICTURE,
             studies=self.studies[entry.env],
             scene=entries().get(entry.env),
             scripts=scripts(len(dataset["loss"].dims)),

@@ -47,6 +47,11 @@ class Numbers:
     undersampled: Mapping[str, float | None] | None = None
     floor: str = ""
 
+    @property
+    def spread(self) -> float:
+        """How far its losses range, 0 where none is finite."""
+        return 0.0 if self.lowest is None or self.highest is None else self.highest - self.lowest
+
 
 @dataclass(frozen=True)
 class ReportEntry:

@@ -127,7 +127,7 @@ def make_tiles(shown: Sequence[FigureEntry], data: Path, out: Path, studio: Stud
 
 
 def _tile(env: str, group: Sequence[FigureEntry], data: Path, out: Path, studio: Studio) -> Tile:
-    best = next((one for one in group if len(one.labels) == 2), group[0])
+    best = max(group, key=lambda one: (len(one.labels), one.numbers.spread))
     about = (env, best.id, best.page, best.labels, best.dim, str(best.identity.get("engine", "")))
     if found := _place_census(env, data, out, studio):
         census, files = found

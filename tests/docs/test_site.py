@@ -50,8 +50,8 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (source / "index.md").write_text(INDEX.replace("\\\\", "\\"))
     (source / "other.md").write_text(OTHER)
     (source / "gallery").mkdir()
-    for name in ("manifest.json", "index.html"):
-        (source / "gallery" / name).write_text("{}")
+    for name, text in (("manifest.json", "{}"), ("index.html", "<ul><!-- documentation  --></ul>")):
+        (source / "gallery" / name).write_text(text)
     shutil.copy(DOCS / "references.bib", source)
     how = ["-c", DOCS, "-D", "walked=0", "-D", f"gallery_site={source / 'gallery'}", "-D", "exclude_patterns=gallery"]
     command = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", *map(str, [*how, source, source / "out"])]
@@ -64,6 +64,7 @@ def test_it_is_sound_and_holds_what_was_run_and_the_gallery(small: Path) -> None
     assert list(find_faults(small)) == []
     assert "42 it is" in (small / "other.html").read_text()
     assert (small / "gallery/manifest.json").read_text() == "{}"
+    assert '<a href="../index.html">Documentation</a>' in (small / "gallery/index.html").read_text()  # which stands there
     assert "<mfrac>" in (small / "index.html").read_text()
     assert not re.search(r"<script[^>]*mathjax", (small / "index.html").read_text(), re.IGNORECASE)
     assert "--refine" in (small / "other.html").read_text()

@@ -26,6 +26,7 @@ function sift() {
   clearTimeout(counting);
   const left = cards.filter((card) => !card.hidden).length;
   const asked = words.length || chosen.some((choice) => choice.value);
+  if (asked) document.getElementById("every").open = true;
   counting = setTimeout(() => (count.textContent = asked ? `${left} of ${cards.length} slices` : ""), 300);
 }
 

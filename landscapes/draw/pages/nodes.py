@@ -25,6 +25,7 @@ from ..render.relief import Relief, azimuth
 from ..style import LOSS_MAP, Scale, decades, method, point_areas, round_values
 
 LINEAR, LOGARITHMIC = "linear", "logarithmic"
+FAR = 1.0  # half-widths of the box: no line leads to a point of a run that is farther off the slice
 Column = Sequence[float | None]  # of numbers, None for what is not finite
 
 
@@ -73,7 +74,8 @@ class Trajectory(Search):
     """A run with its points, in the order of evaluation, for the map alone.
 
     Of every point: where it falls, its own loss, and how large its mark is [pixels] (the smaller, the farther off the
-    slice). `path` holds the points that were the best so far, `hidden` those beyond the map.
+    slice). `path` holds the points that were the best so far, `hidden` those beyond the map, `far` those that are more
+    than half a box off the slice, to which no line leads.
     """
 
     u: Column
@@ -82,6 +84,7 @@ class Trajectory(Search):
     radius: Sequence[float]
     path: Sequence[int]
     hidden: Sequence[int]
+    far: Sequence[int]
 
     def search(self) -> Search:
         """Return it without its points."""
@@ -202,4 +205,5 @@ def _trajectory(run: xr.Dataset, reach: float, points: int, top: float) -> Traje
         radius=[round(float(size), 1) for size in radius],
         path=improvements(run).tolist(),
         hidden=np.flatnonzero(outside).tolist(),
+        far=np.flatnonzero(distance > FAR).tolist(),
     )

@@ -93,7 +93,7 @@ def report_page(
         entry=_entry(dataset, title, laid, episodes),
         stride=stride,
         check=check,
-        picture=data_link(picture, "image/png"),
+        still=data_link(picture, "image/png"),
         nodes=_inert(nodes),
         record=_inert(record),
         style=(STATIC / STYLE).read_text(encoding="utf-8"),

@@ -61,7 +61,6 @@ SWEEP = {
     "over": "2", "label": "mass", "low": -10.0, "high": 10.0, "fidelity": "draft", "frames": 12,
     "resolution": [24, 24], "command": "landscape sweep fluid --dims 0 1 --over 2",
 }  # fmt: skip
-MEASURES = {"local minima": 7, "noise floor": "none"}
 
 
 def kept_report() -> Report:
@@ -229,7 +228,6 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     full = folder / "full"
     (full / "episodes.json").write_text(json.dumps(EPISODES))
     (full / "sweep.json").write_text(json.dumps(SWEEP))
-    (full / "measures.json").write_text(json.dumps(MEASURES))
     write_record(full / "report.json", to_json(kept_report()))
     picture(full / "gradient-quality.png")
     (full / "companions.json").write_text(json.dumps({"slices": COMPANIONS}))

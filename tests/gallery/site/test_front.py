@@ -52,7 +52,7 @@ def test_the_front_page_asks_three_questions_and_answers_each_over_all_environme
     row = re.search(r'<th scope="row"><a href="full/index.html">fluid</a></th>(.*?)</tr>', page)
     assert row is not None
     assert re.findall(r">(\d+)</span>", row[1]) == ["10", "90"]
-    assert 'src="card/card.png"' in page
+    assert 'href="card.html"' in page
     assert 'src="league/league.png"' in page
     wall = rows_of(site / "wall.csv")
     assert {(one["word"], float(one["share"]), float(one["low"])) for one in wall} >= {("rugged", 0.75, 0.375)}
@@ -166,7 +166,7 @@ def test_the_front_page_is_filtered_by_word_number_and_engine_and_a_link_keeps_t
 def test_every_page_fits_every_width(width: int, scheme: str, site: Path, filed: str, visit: Visit) -> None:
     page = visit(filed, "index.html", width=width, color_scheme=scheme)
     names = pages(site)
-    assert len(names) == 3 + len(FIGURES)
+    assert len(names) == 5 + len(FIGURES)
     for name in names:
         page.goto(filed + name)
         page.evaluate("document.querySelectorAll('details').forEach((one) => { one.open = true; })")

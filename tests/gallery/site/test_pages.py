@@ -51,6 +51,7 @@ def test_every_page_opens(way: str, visit: Visit, request: pytest.FixtureRequest
     load_pictures(page, "img")
     assert page.locator(".slice").count() == len(FIGURES)
     for figure in FIGURES:
+        page.evaluate("document.getElementById('every').open = true")
         page.click(f".slice a[href='{figure.id}/index.html']")
         page.wait_for_url(f"**/{figure.id}/index.html")
         shown = "img:not([hidden]):not(#player img)"
@@ -172,12 +173,12 @@ def test_a_search_s_line_leads_out_of_a_window_to_points_that_are_not_in_it(
         const plain = pen.lineTo;
         pen.lineTo = (...at) => { joined += 1; plain.apply(pen, at); };
         const run = SLICE.runs.find((one) => one.method === "random");
-        drawRun(pen, { ...run, u: run.u, loss: run.loss }, where);
+        drawRun(pen, { ...run, u: run.u, loss: run.loss, far: [] }, where);
         delete pen.lineTo;
         const bends = run.path.filter((row) => !run.hidden.includes(row)).length;
         return [joined - (bends ? 10 : 0), bends]; // the star has ten
     }""")
-    assert drawn[0] == drawn[1] > 1
+    assert drawn[0] == drawn[1] - 1 > 1
 
 
 def test_arrows_point_downhill(filed: str, visit: Visit) -> None:
@@ -239,7 +240,7 @@ def test_the_surface_is_flat_where_a_node_is_and_opens_where_its_valley_is_seen(
     assert np.argmax(nearest) == np.argmax(corners @ [np.cos(eye), np.sin(eye)])
 
 
-@pytest.mark.parametrize("path", ["full/index.html", "league.html"])
+@pytest.mark.parametrize("path", ["full/index.html", "league.html", "league/fluid.html"])
 def test_every_table_shows_all_of_its_columns_on_a_phone(filed: str, visit: Visit, path: str) -> None:
     page = visit(filed, path, width=360)
     page.evaluate("document.querySelectorAll('details').forEach((one) => { one.open = true; })")
@@ -248,7 +249,7 @@ def test_every_table_shows_all_of_its_columns_on_a_phone(filed: str, visit: Visi
             .map((one) => { const box = one.getBoundingClientRect();
                             return [box.left, box.right, box.width, one.scrollWidth - one.clientWidth]; })"""
     )  # fmt: skip
-    assert len(boxes) > 50
+    assert len(boxes) > 20
     for left, right, width, hidden in boxes:
         assert 0 <= left < right <= 360
         assert width > 20

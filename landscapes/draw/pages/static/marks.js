@@ -46,15 +46,20 @@ function doubled(pen, colour, width, around = "#ffffff") {
   }
 }
 
-// A search: the line joins what was the best so far. `where` gives a row's place, or null where it is not drawn. On a
+// A search: the line joins what was the best so far, where that is not far off the slice. `where` gives a row's place, or null where it is not drawn. On a
 // plane a mark's fill is its loss; on a line its height is.
 function drawRun(pen, run, where) {
   const around = up ? "#ffffff" : ink("ground");
   const fill = (row) => (up ? shade(level(run.loss[row])) : run.colour);
   const hidden = new Set(run.hidden);
   const places = run.u.map((_, row) => (hidden.has(row) ? null : where(run, row)));
+  const far = new Set(run.far);
   pen.beginPath();
-  run.path.map((row) => places[row]).filter(Boolean).forEach((at) => pen.lineTo(...at));
+  let joined = false; // with what was the best before
+  for (const row of run.path.filter((row) => places[row])) {
+    if (!far.has(row)) pen[joined ? "lineTo" : "moveTo"](...places[row]);
+    joined = !far.has(row);
+  }
   doubled(pen, run.colour, 1.5, around);
   places.forEach((at, row) => {
     if (!at) return;
