@@ -64,7 +64,7 @@ def test_it_is_sound_and_holds_what_was_run_and_the_gallery(small: Path) -> None
     assert list(find_faults(small)) == []
     assert "42 it is" in (small / "other.html").read_text()
     assert (small / "gallery/manifest.json").read_text() == "{}"
-    assert '<a href="../index.html">Documentation</a>' in (small / "gallery/index.html").read_text()  # which stands there
+    assert '<a href="../index.html">Documentation</a>' in (small / "gallery/index.html").read_text()
     assert "<mfrac>" in (small / "index.html").read_text()
     assert not re.search(r"<script[^>]*mathjax", (small / "index.html").read_text(), re.IGNORECASE)
     assert "--refine" in (small / "other.html").read_text()
