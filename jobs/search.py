@@ -251,9 +251,12 @@ def make_optimizer(
 
 
 def divide_methods(env: Environment, names: Sequence[str] = (), *, budget: int = 0) -> tuple[list[str], dict[str, str]]:
-    """Return which methods, by default of all, can search an environment here, and why the others cannot."""
+    """Return which methods, by default all but `auto`, can search an environment here, and why the others cannot.
+
+    `auto` takes one of the others, so that it races where it is named.
+    """
     able, unable = list[str](), dict[str, str]()
-    for method in names or methods():
+    for method in names or [name for name in methods() if name != "auto"]:
         try:
             made = make_optimizer(method, env)
             made.require_memory(made.options, SearchSize(env.space.dim, env.decisions, budget))

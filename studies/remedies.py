@@ -31,6 +31,7 @@ STIFFNESSES = (0.03, 0.1, 0.3)  # shares of the contact stiffness
 STEPS = (0.001, 0.01, 0.05)  # along a gradient, as shares of the box
 SIGNIFICANT = 0.05
 RESAMPLES = 999  # of the bootstrap
+ROUNDING = 1e-12  # of the largest loss, below which a gradient is zero
 GAIN = 1e-9  # relative, from which on a further descent from the best point has got anywhere
 WITHOUT = "none"  # the name of the row without a remedy
 
@@ -138,11 +139,12 @@ def candidates(env: Environment) -> list[str]:
 
 
 def _typical_gradient(env: Environment) -> float:
-    """Return the median length of gradients [loss unit per side of the box]."""
+    """Return the median length of gradients that are not zero but for rounding [loss unit per side of the box]."""
     found = evaluate(env, env.space.sobol(32, seed=1), grad=True)
     assert found.grad is not None  # as it was asked for
     sizes = (found.grad * (env.space.upper - env.space.lower)).norm(dim=1)
-    return float(sizes[sizes.isfinite() & (sizes > 0)].median()) if bool((sizes > 0).any()) else 1.0
+    sizes = sizes[sizes.isfinite() & (sizes > ROUNDING * found.loss.nan_to_num(0.0).abs().max())]
+    return float(sizes.median()) if len(sizes) else 1.0
 
 
 @dataclass(frozen=True)

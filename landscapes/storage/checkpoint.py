@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ..identity import DamagedError, check_identity
+from ..identity import DamagedError, StoreMismatchError, check_identity
 from ..objective import Evaluation, Objective, evaluate
 from ..plain import digest, plain_json, text
 from ..verification import POINTS, StoredPoints, verify
@@ -81,6 +81,10 @@ class Checkpoint:
             kept = self.read(name, todo)
             loss, slope, status = (torch.from_numpy(kept[part]) for part in ("loss", "grad", "status"))
             then = Evaluation(loss, slope, status)
+            known = slope.shape[1]
+        if known != objective.space.dim:
+            has = f"{objective.name} has {objective.space.dim}"
+            raise StoreMismatchError(f"{self.folder} is a study of {known} parameters, and {has}; {todo}")
         verify(objective, [StoredPoints(self.folder, "study", x, then, True)])
 
     def _is_ours(self, name: str) -> bool:

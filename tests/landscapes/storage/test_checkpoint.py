@@ -59,6 +59,9 @@ def test_a_study_goes_on_with_the_same_objective_alone(tmp_path: Path) -> None:
     study(tmp_path).verify(BOWL)
     with pytest.raises(StoreMismatchError, match=r"a study of bowl whose losses are others now: \S+ then, \S+ now"):
         study(tmp_path).verify(CUP)
+    line = from_torch(lambda x: (x**2).sum(dim=1), ParameterSpace({"x": (-1, 1)}), name="bowl")
+    with pytest.raises(StoreMismatchError, match="is a study of 2 parameters, and bowl has 1"):
+        study(tmp_path).verify(line)
     study(tmp_path, force=True).verify(CUP)
 
 
