@@ -15,14 +15,14 @@ def show(found: RemedyStudy, console: Console) -> None:
     from rich.box import SIMPLE
 
     unit = f" [{found.loss_unit}]" if found.loss_unit else ""
-    rows = table("remedy", f"loss reached{unit}", "95 %", "better", "p", "falls", "moved", box=SIMPLE)
-    for column in (0, 2, 4):
-        rows.columns[column].no_wrap = True
+    rows = table("remedy", f"loss reached{unit} (95 %)", "better", "p", "falls", "moved", box=SIMPLE)
+    for column in rows.columns[:1] + rows.columns[2:]:
+        column.no_wrap = True
     for row in found.rows:
         one = row.reached
         better = "" if row is found.plain or row.better.value != row.better.value else f"{row.better.value:.0%}"
         rows.add_row(
-            row.remedy, f"{one.value:.4g}", f"{one.low:.4g} to {one.high:.4g}", better,
+            row.remedy, f"{one.value:.3g} ({one.low:.3g} to {one.high:.3g})", better,
             "" if row is found.plain else _p(row.p), f"{row.falls[1].value:.0%}", f"{row.moved:.1%}",
         )  # fmt: skip
     console.print(rows)
