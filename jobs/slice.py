@@ -42,7 +42,7 @@ from ..landscapes.plane import Plane
 from ..landscapes.sampling.distribution import PortableObjective, evaluator, run_tasks, workers_of
 from ..landscapes.sampling.fill import Progress, sample
 from ..landscapes.sampling.refine import Refined, Refinement, partly_refined, refine
-from ..landscapes.storage.arrays import Tile, need_of
+from ..landscapes.storage.arrays import Tile, count_statuses, need_of
 from ..landscapes.storage.files import clear
 from ..landscapes.storage.floor_map import (
     FLOOR,
@@ -588,12 +588,6 @@ def barrier_of(dataset: xr.Dataset) -> float | None:
         return None
     height = barrier(dataset["u"].to_numpy(), dataset["loss"].to_numpy())
     return height if math.isfinite(height) else None
-
-
-def count_statuses(dataset: xr.Dataset) -> dict[str, int]:
-    """Count the points of a slice by how they ended."""
-    status = dataset["status"].to_numpy()
-    return {kind.name.lower(): int((status == kind).sum()) for kind in Status}
 
 
 def range_of(dataset: xr.Dataset) -> dict[str, float | None]:

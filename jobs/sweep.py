@@ -24,6 +24,7 @@ from ..landscapes.lattice import check_gradients
 from ..landscapes.objective import BoxedObjective, Objective, failed
 from ..landscapes.plain import plain_name
 from ..landscapes.sampling.fill import Progress, sample
+from ..landscapes.storage.arrays import count_statuses
 from ..landscapes.storage.arrays import need_of as slice_need
 from ..landscapes.storage.files import discard, refuse_others, visible_files
 from ..landscapes.storage.paths import check_replaceable, slice_exists, slice_places
@@ -34,7 +35,6 @@ from .scene import provenance
 from .slice import (
     MAX_NAME_LETTERS,
     SliceCost,
-    count_statuses,
     estimate_cost,
     flat_points,
     kind_of,

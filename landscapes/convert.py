@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import fields, is_dataclass
 from enum import Enum
 from functools import cache
@@ -77,3 +78,16 @@ def _exactly(value: Any, kind: type[Any]) -> Any:
     if not isinstance(value, kind):
         raise TypeError(f"{value!r} is no {'text' if kind is str else 'yes or no'}")
     return value
+
+
+def to_attribute(name: str, record: Any) -> dict[str, str]:
+    """Return the attribute of a name that a slice holds a record in, as text."""
+    return {name: json.dumps(to_json(record))}
+
+
+def from_attribute(kind: type[Record], attributes: Mapping[Any, Any], name: str) -> Record | None:
+    """Read a record from a slice's attributes, None where there is none of the name or what it holds is none."""
+    try:
+        return from_json(kind, json.loads(attributes[name]))
+    except Exception:  # text of any content makes the converter raise anything at all
+        return None

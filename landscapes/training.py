@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import io
-import json
 import math
 import re
 import zipfile
@@ -24,7 +23,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from .convert import from_json, to_json
+from .convert import from_attribute, to_attribute
 from .objective import Objective, evaluate, in_box
 from .plane import Plane
 from .space import ParameterSpace
@@ -131,15 +130,12 @@ class TrainingPath:
 
     def attribute(self) -> dict[str, str]:
         """Return the attribute that a slice holds it in, as text."""
-        return {ATTRIBUTE: json.dumps(to_json(self))}
+        return to_attribute(ATTRIBUTE, self)
 
     @classmethod
     def of(cls, dataset: xr.Dataset) -> TrainingPath | None:
         """Read it from a slice, None where the slice has none or what it has is none."""
-        try:
-            return from_json(cls, json.loads(dataset.attrs[ATTRIBUTE]))
-        except Exception:  # text of any content makes the converter raise anything at all
-            return None
+        return from_attribute(cls, dataset.attrs, ATTRIBUTE)
 
 
 def _refuse_beyond(x: Float[Tensor, "checkpoint dim"], space: ParameterSpace, who: str, folder: Path) -> None:

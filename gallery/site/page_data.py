@@ -14,7 +14,7 @@ import xarray as xr
 
 from ...envs.registry import entries
 from ...jobs.report import Report
-from ...jobs.slice import count_statuses, flat_points
+from ...jobs.slice import flat_points
 from ...landscapes.convert import from_json, to_json
 from ...landscapes.draw.pages.nodes import EpisodeShown, Search, Trajectory, lay_runs
 from ...landscapes.draw.pages.words import Word, words_of
@@ -24,6 +24,7 @@ from ...landscapes.measures.slice_floor import floor_of
 from ...landscapes.measures.undersampled import Undersampled
 from ...landscapes.objective import NOT_EVALUATED
 from ...landscapes.plane import Plane
+from ...landscapes.storage.arrays import count_statuses
 from ...landscapes.storage.records import read_json, reading
 from ..figures import Figure
 from ..files import EPISODES, REMAKE, REPORT, RUN_SUFFIX, RUNS

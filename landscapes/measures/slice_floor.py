@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping
 from itertools import islice
 
@@ -13,7 +12,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..convert import from_json, to_json
+from ..convert import from_attribute, to_attribute
 from ..identity import digest_of, gradient_stride, plane_of, stored_identity
 from ..objective import Evaluation, Objective, Status
 from ..space import sobol
@@ -29,15 +28,12 @@ SAMPLES_EACH, MOST_POINTS = 10, 16  # samples of a slice for each evaluation of 
 
 def floor_of(dataset: xr.Dataset) -> Floor | None:
     """Read the numerical floor from a slice, None where it was not measured or what is there is none."""
-    try:
-        return from_json(Floor, json.loads(dataset.attrs[ATTRIBUTE]))
-    except Exception:  # text of any content makes the converter raise anything at all
-        return None
+    return from_attribute(Floor, dataset.attrs, ATTRIBUTE)
 
 
 def floor_attribute(floor: Floor) -> dict[str, str]:
     """Return the attribute that a slice holds its numerical floor in, as text."""
-    return {ATTRIBUTE: json.dumps(to_json(floor))}
+    return to_attribute(ATTRIBUTE, floor)
 
 
 def counted_from(floor: Floor | None) -> float:

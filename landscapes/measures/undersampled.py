@@ -19,7 +19,6 @@ a refined slice the cells that it interpolates count as resolved; how exact they
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -29,7 +28,7 @@ import xarray as xr
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from ..convert import from_json, to_json
+from ..convert import from_attribute, to_attribute
 from ..identity import plane_of
 from ..large import LARGE, in_unit, unit_of
 from ..lattice import has_all_gradients, lift_between
@@ -80,15 +79,12 @@ class Undersampled:
 
     def attribute(self) -> dict[str, str]:
         """Return the attribute that a slice holds it in, as text."""
-        return {ATTRIBUTE: json.dumps(to_json(self))}
+        return to_attribute(ATTRIBUTE, self)
 
     @classmethod
     def of(cls, dataset: xr.Dataset) -> Undersampled | None:
         """Read it from a slice, None where the slice has none or what it has is none."""
-        try:
-            return from_json(cls, json.loads(dataset.attrs[ATTRIBUTE]))
-        except Exception:  # text of any content makes the converter raise anything at all
-            return None
+        return from_attribute(cls, dataset.attrs, ATTRIBUTE)
 
 
 def find_undersampled(

@@ -143,6 +143,12 @@ def parameters_of(dataset: xr.Dataset) -> list[tuple[str, str]]:
     return list(zip(names, units, strict=True))
 
 
+def count_statuses(dataset: xr.Dataset) -> dict[str, int]:
+    """Count the points of a slice by how they ended."""
+    status = dataset["status"].to_numpy()
+    return {kind.name.lower(): int((status == kind).sum()) for kind in Status}
+
+
 def _axis(plane: Plane, number: int) -> dict[str, str]:
     about = {"label": plane.labels[number], "long_name": plane.names[number]}
     about |= {"scale": LOG10} if plane.scales[number] == LOG10 else {}

@@ -15,8 +15,7 @@ from ...convert import to_json
 from ...identity import plane_of, stored_identity, stored_provenance
 from ...measures.profile import Profile
 from ...measures.verdict import QuotedWord
-from ...objective import Status
-from ...storage.arrays import parameters_of
+from ...storage.arrays import count_statuses, parameters_of
 from .nodes import EpisodeShown, Trajectory, lay_runs, read_off_nodes
 from .rendering import STATIC, STYLE, scripts, templates
 from .words import words_of
@@ -113,7 +112,7 @@ def shown_of(
     provenance = stored_provenance(dataset)
     return {
         "plane": plane_of(dataset).rank == 2,
-        "status": _statuses(dataset),
+        "status": count_statuses(dataset),
         "held": list(held_parameters(dataset)),
         "provenance": provenance,
         "command": provenance.get("command", ""),
@@ -199,11 +198,6 @@ def _said(row: ScaleRow) -> str:
 
 def _or(value: float, other: float) -> float:
     return value if math.isfinite(value) else other
-
-
-def _statuses(dataset: xr.Dataset) -> dict[str, int]:
-    status = dataset["status"].to_numpy()
-    return {kind.name.lower(): int((status == kind).sum()) for kind in Status}
 
 
 def _stride(dataset: xr.Dataset) -> int:
