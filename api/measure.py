@@ -357,7 +357,7 @@ def census(
     along
         How slices are oriented: pairs of parameters, or random directions, both over the whole box.
     second_fidelity
-        Repeat one slice per base point at this fidelity, to see its effect.
+        Repeat every fourth slice at this fidelity, to see its effect.
     """
     spec = spec_of(scene, keywords)
     from dataclasses import replace

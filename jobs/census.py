@@ -37,6 +37,7 @@ SLICES, RESOLUTION = 64, 24
 NOISE_POINTS, REPEATS = 16, 4
 OWN, SAMPLES = "original", ("loss", "grad", "status")  # of what replicas are held against
 MEASURING_SECONDS = 0.05  # of a slice, next to what it simulates
+OTHERS = 4  # one slice of so many is surveyed at the other fidelity, too
 COPIES = 4  # of the losses and gradients of a slice
 
 
@@ -53,8 +54,8 @@ class Task:
 class CensusJob(CheckpointedJob["Census"]):
     """The slices of `design` to survey for `env`; a part of the checkpoint for each.
 
-    Some of them, one for each base point while cuts last, are surveyed for `other`, too: the scene at another fidelity,
-    None for none. With an `executor` its workers survey, a slice each.
+    Every fourth is surveyed for `other`, too: the scene at another fidelity, None for none. With an `executor` its
+    workers survey, a slice each.
     """
 
     results = CENSUS
@@ -87,7 +88,7 @@ class CensusJob(CheckpointedJob["Census"]):
         with gradients, and where the scene has one parameter; TooLargeError for more slices than there is memory for;
         StoreMismatchError where the folder holds another census.
         """
-        from ..landscapes.measures.census import CensusDesign
+        from ..landscapes.measures.census import CUTS, CensusDesign
         from ..landscapes.measures.verdict import WORDS
         from ..landscapes.storage.checkpoint import Checkpoint
 
@@ -107,6 +108,7 @@ class CensusJob(CheckpointedJob["Census"]):
         design = CensusDesign.draw(env.space, slices, **cut)
         other = replace(scene, fidelity=also, tolerance=None).make() if also else None
         identity = {**env.identity(), "slices": slices, "resolution": resolution, "along": along, "seed": seed}
+        identity["cuts"] = CUTS
         if gradients > 1:  # a census that was begun when all had them continues
             identity["gradients"] = gradients
         identity["other"] = other.identity()["settings"] if other else None
@@ -122,8 +124,7 @@ class CensusJob(CheckpointedJob["Census"]):
     def tasks(self) -> list[Task]:
         """What is to be surveyed: every slice, then those of the other fidelity."""
         whole = [Task(f"slice-{number}", number, False) for number in range(len(self.design.places))]
-        many = len(self.design.cuts)
-        again = [Task(f"other-{n}", n, True) for n, (b, c) in enumerate(self.design.places) if c == b % many]
+        again = [Task(f"other-{n}", n, True) for n in range(0, len(self.design.places), OTHERS)]
         return whole + (again if self.other else [])
 
     def work(self) -> list[Work]:
@@ -235,7 +236,7 @@ class CensusJob(CheckpointedJob["Census"]):
         watch.note(f"{self.env.name} · {self.env.fidelity.name} · {self.env.device} · {self.folder}")
         without, having = self.design.samples
         what = (
-            f"{len(self.design.places)} slices: {bases} base points, each along {cuts} cuts, {samples} samples a slice"
+            f"{len(self.design.places)} slices through {bases} base points along {cuts} cuts, {samples} samples each"
             f"{f', {having} of them with gradients' if without else ''}"
         )
         kept = f"; {len(self.tasks) - len(left)} are there already" if len(left) < len(self.tasks) else ""

@@ -40,6 +40,7 @@ Array = NDArray[np.float64]
 PAIRS, RANDOM = "pairs", "random"
 ALONG = (PAIRS, RANDOM)  # what cuts are: pairs of parameters, or pairs of random directions
 STEEP = 48  # pairs of neighbouring samples of a slice that are bisected for jumps
+CUTS = 2  # through each base point
 PLACES, POINTS = 48, 48  # between the samples of a slice, and where gradients are held against slopes
 MEASURES = (
     "turns",
@@ -86,10 +87,11 @@ class PlaneSpec:
 
 @dataclass(frozen=True, eq=False)
 class CensusDesign:
-    """Hold what is sliced: every cut through every base point, so that what either does can be told apart.
+    """Hold what is sliced: two cuts through every base point, and every cut through two points or more.
 
-    `bases` [parameters' units] has shape (base, dim). A slice has gradients at every so many samples along each axis,
-    `gradients`.
+    So what the point and the cut do can be told apart, while there are as many of both as slices allow: slices that
+    share one are alike. `bases` [parameters' units] has shape (base, dim). A slice has gradients at every so many
+    samples along each axis, `gradients`.
     """
 
     space: ParameterSpace
@@ -102,26 +104,25 @@ class CensusDesign:
     def draw(
         cls, space: ParameterSpace, slices: int, *, along: str, resolution: int, seed: int, gradients: int = 1
     ) -> CensusDesign:
-        """Draw about as many base points as cuts, so many slices in all at most.
+        """Draw half as many base points as slices, and as many cuts where there are so many.
 
-        Of pairs of parameters there may be fewer than that takes, and then there are more base points; of two
-        parameters there is one slice, whatever it goes through. Raises ValueError for other ways to cut, and where
-        the space has one parameter.
+        Of two parameters there is one slice, whatever it goes through. Raises ValueError for other ways to cut, and
+        where the space has one parameter.
         """
         if along not in ALONG:
             raise ValueError(f"a census cuts along {' or '.join(ALONG)}; got {along!r}")
         if space.dim < 2:
             raise ValueError("a census takes two parameters and more; got one")
         generator = np.random.default_rng(seed)
-        count = math.isqrt(slices)
+        count = max(1, slices // CUTS)
         if along == RANDOM:
             frames = [orthonormal(generator, space.dim).tolist() for _ in range(count)]
             cuts = [PlaneSpec(None, tuple(map(tuple, frame))) for frame in frames]
         else:
             every = list(combinations(range(space.dim), 2))
             cuts = [PlaneSpec(every[at]) for at in sorted(generator.permutation(len(every))[:count])]
-        many = 1 if along == PAIRS and space.dim == 2 else slices // len(cuts)
-        bases = space.from_unit(torch.from_numpy(generator.random((many, space.dim))))
+        only = along == PAIRS and space.dim == 2
+        bases = space.from_unit(torch.from_numpy(generator.random((1 if only else count, space.dim))))
         return cls(space, bases, tuple(cuts), resolution, gradients)
 
     @property
@@ -139,7 +140,8 @@ class CensusDesign:
     @property
     def places(self) -> list[tuple[int, int]]:
         """The numbers of base point and cut of every slice, in order."""
-        return [(base, cut) for base in range(len(self.bases)) for cut in range(len(self.cuts))]
+        through = min(CUTS, len(self.cuts))
+        return [(base, (base + k) % len(self.cuts)) for base in range(len(self.bases)) for k in range(through)]
 
     def plane(self, base: int, cut: int) -> Plane:
         """Return a slice."""
@@ -432,15 +434,12 @@ def conclude(
 ) -> Census:
     """Sum up the slices of a design, and those that were measured at another fidelity, too, by their numbers."""
     drawn = bootstrap(design.places, seed=seed, exhausted=design.exhausted)
-    shape = len(design.bases), len(design.cuts)
-    whole, halved = (
-        np.array([getattr(one, name) for one in found]).reshape(*shape, -1) for name in ("measures", "halved")
-    )
+    whole, halved = (np.array([getattr(one, name) for one in found]) for name in ("measures", "halved"))
     spreads, parts = {}, {}
     for k, name in enumerate(MEASURES):
-        spreads[name] = spread(whole[..., k].ravel(), drawn)
+        spreads[name] = spread(whole[:, k], drawn)
         elsewhere = {at: float(one.measures[k]) for at, one in others.items()}
-        parts[name] = divide(whole[..., k], halved[..., k], elsewhere, design.places)
+        parts[name] = divide(whole[:, k], halved[:, k], elsewhere, design.places)
     places = zip(design.places, found, strict=True)
     return Census(
         along="random" if design.cuts[0].dims is None else "pairs",
@@ -533,21 +532,22 @@ def _medians(values: Array, drawn: NDArray[np.int64]) -> Array:
 
 
 def divide(
-    table: Array, halved: Array, others: Mapping[int, float], places: Sequence[tuple[int, int]]
+    values: Array, halved: Array, others: Mapping[int, float], places: Sequence[tuple[int, int]]
 ) -> VarianceComponents:
-    """Divide the variance of a measure, shape (base, cut), by what the slices differ in.
+    """Divide the variance of a measure over slices, shape (slice,), by what they differ in.
 
-    Two-way random effects without repetition, by mean squares (Searle, Casella & McCulloch 1992, section 4.3), shares
-    below zero cut off. `halved` is the measure at half the resolution, `others` that of some slices, by their numbers
-    among `places`, at another fidelity: half the mean square of a difference is the variance that either adds.
+    Two-way random effects: half the mean square of the difference of two slices is what point, cut and both add where
+    they share neither, and lacks what they share (Searle, Casella & McCulloch 1992, section 4.3: in a whole table these
+    are the mean squares). Shares below zero are cut off. `places` are base point and cut of the slices. `halved` is the
+    measure at half the resolution, `others` that of some slices, by their numbers, at another fidelity: half the mean
+    square of a difference is the variance that either adds.
     """
-    values = np.array([table[place] for place in places])
     total = float(np.nanvar(values, ddof=1)) if np.isfinite(values).sum() > 1 else 0.0
     if not total > (ROUNDING * np.nanmax(np.abs(values), initial=0.0)) ** 2:
         return VarianceComponents(*(np.nan,) * 5)
     other = np.array([others.get(number, np.nan) for number in range(len(values))])
-    added = [_added(values, one) / total for one in (np.array([halved[place] for place in places]), other)]
-    base, cut, both = _components(table)
+    added = [_added(values, one) / total for one in (halved, other)]
+    base, cut, both = _components(values, np.array(places))
     whole = base + cut + both
     shares = [one / whole if whole > 0 else np.nan for one in (base, cut, both)]
     return VarianceComponents(*shares, *added)
@@ -558,14 +558,14 @@ def _added(values: Array, others: Array) -> float:
     return float(np.nanmean(squares) / 2) if np.isfinite(squares).any() else np.nan
 
 
-def _components(table: Array) -> tuple[float, float, float]:
-    """Return the variance components of rows, columns and the rest; NaN where a cell is missing or there is one row."""
-    rows, columns = table.shape
-    if not np.isfinite(table).all() or min(rows, columns) < 2:
+def _components(values: Array, places: NDArray[np.int64]) -> tuple[float, float, float]:
+    """Return what base points, cuts and the rest add to the variance; NaN where no two slices share either."""
+    first, second = np.triu_indices(len(values), 1)
+    squares = np.square(values[first] - values[second]) / 2
+    shared = places[first] == places[second]
+    known = np.isfinite(squares)
+    ways = [known & (shared == way).all(axis=1) for way in ([False, False], [True, False], [False, True])]
+    if not all(one.any() for one in ways):
         return np.nan, np.nan, np.nan
-    by_row, by_column, mean = table.mean(axis=1), table.mean(axis=0), table.mean()
-    rest = table - by_row[:, None] - by_column + mean
-    error = float(np.square(rest).sum() / ((rows - 1) * (columns - 1)))
-    base = (columns * float(by_row.var(ddof=1)) - error) / columns
-    cut = (rows * float(by_column.var(ddof=1)) - error) / rows
-    return max(base, 0.0), max(cut, 0.0), error
+    apart, of_base, of_cut = (float(squares[one].mean()) for one in ways)
+    return max(apart - of_base, 0.0), max(apart - of_cut, 0.0), max(of_base + of_cut - apart, 0.0)

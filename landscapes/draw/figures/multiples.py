@@ -97,12 +97,12 @@ def _draw(ax: Axes, cut: CompanionSlice, dataset: xr.Dataset, scale: style.Scale
     ax.set(xlim=ends[0], ylim=ends[1])
 
 
-CENSUS_PITCH, ACROSS = 8.0, 8  # room on a screen [inch]; slices side by side
+CENSUS_PITCH, ACROSS = 8.0, 8  # room on a screen [inch]; slices side by side, and rows of them
 FOOT = 4  # words that the legend has, the most frequent first
 
 
 def census_figure(census: Census, *, width: float | None = None) -> page.Picture:
-    """Draw the losses of every slice on one scale, the least rugged first, row by row.
+    """Draw the losses of slices on one scale, the least rugged first, row by row: of more than 64 every so many.
 
     Slices are ordered by how often lines turn back along a side. What failed or lies outside the box is grey. The
     legend says which share of the slices each word fits.
@@ -110,18 +110,21 @@ def census_figure(census: Census, *, width: float | None = None) -> page.Picture
     Raises ValueError where the page is too narrow or too wide.
     """
     sheet = style.Sheet.of(width, pitch=CENSUS_PITCH)
-    across = min(ACROSS, math.ceil(math.sqrt(len(census.slices))))
-    rows = -(-len(census.slices) // across)
+    count = len(census.slices)
+    shown = [census.order[k * count // min(count, ACROSS**2)] for k in range(min(count, ACROSS**2))]
+    across = min(ACROSS, math.ceil(math.sqrt(len(shown))))
+    rows = -(-len(shown) // across)
     picture = page.Picture(sheet, sheet.width * rows / across)
     axes = list(picture.subplots(rows, across, squeeze=False).flat)
     scale = style.Scale.of_loss(np.asarray(census.losses, dtype=float))
-    for ax, number in zip(axes, census.order, strict=False):
+    for ax, number in zip(axes, shown, strict=False):
         _frame(ax, shape=1.0)
         drawn = _map(ax, census.losses[number], scale)
-    for empty in axes[len(census.slices) :]:
+    for empty in axes[len(shown) :]:
         empty.set_axis_off()
     page.colour_bar(axes[0], drawn, labelled("loss", census.loss_unit), scale, beside=axes)
-    many = f"{len(census.slices)} slices, the least rugged first"
+    of_all = f"{len(shown)} of " if len(shown) < count else ""
+    many = f"{of_all}{count} slices, the least rugged first"
     numerics = [census.floor.sentence()] if census.floor else []
     page.entitle(picture, f"{census.env} · census at {census.fidelity} · {many}")
     made = [*numerics, *page.made_by(census, "device", "created"), *filter(None, [census.command])]
