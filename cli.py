@@ -18,10 +18,11 @@ from typing import Annotated, Any, get_args
 from cyclopts import App, CycloptsError, Group, MissingArgumentError, Parameter, UnusedCliTokensError, convert
 
 from . import __version__
-from .commands.results import as_json, kind_of, shower
+from .commands.results import LIVE, as_json, kind_of, shower
 
 GROUPS = {  # of the help: heading -> verbs, each with the module of `api` that declares it
     "Look": {
+        "explore": "explore",
         "slice": "slice",
         "bounce": "slice",
         "sweep": "sweep",
@@ -120,9 +121,9 @@ class Verb:
 
     @property
     def parameters(self) -> list[Slot]:
-        """Its arguments and options: those of the function, then those of what shows its result, then --json."""
+        """Its arguments and options: those of the function, of what shows its result, and --json where there is one."""
         own = _slots(self.function)
-        if not _returned(self.function):
+        if set(_returned(self.function)) <= LIVE:
             return own
         last = own.pop() if own and own[-1].kind is Slot.VAR_KEYWORD else None
         whole = [*own, *self.displayed.values(), Slot("json", Slot.KEYWORD_ONLY, default=False, annotation=JSON)]

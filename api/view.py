@@ -67,9 +67,14 @@ def show_recording(path: Path, *, serve: bool) -> None:
             return
 
 
+def has_display() -> bool:
+    """Whether there is a display here for a window."""
+    return not sys.platform.startswith("linux") or any(os.environ.get(name) for name in DISPLAYS)
+
+
 def check_display(path: Path, instead: str) -> None:
     """Raise ValueError, saying what to do `instead`, where there is no display to open a file on."""
-    if sys.platform.startswith("linux") and not any(os.environ.get(name) for name in DISPLAYS):
+    if not has_display():
         raise ValueError(f"there is no display here to open {path} on; {instead}")
 
 

@@ -18,6 +18,7 @@ SHOWN = {
     "CheckReports": "checks:show",
     "Computed": "gallery:show_computed",
     "Environment": "environments:show_environment",
+    "Explorer": "explore:show",
     "FigureList": "gallery:show_figures",
     "Hessian": "hessian:show",
     "Info": "environments:show_info",
@@ -36,6 +37,7 @@ SHOWN = {
     "type[Optimizer]": "environments:show_method",
 }
 
+LIVE = {"Explorer"}  # types that are no JSON: shown until Ctrl-C
 
 RECORDED = {  # the same of types that are no records: what makes plain JSON of them
     "Environment": "environments:describe_environment",

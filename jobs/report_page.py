@@ -27,6 +27,8 @@ from .watch import Watch
 
 if TYPE_CHECKING:
     import xarray as xr
+    from jaxtyping import Float
+    from torch import Tensor
 
     from ..envs.base import Environment
     from .report import Report
@@ -93,14 +95,20 @@ def _film(env: Environment, dataset: xr.Dataset) -> Iterator[EpisodeShown]:
     for why, place in (("lowest loss", np.nanargmin(loss)), ("highest loss", np.nanargmax(loss))):
         row, column = (int(one) for one in np.unravel_index(int(place), loss.shape))
         along = torch.stack([axis[at] for axis, at in zip(plane.axes(), (column, row), strict=False)])
-        try:
-            episode = env.episode(plane.lift(along[None])[0])
-        except ValueError:  # it has none to draw
+        if (links := film_links(env, plane.lift(along[None])[0])) is None:
             return
-        if not episode.parts:
-            return
-        with tempfile.TemporaryDirectory() as folder:
-            film, still = film_episode(episode, Path(folder) / "episode", height=FILM_PIXELS, frames=FILM_FRAMES)
-            mp4, webp = data_link(film.read_bytes(), "video/mp4"), data_link(still.read_bytes(), "image/webp")
         at = dict(zip(plane.labels, plane.to_values(along).tolist(), strict=True))
-        yield EpisodeShown(row, column, why, float(loss[row, column]), Status.OK.name, at, mp4, webp)
+        yield EpisodeShown(row, column, why, float(loss[row, column]), Status.OK.name, at, *links)
+
+
+def film_links(env: Environment, x: Float[Tensor, " dim"]) -> tuple[str, str] | None:
+    """Return links that hold a film of the episode at a point and a picture of its end, None where it has none."""
+    try:
+        episode = env.episode(x)
+    except ValueError:  # it has none to draw
+        return None
+    if not episode.parts:
+        return None
+    with tempfile.TemporaryDirectory() as folder:
+        film, still = film_episode(episode, Path(folder) / "episode", height=FILM_PIXELS, frames=FILM_FRAMES)
+        return data_link(film.read_bytes(), "video/mp4"), data_link(still.read_bytes(), "image/webp")

@@ -83,10 +83,13 @@ def lift_between(plane: Plane, places: NDArray[np.float64]) -> torch.Tensor:
     return plane.lift(torch.from_numpy(np.stack(u, axis=-1)))
 
 
-def own_cells(dataset: xr.Dataset) -> xr.Dataset:
-    """Return a slice as it is drawn: where it was not sampled it has loss and status of the nearest sample."""
-    lacking = dataset["status"].to_numpy() == Status.INTERPOLATED if "status" in dataset else np.zeros(0, bool)
-    if not lacking.any():
+def own_cells(dataset: xr.Dataset, kind: Status = Status.INTERPOLATED) -> xr.Dataset:
+    """Return a slice as it is drawn: where it was not sampled it has loss and status of the nearest sample.
+
+    That is where its status is of that `kind`, but for a slice that has no samples.
+    """
+    lacking = dataset["status"].to_numpy() == kind if "status" in dataset else np.zeros(0, bool)
+    if not lacking.any() or lacking.all():
         return dataset
     from scipy.ndimage import distance_transform_edt
 

@@ -52,6 +52,7 @@ gallery compute --only bounce-y --part slices --resolution 4 --fidelity draft --
 gallery list --data data
 gallery build --data data --out site
 gallery serve --out site --port 0
+explore branin --device cpu --no-browser --port 0
 """.strip().splitlines()
 
 

@@ -203,7 +203,9 @@ def test_every_command_runs(
 
     monkeypatch.chdir(desk)  # where workers start, too: it is there as long as they are
     monkeypatch.setenv("XDG_DATA_HOME", str(desk / "data"))
-    monkeypatch.setattr("http.server.ThreadingHTTPServer.serve_forever", stop)
+    monkeypatch.setattr("gradscape.jobs.explore_page.Explorer.wait", lambda explorer: explorer.close())
+    if command.split()[1] != "explore":  # which serves on another thread
+        monkeypatch.setattr("http.server.ThreadingHTTPServer.serve_forever", stop)
     monkeypatch.setattr(view, "show_recording", lambda path, *, serve: opened.append(path))
     for name, value in (("REPETITION", 0.01), ("LARGEST", 0.01), ("RESAMPLES", 9)):
         monkeypatch.setattr(f"gradscape.studies.samples.{name}", value)

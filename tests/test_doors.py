@@ -84,6 +84,7 @@ def here(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """Work in the folder of the simulators, and draw blank pictures."""
     monkeypatch.chdir(folder)
     leave_blank(monkeypatch.setattr)
+    monkeypatch.setattr("gradscape.jobs.explore_page.Explorer.wait", lambda explorer: explorer.close())
     yield folder
     entries.cache_clear()
 
@@ -95,6 +96,7 @@ def functions(f: Any, name: str) -> dict[str, Callable[[], Any]]:
         "as_environment": lambda: gs.as_environment(f),
         "make": lambda: gs.make(f),
         "check": lambda: gs.check(f, power="20%"),
+        "explore": lambda: gs.explore(f, browser=False).close(),
         "slice": lambda: gs.slice(f, resolution=6, out=f"{name}/slice"),
         "sample": lambda: gs.sample(f, gs.open_slice(f"{name}/slice").plane),
         "open_slice": lambda: gs.open_slice(f"{name}/slice", env=f).report(points=2),
@@ -125,6 +127,7 @@ def commands(f: str, name: str) -> dict[str, str]:
     """Return a command of every verb that takes a simulator, or what others made of one, by the verb."""
     return {
         "envs": f"envs {f}",
+        "explore": f"explore {f} --no-browser",
         "slice": f"slice {f} --resolution 6 --out {name}/s",
         "report": f"report {name}/s --env {f} --points-per-axis 2 --out {name}/r",
         "check": f"check {f} --power 20%",

@@ -104,15 +104,17 @@ def censuses() -> str:
 
 
 def short_censuses() -> str:
-    """README's: how many slices are not flat, and the shares of them."""
-    rows = []
+    """README's, of the scenes that were counted: how many slices are not flat, and the shares of them."""
+    rows, left = [], []
     for scene in scenes():
         found = _census(scene)
-        cells = [found, *[""] * len(COLUMNS)] if isinstance(found, str) else [
-            str(found.solid), *(_interval(found.share(words)) for words in COLUMNS.values())
-        ]  # fmt: skip
+        if isinstance(found, str):
+            left.append(f"`{scene}`")
+            continue
+        cells = [str(found.solid), *(_interval(found.share(words)) for words in COLUMNS.values())]
         rows.append([f"`{scene}`", *cells, ", ".join(_paper_words(scene))])
-    return table(("environment", "slices", *COLUMNS, "the paper says"), rows)
+    shown = table(("environment", "slices", *COLUMNS, "the paper says"), rows)
+    return f"{shown}\n\nNot counted since the words changed: {', '.join(left)}." if left else shown
 
 
 def _census(scene: str) -> Census | str:

@@ -175,7 +175,7 @@ class _Site:
         dataset = open_slice(source / files.STORE)
         episodes, runs = read_episodes(source, dataset), lay_own(dataset, self.tables)
         nodes = read_off_nodes(dataset, episodes, runs)
-        (folder / NODES).write_text(f"const SLICE = {json.dumps(nodes, separators=(',', ':'))};\n")
+        (folder / NODES).write_text(f"let SLICE = {json.dumps(nodes, separators=(',', ':'))};\n")
         companions, report = read_companions(source), read_report(source)
         given = [name for episode in episodes for name in episode.files]
         given += [files.COMPANION_PICTURE] if companions else []

@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from . import testing
     from .api.compare import compare
     from .api.environments import list_envs
+    from .api.explore import explore
     from .api.export import export
     from .api.measure import bench, card, census, check, hessian, pairs, remedy
     from .api.overlay import overlay
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
 _HOMES = {
     "api.compare": ("compare",),
     "api.environments": ("list_envs",),
+    "api.explore": ("explore",),
     "api.export": ("export",),
     "api.measure": ("bench", "card", "census", "check", "hessian", "pairs", "remedy"),
     "api.overlay": ("overlay",),

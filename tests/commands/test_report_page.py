@@ -47,7 +47,7 @@ class Page(HTMLParser):
 
 def nodes_of(path: Path) -> dict[str, Any]:
     """Return what the map is drawn from."""
-    found = re.search(r"const SLICE = (.*);</script>", path.read_text())
+    found = re.search(r"let SLICE = (.*);</script>", path.read_text())
     assert found
     return dict(json.loads(found[1]))
 

@@ -174,7 +174,7 @@ def test_pictures_lead_to_the_gallery_where_it_is_built_and_to_scenes_where_not(
 
 def test_every_picture_of_the_pages_says_what_made_it() -> None:
     found = extension.pictures_of_pages()
-    assert {file.name for file in (ROOT / "docs").glob("*.png")} == set(found)
+    assert {one.name for kind in ("png", "webp") for one in (ROOT / "docs").glob(f"*.{kind}")} == set(found)
     for name, (pages, command) in found.items():
         assert pages, f"no page shows {name}"
         verb = re.match(r"landscape (gallery \w+|\w+)", command)

@@ -96,21 +96,23 @@ def read_off_nodes(
     episodes: Sequence[EpisodeShown] = (),
     runs: Sequence[Trajectory] = (),
     floor: xr.Dataset | None = None,
+    *,
+    growing: bool = False,
 ) -> dict[str, Any]:
     """Read off a slice what the map draws and says of its nodes, as JSON for its script.
 
     Nodes go row by row from the lowest v; arrays are packed, see `pack`. `loss` [unit] is float32, NaN where there is
-    none, and `status` uint8, by the numbers of `statuses`. `cells` and `looks` are the same as they are drawn, where a
-    refined slice was not sampled everywhere. `slope` is the gradient along the axes, `gradient` its length in all
-    dimensions, float32 both. `finer` are flags of the cells between four samples whose gradients contradict their
-    losses. `floor` is the numerical floor at every node [loss unit], where it was mapped. `scales` are those that the
-    map can have, by name, `scale` that which it begins with. `azimuth` is where the surface is seen from at first
-    [degrees].
+    none, and `status` uint8, by the numbers of `statuses`. `cells` and `looks` are the same as they are drawn,
+    where a refined slice, or one that is still `growing`, was not sampled everywhere. `slope` is the gradient along
+    the axes, `gradient` its length in all dimensions, float32 both. `finer` are flags of the cells between four
+    samples whose gradients contradict their losses. `floor` is the numerical floor at every node [loss unit], where
+    it was mapped. `scales` are those that the map can have, by name, `scale` that which it begins with. `azimuth`
+    is where the surface is seen from at first [degrees].
     """
     plane, loss = plane_of(dataset), dataset["loss"].to_numpy()
     own, flat = Scale.of_loss(loss), plane.rank == 2
-    skipped = flat and bool((dataset["status"] == Status.INTERPOLATED).any())
-    drawn = own_cells(dataset) if skipped else None
+    kind = Status.MISSING if growing else Status.INTERPOLATED
+    drawn = own_cells(dataset, kind) if flat and bool((dataset["status"] == kind).any()) else None
     grad = torch.from_numpy(dataset["grad"].to_numpy().reshape(loss.size, -1)) if "grad" in dataset else None
     finer = contradicted_cells(dataset) if flat and grad is not None else np.zeros(0)
     found = {

@@ -93,8 +93,8 @@ def report_page(
         stride=stride,
         check=check,
         still=data_link(picture, "image/png"),
-        nodes=_inert(nodes),
-        record=_inert(record),
+        nodes=inert(nodes),
+        record=inert(record),
         style=(STATIC / STYLE).read_text(encoding="utf-8"),
         scripts=[(STATIC / name).read_text(encoding="utf-8") for name in (*scripts(len(shown.loss.dims)), DOWNLOAD)],
     )
@@ -219,7 +219,7 @@ def _every(dataset: xr.Dataset, stride: int) -> xr.Dataset:
     return thin.assign_attrs(identity=json.dumps({**identity, "plane": coarse.record()}))
 
 
-def _inert(value: Any) -> str:
+def inert(value: Any) -> str:
     """Return a value as JSON that no text in it can end the script that it stands in."""
     text = json.dumps(to_json(value), separators=(",", ":"))
     return text.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")

@@ -216,7 +216,7 @@ def test_words_are_beside_the_papers_and_a_trade_off_is_ranked(site: Path) -> No
 
 def test_a_search_lies_where_its_parameters_say(site: Path, data: Path) -> None:
     """On the slice through the middle of the box a point's place is its own two parameters, its distance the third."""
-    text = (site / "full/nodes.js").read_text().removeprefix("const SLICE = ").rstrip(";\n")
+    text = (site / "full/nodes.js").read_text().removeprefix("let SLICE = ").rstrip(";\n")
     for run in json.loads(text)["runs"]:
         table = open_run(data / f"runs/fluid/{run['method']}-0.zarr.zip")
         x, loss = table["x"].to_numpy(), table["loss"].to_numpy()

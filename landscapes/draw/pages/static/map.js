@@ -99,7 +99,7 @@ function bitmap(wide, tall, colourOf) {
   return canvas_;
 }
 
-const layers = { map: null, failures: [], finer: null, floor: null, lines: [] };
+const layers = { of: null, map: null, failures: [], finer: null, floor: null, lines: [] };
 const FLOOR_FROM = 0.01; // of the range of the losses: replicas that differ by more are marked
 function aboveFloor() {
   const known = losses.filter((loss) => loss === loss);
@@ -112,6 +112,7 @@ function paintLayers() {
   layers.map = bitmap(columns, rows, (index) => colours[index]);
   layers.lines = [];
   sharp.stale = true;
+  if (layers.of !== losses) Object.assign(layers, { of: losses, failures: [], finer: null, floor: null });
   if (layers.failures.length || layers.finer || layers.floor) return; // they do not depend on the scale
   for (const [kind, lines] of Object.entries(STRIPES)) {
     const code = Number(Object.keys(SLICE.statuses).find((one) => SLICE.statuses[one] === kind));
@@ -220,7 +221,7 @@ function spacing() {
   }
   return Number.isFinite(least) ? least : 1;
 }
-const given = slopes && up ? spacing() : 1;
+let given = slopes && up ? spacing() : 1;
 
 // How many nodes lie from arrow to arrow: as few as leave room for them, doubled so that zooming adds arrows.
 function thinned() {
@@ -299,3 +300,7 @@ document.addEventListener("viewed", () => {
 });
 document.addEventListener("scaled", paintLayers);
 paintLayers();
+document.addEventListener("loaded", () => {
+  given = slopes && up ? spacing() : 1;
+  redraw();
+});

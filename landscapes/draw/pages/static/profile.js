@@ -166,6 +166,10 @@ const rechart = fit(chart, (brush, width, height) => {
   brush.restore();
 });
 
+document.addEventListener("loaded", () => {
+  if (profile) sayProfile();
+  rechart();
+});
 drawer.addEventListener("click", () => {
   drawer.setAttribute("aria-pressed", String(!profiling()));
   canvas.classList.toggle("drawing", profiling());

@@ -65,7 +65,7 @@ function follow() {
   if (up && numbers("camera", 3)) setCamera(...numbers("camera", 3));
 }
 
-document.getElementById("link").addEventListener("click", async () => {
+document.getElementById("link")?.addEventListener("click", async () => {
   const field = document.getElementById("permalink");
   history.replaceState(null, "", linkHere());
   field.value = location.href;

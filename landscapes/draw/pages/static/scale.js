@@ -72,6 +72,10 @@ function setScale(name) {
   document.dispatchEvent(new Event("scaled"));
 }
 setScale(scaleName);
+document.addEventListener("loaded", () => {
+  ordered = null;
+  setScale(scaleName === RANK || scaleName in SLICE.scales ? scaleName : SLICE.scale);
+});
 
 // Where equal losses lie, between four nodes that all have one: nothing is drawn across a failure. Each part of a line
 // is four numbers, from and to, in nodes. Of a cell's corners, from the lower left on and counter-clockwise, those that

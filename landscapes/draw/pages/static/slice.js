@@ -10,18 +10,31 @@ function unpacked(text, Kind) {
   return new Kind(held.buffer);
 }
 
-const [across, up] = SLICE.axes;
-const columns = across.values.length;
-const rows = up ? up.values.length : 1;
-const losses = unpacked(SLICE.loss, Float32Array);
-const statuses = unpacked(SLICE.status, Uint8Array);
-const drawnLosses = unpacked(SLICE.cells, Float32Array) || losses; // of a refined slice, each node's nearest sample's
-const drawnStatuses = unpacked(SLICE.looks, Uint8Array) || statuses;
-const slopes = SLICE.slope ? SLICE.slope.map((part) => unpacked(part, Float32Array)) : null;
-const gradients = unpacked(SLICE.gradient, Float32Array);
-const finer = unpacked(SLICE.finer, Uint8Array); // cells between four nodes
-const floors = unpacked(SLICE.floor, Float32Array); // the numerical floor of every node
-const lowest = losses.reduce((best, loss, at) => (loss < losses[best] || !(losses[best] === losses[best]) ? at : best), 0);
+let across, up, columns, rows, losses, statuses, drawnLosses, drawnStatuses, slopes, gradients, finer, floors, lowest;
+
+function read() {
+  [across, up] = SLICE.axes;
+  columns = across.values.length;
+  rows = up ? up.values.length : 1;
+  losses = unpacked(SLICE.loss, Float32Array);
+  statuses = unpacked(SLICE.status, Uint8Array);
+  drawnLosses = unpacked(SLICE.cells, Float32Array) || losses; // of a refined slice, each node's nearest sample's
+  drawnStatuses = unpacked(SLICE.looks, Uint8Array) || statuses;
+  slopes = SLICE.slope ? SLICE.slope.map((part) => unpacked(part, Float32Array)) : null;
+  gradients = unpacked(SLICE.gradient, Float32Array);
+  finer = unpacked(SLICE.finer, Uint8Array); // cells between four nodes
+  floors = unpacked(SLICE.floor, Float32Array); // the numerical floor of every node
+  lowest = losses.reduce((best, loss, at) => (loss < losses[best] || !(losses[best] === losses[best]) ? at : best), 0);
+}
+read();
+
+// Show another slice of as many nodes, as the explorer does.
+function load(slice) {
+  SLICE = slice;
+  read();
+  document.dispatchEvent(new Event("loaded"));
+}
+
 const lossLabel = "loss" + (SLICE.unit ? ` [${SLICE.unit}]` : "");
 const shown = new Set(); // what the switches let through
 

@@ -135,11 +135,13 @@ for (const [id, press] of Object.entries(BUTTONS)) document.getElementById(id).a
 document.addEventListener("viewed", () => canvas.classList.toggle("zoomed", view.zoom > 1));
 
 const chooser = document.getElementById("scale");
-for (const name of [...Object.keys(SLICE.scales), ...(up ? [RANK] : [])]) {
+function offerScales() {
   const names = { linear: "linear", logarithmic: "logarithmic", rank: "by rank" };
-  chooser.add(new Option(names[name], name, name === SLICE.scale, name === SLICE.scale));
+  const offered = [...Object.keys(SLICE.scales), ...(up ? [RANK] : [])];
+  chooser.replaceChildren(...offered.map((name) => new Option(names[name], name, name === SLICE.scale, name === SLICE.scale)));
+  chooser.value = scaleName; // a browser keeps what was chosen when it comes back
 }
-chooser.value = SLICE.scale; // a browser keeps what was chosen when it comes back
+offerScales();
 chooser.addEventListener("change", () => setScale(chooser.value));
 
 for (const input of document.querySelectorAll("#switches input")) {
@@ -156,3 +158,7 @@ for (const input of document.querySelectorAll("#switches input")) {
 for (const fields of document.querySelectorAll("fieldset[disabled]")) fields.removeAttribute("disabled");
 document.dispatchEvent(new Event("shown"));
 tell();
+document.addEventListener("loaded", () => {
+  offerScales();
+  tell();
+});

@@ -1,0 +1,48 @@
+"""The page of the explorer: the map of a slice's page, with what moves the slice."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from .rendering import STATIC, STYLE, scripts, templates
+from .report import inert
+
+if TYPE_CHECKING:
+    from ...space import ParameterSpace
+
+SCRIPT = "explore.js"
+
+
+def explore_page(
+    space: ParameterSpace, nodes: Mapping[str, Any], *, title: str, about: str, look: Mapping[str, Any], gradients: bool
+) -> str:
+    """Return the page: it begins with the picture `nodes` of the plane where somebody looks, and asks for finer ones.
+
+    `about` says how the objective is evaluated. The page holds its own scripts and its style.
+    """
+    values = [space.to_values(end).tolist() for end in (space.lower, space.upper)]
+    parameters = [
+        {"name": name, "unit": unit, "low": low, "high": high, "logarithmic": scale == "log10"}
+        for name, unit, low, high, scale in zip(space.names, space.units, *values, space.scales, strict=True)
+    ]
+    entry = {
+        "env": title,
+        "episodes": (),
+        "runs": (),
+        "identity": {"gradients": gradients, "parameters": parameters},
+    }
+    page = templates().get_template("explore.html")
+    return page.render(
+        entry=entry, about=about, parameters=parameters, plane=True, finer=gradients, deviates=False,
+        status=dict.fromkeys(("nonfinite", "escaped", "error", "missing"), 0),
+        axes="two of its parameters", nodes=inert(nodes), space=inert({"parameters": parameters, **look}),
+        style=(STATIC / STYLE).read_text(encoding="utf-8"),
+        scripts=[(STATIC / name).read_text(encoding="utf-8") for name in (*scripts(2), SCRIPT)],
+    )  # fmt: skip
+
+
+def as_text(value: Any) -> bytes:
+    """Return an answer to the page as JSON."""
+    return json.dumps(value, separators=(",", ":")).encode()
