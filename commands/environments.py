@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
-from .terminal import Console, table
+from .terminal import Console, Table, table
 
 if TYPE_CHECKING:
     from ..api.info import Info
@@ -42,9 +43,9 @@ def show_environment(env: Environment, console: Console) -> None:
     from ..landscapes.space import LOG10
     from ..studies.kept import describe_margins
 
-    console.soft_wrap = True
     about = env.about() or "It says nothing of itself: its class has no docstring."
-    console.print(f"{env.name}: {env.space.dim} parameter{'s' if env.space.dim > 1 else ''}\n\n{about}\n")
+    console.print(f"{env.name}: {env.space.dim} parameter{'s' if env.space.dim > 1 else ''}\n")
+    console.print(f"{_flowing(about)}\n")
     bounded = table("no.", "parameter", "lower", "upper", "unit")
     space = env.space
     lower, upper = (space.to_values(end).tolist() for end in (space.lower, space.upper))
@@ -53,17 +54,46 @@ def show_environment(env: Environment, console: Console) -> None:
         label = f"{one} (logarithmic)" if scale == LOG10 else one
         bounded.add_row(str(number), label, f"{low:g}", f"{high:g}", unit)
     console.print(bounded)
-    for fidelity in env.fidelities.values():
-        console.print(f"fidelity {fidelity.record()}")
+    console.print(_fidelities(env))
     console.print(f"engines: {', '.join(env.engines)}")
     for said in describe_margins(env) if any(one.dt for one in env.fidelities.values()) else ():
         console.print(said)
-    console.print(in_full(env.Options))
+    console.print(_flowing(in_full(env.Options)))
     console.print(f"examples: {', '.join(env.examples) or 'none'}")
     presets = (f"{name} ({describe_settings(options)})" for name, options in env.presets.items())
     console.print(f"presets: {', '.join(presets) or 'none'}")
     if words := read_paper().words.get(env.name):
         console.print(f"the paper says: {words}")
+
+
+def _fidelities(env: Environment) -> Table:
+    """Return the fidelities of an environment, a column each."""
+    records = {one.name: one.record() for one in env.fidelities.values()}
+    names = list(dict.fromkeys(setting for record in records.values() for setting in record if setting != "name"))
+    shown = table("fidelity", *records)
+    for name in names:
+        label = "step dt [s]" if name == "dt" else name
+        shown.add_row(label, *(_setting(record.get(name, "")) for record in records.values()))
+    return shown
+
+
+def _setting(value: object) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def _flowing(text: str) -> str:
+    """Return a docstring whose paragraphs are a line each, to be wrapped where the terminal ends.
+
+    A paragraph begins after an empty line, where a line is indented, and where one begins with a word and a colon.
+    """
+    found: list[str] = []
+    for line in text.splitlines():
+        apart = not line or line.startswith(" ") or bool(re.match(r"[A-Z][a-z ]*:", line))
+        if found and found[-1] and not apart and not found[-1].startswith(" "):
+            found[-1] = f"{found[-1]} {line}"
+        else:
+            found.append(line)
+    return "\n".join(found)
 
 
 def describe_environment(env: Environment) -> dict[str, Any]:
@@ -115,8 +145,7 @@ def show_method(kind: type[Optimizer], console: Console) -> None:
     texts += [f"gradients: {'yes' if kind.needs_grad else 'no'}", in_full(kind.Options)]
     if sources := defaults(kind.Options):
         texts.append("whose defaults: " + ", ".join(f"{one.option} {one.source}" for one in sources))
-    console.soft_wrap = True
-    console.print(f"{kind.name}: " + "\n\n".join(texts))
+    console.print(_flowing(f"{kind.name}: " + "\n\n".join(texts)))
 
 
 def show_info(found: Info, console: Console) -> None:
