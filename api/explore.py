@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Unpack
 
 from cyclopts import Parameter
@@ -11,7 +10,6 @@ from cyclopts.validators import Number
 from .call import current, verb
 from .options import Dims, Scene, SceneKeywords
 from .scene import environment
-from .values import as_path
 from .view import has_display
 
 if TYPE_CHECKING:
@@ -25,17 +23,14 @@ def explore(
     *,
     port: Annotated[int, Parameter(validator=Number(gte=0, lte=65535))] = 0,
     browser: Annotated[bool, Parameter(negative="--no-browser")] = True,
-    out: Annotated[
-        str | Path | None, Parameter(help="Folder in which kept slices have theirs, by default out/.")
-    ] = None,
     **keywords: Unpack[SceneKeywords],
 ) -> Explorer:
     """Look around in a landscape, on a page of this machine that samples it meanwhile.
 
     The page shows a plane through a point, coarse first and then finer. Choose the two parameters that vary, and move
     the point by sliders or to a node of the map. A click on a node plays its episode, where the environment has some,
-    and draws a descent from there. What is shown can be kept as a slice, with its picture and the command that makes it
-    again. Ctrl-C ends it; it writes nothing but what is kept.
+    and draws a descent from there. What is shown can be kept as a slice in out/, with its picture and the command that
+    makes it again. Ctrl-C ends it; it writes nothing but what is kept.
 
     Raises ValueError for what the scene does not have, and OSError for a port in use.
 
@@ -59,7 +54,7 @@ def explore(
     chosen = tuple(dims) if dims is not None else (0, 1)
     if len(chosen) != 2:
         raise ValueError(f"an exploration varies two parameters; got {', '.join(map(str, chosen))}")
-    explorer = Explorer(Exploration(env, chosen, call.command, as_path(out) or ROOT), port)
+    explorer = Explorer(Exploration(env, chosen, call.command, ROOT), port)
     if browser and has_display():
         import webbrowser
 

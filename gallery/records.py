@@ -14,6 +14,7 @@ import xarray as xr
 from zarr.storage import ZipStore
 
 from ..landscapes.convert import from_json, to_json
+from ..landscapes.identity import MODEL_VERSION
 from ..landscapes.objective import Status
 from ..landscapes.storage.arrays import COMPACT_CODECS
 from ..landscapes.storage.files import replacing, write_json
@@ -132,11 +133,16 @@ def open_run(path: Path) -> xr.Dataset:
 
 
 def searched(run: Mapping[str, Any], slice_: Mapping[str, Any]) -> bool:
-    """Whether a run searched a slice's scene; an option that one of them was made without does not tell them apart."""
+    """Whether a run searched a slice's scene, of the same model.
+
+    An option that one of them was made without does not tell them apart.
+    """
     ours, theirs = run.get("options", {}), slice_.get("options", {})
     shared = set(ours) & set(theirs)
-    same = run["objective"] == slice_["objective"] and run["parameters"] == slice_["parameters"]
-    return same and all(ours[name] == theirs[name] for name in shared)
+    known = ("objective", "parameters", MODEL_VERSION)
+    return all(run.get(name) == slice_.get(name) for name in known) and all(
+        ours[name] == theirs[name] for name in shared
+    )
 
 
 def read_if_sound(read: Callable[[Path], T], path: Path) -> T | None:

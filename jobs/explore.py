@@ -36,7 +36,7 @@ PATIENCE = 20.0  # seconds that somebody waits for a newer picture before asking
 POINTS, FILE = "explored", "point-{number}.txt"  # where the points lie that kept slices go through
 
 
-TAKING = {"--dims": 2, "--port": 1, "--out": 1}  # options of the command that a slice does not have, and their values
+TAKING = {"--dims": 2, "--port": 1}  # options of the command that a slice does not have, and their values
 FLAGS = ("--browser", "--no-browser")  # and those without a value
 
 

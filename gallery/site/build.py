@@ -51,6 +51,7 @@ from .page_data import (
     read_report,
     read_runs,
 )
+from .sizes import give_sizes
 from .studies import StudyEntry, place_studies
 from .studio import Studio, draws
 from .wall import GRADIENTS, SIZES, Tile, answers, draw_wall, make_tiles, place_card, size_class
@@ -108,7 +109,9 @@ def build_site(
             site.write_page(CARD_PAGE, card=card, scenes=card_scenes(card), colours=colour_stops())
         if league is not None:
             site.write_league(league)
-        return site.write_index(shown, [one.id for one in figures if one not in there], tiles, card, league)
+        manifest = site.write_index(shown, [one.id for one in figures if one not in there], tiles, card, league)
+        give_sizes(new)
+        return manifest
 
 
 def _check(out: Path) -> None:

@@ -26,6 +26,7 @@ from hypothesis import strategies as st
 from gradscape.cli import verbs
 from gradscape.envs.base import Environment
 from gradscape.gallery.site import build
+from gradscape.jobs.explore_page import Explorer
 
 from ..command import options
 from ..faults import damage
@@ -44,6 +45,7 @@ replay bounce --params point.json --no-film
 race branin --methods random,cma-es --budget 5 --seeds 2 --workers 2 --option cma-es.sigma=0.2
 gallery list --json --data gallery
 gallery serve --out site --port 0
+explore branin --no-browser --port 0
 """.strip().splitlines()
 NUMBERS = ("0", "-1", "1", "2", "7", "1e9", "1e308", "-1e308", "1e400", "nan", "inf", "-inf", "0x10", "1_000", "\u0663")
 NUMBERS += ("100000", "2147483648", "9223372036854775808", "9" * 400, "1.5", "5e-324", "1e-300", "-0.0", "")
@@ -184,7 +186,10 @@ def confined(line: list[str]) -> None:
                 raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), name)
 
     sys.addaudithook(keep_within)
-    for place, name in ((Environment, "evaluate"), (build, "build_site"), (ThreadingHTTPServer, "serve_forever")):
+    stopped = [(Environment, "evaluate"), (build, "build_site"), (ThreadingHTTPServer, "serve_forever")]
+    if line[:1] == ["explore"]:  # which samples and serves on threads of its own
+        stopped = [(Explorer, "wait")]
+    for place, name in stopped:
         setattr(place, name, stop)
     landscape(*line)
 

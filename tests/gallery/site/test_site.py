@@ -10,6 +10,7 @@ from urllib.parse import urldefrag
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from gradscape.gallery.league import read_standings
 from gradscape.gallery.paper import read_paper
@@ -235,6 +236,8 @@ def test_a_search_of_other_options_is_not_laid_over_a_slice(data: Path) -> None:
     tables, dataset = read_runs(data), open_slice(data / "full/slice.zarr")
     assert len(tables) == 4
     assert len(lay_own(dataset, tables)) == 2
+    own = next(one for one in tables if lay_own(dataset, [one]))
+    assert not lay_own(dataset, [own.assign_attrs(identity=json.dumps({**stored_identity(own), "model_version": 99}))])
     for one, goal in ((dataset, "high"), (tables[-1], "low")):
         one.attrs["identity"] = json.dumps({**stored_identity(one), "options": {"goal": goal}})
     assert [run.method for run in lay_own(dataset, tables)] == ["descents"]
@@ -361,3 +364,15 @@ def test_the_contrast_of_text_is_that_of_wcag_aa(scheme: str) -> None:
         for name, least in wanted.items():
             low, high = sorted((luminance(named[name]), luminance(named[ground])))
             assert (high + 0.05) / (low + 0.05) >= least, f"{name} on {ground}"
+
+
+def test_pictures_keep_their_room_before_they_are_there(site: Path) -> None:
+    for page in site.rglob("*.html"):
+        for tag in re.findall(r"<img\b[^>]*>", page.read_text()):
+            if 'src="' in tag and 'src="data:' not in tag:
+                assert re.search(r'\swidth="\d+" height="\d+"', tag), (page, tag)
+    text = (site / "full/index.html").read_text()
+    found = re.search(r'src="landscape.png" width="(\d+)" height="(\d+)"', text)
+    with Image.open(site / "full/landscape.png") as picture:
+        assert found
+        assert picture.size == (int(found[1]), int(found[2]))
