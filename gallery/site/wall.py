@@ -28,7 +28,12 @@ GRADIENTS = FOLLOWING_WORDS
 SHAPES = tuple(word for word in WORDS if word not in (*GRADIENTS, FLAT))
 MIN_SHARE = 1 / 3  # of the slices: from this share on a word is said of an environment
 SHOWN_WORDS = 3  # of how smooth an environment is
-RUGGED = ("rugged", "extremely rugged")
+MOSTLY = {  # what may be true of most slices: words of which a slice has one at most
+    "very smooth": ("very smooth",),
+    "smooth with local minima": ("smooth with local minima",),
+    "rugged": ("rugged", "extremely rugged"),
+    "gradients follow": ("gradients follow",),
+}
 REMAKE_CENSUS = "delete it, and `landscape census {} --device {}` measures it again"
 REMAKE_CARD = "delete it, and `landscape card --out {}` measures it again"
 SIZES = {"1-3": "1 to 3", "4-16": "4 to 16", "17-": "17 or more"}  # numbers of parameters, by the name in a link
@@ -52,7 +57,8 @@ class Tile:
     """An environment on the wall: the slice that is shown, and which words fit which share of how many slices.
 
     They are those of its `census`, with the command, the picture and the table of that, or of the gallery's own slices.
-    Of a census `flat` slices are not among them.
+    Of a census `flat` slices are not among them, and `most` has what is true of most slices: of more than half of
+    all by the lower end of its 95 % interval.
     """
 
     env: str
@@ -68,6 +74,7 @@ class Tile:
     table: str = ""
     command: str = ""
     flat: int = 0
+    most: Sequence[str] = ()
 
     def fitting(self, least: float = MIN_SHARE) -> list[str]:
         """Return the words that fit such a share of the slices, or more."""
@@ -96,23 +103,19 @@ def answers(tiles: Sequence[Tile]) -> tuple[str, str]:
     counted = [tile for tile in tiles if tile.census and tile.slices]
     if not counted:
         return ("No environment was cut many times yet.",) * 2
-    smooth, minima, rugged = (
-        _names(counted, words) for words in (["very smooth"], ["smooth with local minima"], RUGGED)
-    )
-    follow = _names(counted, ["gradients follow"])
+    smooth, minima, rugged, follow = (_names(counted, said) for said in MOSTLY)
     many = f"{len(counted)} environment{'s' if len(counted) > 1 else ''}"
     return (
         f"Of {many} many slices were measured. Most are very smooth in {smooth}, smooth with local minima in {minima}, "
-        f"and rugged in {rugged}.",
+        f"and rugged in {rugged}. Of the others so many slices cannot tell, or none of the words fits most.",
         f"Gradients follow the loss over 1 % of the box in most slices of {follow}. In the others they follow loosely, "
-        "in fewer slices, or not at all.",
+        "in fewer slices, or not at all, or so many slices cannot tell.",
     )
 
 
-def _names(tiles: Sequence[Tile], words: Sequence[str]) -> str:
-    """Return the environments in which any of some words, of which a slice has one at most, fits most slices."""
-    shares = {tile.env: sum(one.share for one in tile.words if one.word in words) for tile in tiles}
-    return " and ".join(", ".join(env for env, share in shares.items() if share > 0.5).rsplit(", ", 1)) or "none"
+def _names(tiles: Sequence[Tile], said: str) -> str:
+    """Return the environments of whose slices something is true in most cases."""
+    return " and ".join(", ".join(tile.env for tile in tiles if said in tile.most).rsplit(", ", 1)) or "none"
 
 
 def size_class(dim: int) -> str:
@@ -134,10 +137,15 @@ def _tile(env: str, group: Sequence[FigureEntry], data: Path, out: Path, studio:
         words = [_word_share(word, one) for word, one in census.words.items() if math.isfinite(one.value)]
         picture, table = (path.relative_to(out).as_posix() for path in (files.picture, files.table))
         flat = len(census.slices) - census.solid
-        return Tile(*about, census.solid, True, words, picture, table, census.command, flat)
+        most = [said for said, any_of in MOSTLY.items() if _is_most(census.share(any_of))]
+        return Tile(*about, census.solid, True, words, picture, table, census.command, flat, most)
     said = [set(entry.words) for entry in group if entry.report is not None]
     words = [WordShare(word, sum(word in one for one in said) / len(said)) for word in WORDS] if said else []
     return Tile(*about, len(said), False, words)
+
+
+def _is_most(share: Estimate) -> bool:
+    return (share.low if math.isfinite(share.low) else share.value) > 0.5
 
 
 def _word_share(word: str, share: Estimate) -> WordShare:

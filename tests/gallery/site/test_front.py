@@ -21,6 +21,8 @@ from gradscape.gallery.figures import Figure
 from gradscape.gallery.paper import PaperCaption
 from gradscape.gallery.site import studio
 from gradscape.gallery.site.build import build_site
+from gradscape.gallery.site.wall import Tile, _is_most, answers
+from gradscape.landscapes.statistics import Estimate, exactly
 from gradscape.landscapes.storage.store import open_slice
 
 from .conftest import FIGURES, keep
@@ -46,7 +48,7 @@ def test_the_front_page_asks_three_questions_and_answers_each_over_all_environme
     tiles = re.findall(r'<li class="card tile".*?</li>', page)
     assert [re.search(r'class="name">(.*?)<', tile)[1] for tile in tiles] == ["bounce", "fluid"]  # type: ignore[index]
     fluid = re.sub("<.*?>", " ", tiles[1]).replace("&nbsp;", " ")
-    assert "rugged 75 % discontinuous 50 % of 2 slices" in " ".join(fluid.split())
+    assert "rugged 75 % (38 to 88) discontinuous 50 % (25 to 75) of 2 slices" in " ".join(fluid.split())
     assert "very smooth" not in fluid
     assert "not measured yet" in tiles[0]
     row = re.search(r'<th scope="row"><a href="full/index.html">fluid</a></th>(.*?)</tr>', page)
@@ -220,3 +222,22 @@ def test_many_slices_are_drawn_by_a_process_as_they_are_here(tmp_path: Path, mon
     build_site(figures[1:], tmp_path / "data", tmp_path / "one")
     for name in ("landscape.png", "landscape-dark.png", "thumbnail.png"):
         assert (tmp_path / "many/slice-1" / name).read_bytes() == (tmp_path / "one/slice-1" / name).read_bytes()
+
+
+def test_most_is_said_where_the_interval_says_so() -> None:
+    def tile(env: str, most: list[str], *, census: bool = True) -> Tile:
+        return Tile(env, "", "", (), 3, "warp", 16, census, (), most=most)
+
+    tiles = [
+        tile("a", ["very smooth", "gradients follow"]),
+        tile("b", []),
+        tile("c", ["rugged"]),
+        tile("d", ["rugged"]),
+    ]
+    smooth, follow = answers([*tiles, tile("e", ["rugged"], census=False)])
+    assert "Of 4 environments" in smooth
+    assert "very smooth in a, smooth with local minima in none, and rugged in c and d." in smooth
+    assert "in most slices of a." in follow
+    assert not _is_most(Estimate(0.9, 0.2, 1.0))
+    assert _is_most(Estimate(0.9, 0.6, 1.0))
+    assert _is_most(exactly(0.9))
