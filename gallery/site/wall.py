@@ -107,9 +107,9 @@ def answers(tiles: Sequence[Tile]) -> tuple[str, str]:
     many = f"{len(counted)} environment{'s' if len(counted) > 1 else ''}"
     return (
         f"Of {many} many slices were measured. Most are very smooth in {smooth}, smooth with local minima in {minima}, "
-        f"and rugged in {rugged}. Of the others so many slices cannot tell, or none of the words fits most.",
+        f"and rugged in {rugged}. For the others this many slices cannot tell, or no word fits most of them.",
         f"Gradients follow the loss over 1 % of the box in most slices of {follow}. In the others they follow loosely, "
-        "in fewer slices, or not at all, or so many slices cannot tell.",
+        "in fewer slices, or not at all, or this many slices cannot tell.",
     )
 
 
