@@ -51,10 +51,7 @@ def explore(
     from ..jobs.explore_page import Explorer
     from ..jobs.folder import ROOT
 
-    chosen = tuple(dims) if dims is not None else (0, 1)
-    if len(chosen) != 2:
-        raise ValueError(f"an exploration varies two parameters; got {', '.join(map(str, chosen))}")
-    explorer = Explorer(Exploration(env, chosen, call.command, ROOT), port)
+    explorer = Explorer(Exploration(env, (0, 1) if dims is None else dims, call.command, ROOT), port)
     if browser and has_display():
         import webbrowser
 

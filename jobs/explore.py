@@ -10,14 +10,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from threading import Condition, Thread
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import torch
 
-from ..landscapes.convert import to_json
-from ..landscapes.draw.pages.nodes import lay_runs, read_off_nodes
+from ..landscapes.draw.pages.nodes import Trajectory, lay_runs, read_off_nodes
 from ..landscapes.objective import Status, describe_errors, evaluate
+from ..landscapes.overlay import best_point
 from ..landscapes.plane import Plane
 from ..landscapes.sampling.fill import Progress, describe, sample
 from ..landscapes.storage.store import SliceStore
@@ -29,6 +29,8 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from ..envs.base import Environment
+
+Result = TypeVar("Result")
 
 SIDE = 48  # samples along each axis of a plane that is complete
 DESCENT = 60  # points of a descent at most
@@ -71,6 +73,38 @@ class Seen:
     error: str = ""
 
 
+@dataclass(frozen=True)
+class Film:
+    """Hold what an episode was like: its loss and status, and links that hold a film and a picture of its end.
+
+    Where it has none, they are None, and `said` says so.
+    """
+
+    loss: float
+    status: str
+    mp4: str | None
+    webp: str | None
+    said: str
+
+
+@dataclass(frozen=True)
+class Descent:
+    """Hold a descent as the map draws it, its end in the unit cube, and its loss there, None where it has none."""
+
+    run: Trajectory
+    end: list[float] | None
+    best: float | None
+
+
+@dataclass(frozen=True)
+class KeptSlice:
+    """Say where a plane is kept as a slice, in which files, and which command makes it again."""
+
+    folder: str
+    files: list[str]
+    command: str
+
+
 class Exploration:
     """Sample the plane that is looked at, coarse to fine, in a thread of its own, which does all else between tiles.
 
@@ -81,11 +115,11 @@ class Exploration:
         """Begin to look along two parameters through the centre of the box. Raises ValueError where there are none."""
         if env.space.dim < 2:
             raise ValueError(f"an exploration takes two parameters and more; {env.name} has one")
-        first, second = (env.space.index(one) for one in dims)
-        if first == second:
+        numbers = tuple(env.space.index(one) for one in dims)
+        if len(numbers) != 2 or numbers[0] == numbers[1]:
             raise ValueError(f"an exploration varies two different parameters; got {', '.join(map(str, dims))}")
         self.env, self.command, self.root = env, command, root
-        self.look = Look((first, second), tuple([0.5] * env.space.dim))
+        self.look = Look(numbers, tuple([0.5] * env.space.dim))
         self.seen = Seen(0, 0, SIDE**2)
         self._tasks = SimpleQueue[tuple[Callable[[], Any], Future[Any]]]()
         self._changed, self._closed, self._descents = Condition(), False, 0
@@ -119,37 +153,26 @@ class Exploration:
             self._changed.wait_for(lambda: self._closed or self.seen.number != number, PATIENCE)
             return self.seen
 
-    def film(self, at: Sequence[float]) -> dict[str, Any]:
-        """Film the episode at a point of the unit cube: links that hold a film and a picture, and the loss."""
-        from .report_page import film_links
+    def film(self, at: Sequence[float]) -> Film:
+        """Film the episode at a point of the unit cube."""
+        return self._do(lambda: self._film(at))
 
-        def task() -> dict[str, Any]:
-            x = self._point(at)
-            found = evaluate(self.env, x[None], grad=False)
-            links = film_links(self.env, x)
-            said = "" if links else f"{self.env.name} has no episodes to draw"
-            mp4, webp = links or (None, None)
-            loss, status = float(found.loss[0]), Status(int(found.status[0])).name
-            return {"loss": loss, "status": status, "mp4": mp4, "webp": webp, "said": said}
-
-        return dict(to_json(self._do(task)))
-
-    def descend(self, at: Sequence[float], *, everywhere: bool) -> dict[str, Any]:
-        """Descend by L-BFGS-B over the two parameters shown, or over all: a run for the map, and where it ends.
+    def descend(self, at: Sequence[float], *, everywhere: bool) -> Descent:
+        """Descend by L-BFGS-B over the two parameters shown, or over all.
 
         Raises ValueError where there is no gradient.
         """
         if not self.env.has_gradient:
             raise ValueError(f"{self.env.name} has no gradient to descend along")
-        return dict(to_json(self._do(lambda: self._descend(np.array(at), everywhere))))
+        return self._do(lambda: self._descend(np.array(at), everywhere))
 
-    def keep(self) -> dict[str, Any]:
-        """Keep the plane as a slice on disk: its folder, its files, and the command that makes it again."""
-        return dict(to_json(self._do(self._keep)))
+    def keep(self) -> KeptSlice:
+        """Keep the plane as a slice on disk."""
+        return self._do(self._keep)
 
-    def _do(self, task: Callable[[], Any]) -> Any:
+    def _do(self, task: Callable[[], Result]) -> Result:
         """Let the thread do something between two tiles, and return what comes of it."""
-        promised = Future[Any]()
+        promised = Future[Result]()
         self._tasks.put((task, promised))
         with self._changed:
             self._changed.notify_all()
@@ -189,8 +212,7 @@ class Exploration:
                 promised.set_exception(error)
 
     def _sample(self, look: Look) -> None:
-        plane, grad = self.plane(look), self.env.has_gradient
-        store = SliceStore.in_memory(plane, self.env.space, **describe(self.env), grad=grad)
+        store = self._store(look, grad=self.env.has_gradient)
 
         def follow(progress: Progress) -> None:
             finer = progress.level_complete and progress.done < progress.total
@@ -200,7 +222,7 @@ class Exploration:
             if self._closed or self.look != look:
                 raise _MovedError
 
-        whole = sample(self.env, plane, store, gradients=int(grad), progress=follow)
+        whole = sample(self.env, store.plane, store, gradients=int(store.grad), progress=follow)
         raised = int((whole["status"] == Status.ERROR).sum())
         self._show(look, SIDE**2, whole, complete=True, error=describe_errors(raised, store.error))
 
@@ -223,13 +245,26 @@ class Exploration:
         """Return what the map draws of a picture, or of a plane of which nothing is known yet."""
         return read_off_nodes(self._empty() if seen.slice is None else seen.slice, growing=True)
 
+    def _store(self, look: Look, *, grad: bool) -> SliceStore:
+        return SliceStore.in_memory(self.plane(look), self.env.space, **describe(self.env), grad=grad)
+
     def _empty(self) -> xr.Dataset:
-        return SliceStore.in_memory(self.plane(self.look), self.env.space, **describe(self.env), grad=False).dataset()
+        return self._store(self.look, grad=False).dataset()
 
     def _point(self, at: Sequence[float]) -> Float[Tensor, " dim"]:
         return self.env.space.from_unit(torch.tensor(at, dtype=torch.float64))
 
-    def _descend(self, at: NDArray[np.float64], everywhere: bool) -> dict[str, Any]:
+    def _film(self, at: Sequence[float]) -> Film:
+        from .report_page import film_links
+
+        x = self._point(at)
+        found = evaluate(self.env, x[None], grad=False)
+        links = film_links(self.env, x)
+        mp4, webp = links or (None, None)
+        said = "" if links else f"{self.env.name} has no episodes to draw"
+        return Film(float(found.loss[0]), Status(int(found.status[0])).name, mp4, webp, said)
+
+    def _descend(self, at: NDArray[np.float64], everywhere: bool) -> Descent:
         from scipy.optimize import minimize
 
         from ..optim.base import Kind
@@ -257,20 +292,19 @@ class Exploration:
             minimize(loss_of, at[free], jac=True, method="L-BFGS-B", bounds=[(0.0, 1.0)] * len(free))
         return self._laid(run.dataset(), everywhere)
 
-    def _laid(self, run: xr.Dataset, everywhere: bool) -> dict[str, Any]:
+    def _laid(self, run: xr.Dataset, everywhere: bool) -> Descent:
         """Return a descent as the map draws it, and where it ends."""
         self._descents += 1
         over = "all parameters" if everywhere else "the two shown"
         named = run.assign_attrs(method="l-bfgs-b", seed=self._descents, fidelity=self.env.fidelity.name)
         (laid,) = lay_runs(self._empty(), [named])
-        label = f"descent {self._descents} over {over}"
+        laid = replace(laid, label=f"descent {self._descents} over {over}")
         if laid.best is None:
-            return {"run": replace(laid, label=label), "end": None, "best": None}
-        x = torch.from_numpy(run["x"].to_numpy()[int(np.nanargmin(run["loss"].to_numpy()))].copy())
-        end = self.env.space.to_unit(x).clamp(0, 1).tolist()
-        return {"run": replace(laid, label=label), "end": end, "best": laid.best}
+            return Descent(laid, None, None)
+        x, _ = best_point([run])
+        return Descent(laid, self.env.space.to_unit(x).clamp(0, 1).tolist(), laid.best)
 
-    def _keep(self) -> dict[str, Any]:
+    def _keep(self) -> KeptSlice:
         from .slice import SliceJob
         from .watch import Watch
 
@@ -281,7 +315,7 @@ class Exploration:
             self.env, self.plane(look), command=command, root=self.root, gradients=int(self.env.has_gradient)
         )
         summary = job.run(Watch())
-        return {"folder": str(job.folder), "files": summary.files, "command": command}
+        return KeptSlice(str(job.folder), summary.files, command)
 
     def _name_point(self, look: Look) -> str:
         """Return what the command line calls the point: center, or a file of numbers, which is written here."""

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import json
 import secrets
+from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 from http import HTTPStatus
 from threading import Thread
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
+from ..landscapes.convert import to_json
 from ..landscapes.draw.loopback import LoopbackHandler, LoopbackServer
-from ..landscapes.draw.pages.explore import as_text, explore_page
+from ..landscapes.draw.pages.explore import explore_page
 from .explore import Exploration, Look
 
 LARGEST = 4_000_000  # bytes of a question
@@ -64,22 +67,25 @@ class Explorer:
             look={"dims": look.dims, "at": look.at}, gradients=env.has_gradient,
         )  # fmt: skip
 
-    def answer(self, question: str, asked: dict[str, Any]) -> dict[str, Any]:
-        """Answer the page. Raises ValueError for what it cannot ask, and KeyError for a question that there is not."""
+    def answer(self, question: str, asked: Mapping[str, Any]) -> Any:
+        """Answer the page, in plain JSON.
+
+        Raises ValueError for what it cannot ask, and KeyError for a question that there is not.
+        """
         exploration = self.exploration
         if question == "look":
             exploration.turn(Look((int(asked["dims"][0]), int(asked["dims"][1])), tuple(map(float, asked["at"]))))
             return {}
         if question == "seen":
             seen = exploration.wait(int(asked["number"]))
-            known = {"number": seen.number, "done": seen.done, "total": seen.total, "complete": seen.complete}
-            return {**known, "error": seen.error, "slice": exploration.nodes(seen) if seen.slice is not None else None}
+            nodes = None if seen.slice is None else exploration.nodes(seen)
+            return {**to_json(replace(seen, slice=None)), "slice": nodes}
         if question == "film":
-            return exploration.film(asked["at"])
+            return to_json(exploration.film(asked["at"]))
         if question == "descend":
-            return exploration.descend(asked["at"], everywhere=bool(asked["everywhere"]))
+            return to_json(exploration.descend(asked["at"], everywhere=bool(asked["everywhere"])))
         if question == "keep":
-            return exploration.keep()
+            return to_json(exploration.keep())
         raise KeyError(question)
 
     def _repr_html_(self) -> str:
@@ -120,7 +126,7 @@ class ExplorerHandler(LoopbackHandler):
             found, status = {"error": f"the explorer has no such question: {self.path}"}, HTTPStatus.BAD_REQUEST
         except Exception as error:  # of a simulator, which may raise anything: the page says it
             found, status = {"error": f"{type(error).__name__}: {error}"}, HTTPStatus.BAD_REQUEST
-        self._send(status, as_text(found), "application/json")
+        self._send(status, json.dumps(found).encode(), "application/json")
 
     def _is_known(self, token: str) -> bool:
         if secrets.compare_digest(token.encode(), self.explorer.token.encode()):

@@ -5,7 +5,6 @@ python -m docs.pages.hero     # simulates three episodes: some minutes of two co
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 import gradscape as gs
-from gradscape.gallery.files import DATA
+from gradscape.gallery.files import DATA, EPISODES
+from gradscape.gallery.records import read_nodes
 from gradscape.landscapes.draw import style
 from gradscape.landscapes.draw.figures.contour import slopes
 from gradscape.landscapes.draw.film import picture
@@ -28,7 +28,6 @@ from gradscape.landscapes.storage.store import open_slice
 FIGURE, PLACE = "fluid-6-8", Path(__file__).parents[1] / "hero.webp"
 ORDER = ("highest loss", "median loss", "lowest loss")
 HEIGHT, DPI = 360, 80  # of the film [pixels]
-UNIT = 0.2  # what a parameter of the ladle is in [m/s], unless an option says otherwise
 EVERY = 8  # samples from arrow to arrow
 FRAMES, RATE, REST = 36, 12, 10  # of an episode, a second, and that its end stays
 
@@ -48,22 +47,21 @@ def whole() -> Iterator[NDArray[np.uint8]]:
     dataset = open_slice(folder)
     plane, identity = plane_of(dataset), stored_identity(dataset)
     env = gs.make(identity["objective"], fidelity=identity["fidelity"], device="cpu")
-    nodes = {one["why"]: one for one in json.loads((folder / "episodes.json").read_text())}
+    nodes = {one.why: one for one in read_nodes(folder / EPISODES)}
     for why in ORDER:
         node = nodes[why]
-        place = torch.stack([axis[node[name]] for axis, name in zip(plane.axes(), ("column", "row"), strict=True)])
+        place = torch.stack([axis[at] for axis, at in zip(plane.axes(), (node.column, node.row), strict=True)])
         episode = env.episode(plane.lift(place[None])[0])
         shown = list(frames(episode, pick_frames(episode, FRAMES), height=HEIGHT))
-        left = draw_map(dataset, place.tolist(), f"{why}: {node['loss']:.3f} m")
+        left = draw_map(dataset, place.tolist(), f"{why}: {node.loss:.3f} m", vars(env.options)["speed"])
         for frame in [*shown, *[shown[-1]] * REST]:
             yield np.concatenate([left, np.ascontiguousarray(frame[: len(left)])], axis=1)
 
 
-def draw_map(dataset: Any, place: list[float], said: str) -> NDArray[np.uint8]:
-    """Draw the losses and the directions of steepest descent, with the node."""
+def draw_map(dataset: Any, place: list[float], said: str, speed: float) -> NDArray[np.uint8]:
+    """Draw the losses and the directions of steepest descent, with the node; a parameter of 1 is a `speed` [m/s]."""
     figure = Figure(figsize=(1.3 * HEIGHT / DPI, HEIGHT / DPI), dpi=DPI, layout="constrained")
     ax = figure.subplots()
-    speed = stored_identity(dataset)["options"].get("speed", UNIT)
     u, v = (speed * dataset[name].to_numpy() for name in ("u", "v"))
     mesh = ax.pcolormesh(u, v, dataset["loss"].to_numpy(), cmap=style.LOSS_MAP, shading="nearest")
     figure.colorbar(mesh, ax=ax, label="loss [m]")

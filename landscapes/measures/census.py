@@ -114,7 +114,8 @@ class CensusDesign:
         if space.dim < 2:
             raise ValueError("a census takes two parameters and more; got one")
         generator = np.random.default_rng(seed)
-        count = max(1, slices // CUTS)
+        many = max(1, slices // CUTS)
+        count = max(many, min(CUTS, slices))
         if along == RANDOM:
             frames = [orthonormal(generator, space.dim).tolist() for _ in range(count)]
             cuts = [PlaneSpec(None, tuple(map(tuple, frame))) for frame in frames]
@@ -122,7 +123,7 @@ class CensusDesign:
             every = list(combinations(range(space.dim), 2))
             cuts = [PlaneSpec(every[at]) for at in sorted(generator.permutation(len(every))[:count])]
         only = along == PAIRS and space.dim == 2
-        bases = space.from_unit(torch.from_numpy(generator.random((1 if only else count, space.dim))))
+        bases = space.from_unit(torch.from_numpy(generator.random((1 if only else many, space.dim))))
         return cls(space, bases, tuple(cuts), resolution, gradients)
 
     @property

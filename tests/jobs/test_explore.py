@@ -69,30 +69,30 @@ def test_who_moves_sees_the_plane_through_the_new_point(exploration: Exploration
 def test_a_descent_ends_in_the_minimum_of_what_it_may_move(exploration: Exploration, everywhere: bool) -> None:
     finished(exploration)
     found = exploration.descend([0.1, 0.9, 0.25], everywhere=everywhere)
-    assert found["best"] == pytest.approx(0.0 if everywhere else 4.0, abs=1e-6)
-    assert found["end"] == pytest.approx([0.5, 4 / 6, 0.75 if everywhere else 0.25], abs=1e-3)
-    assert found["run"]["episodes"] < 60
-    assert found["run"]["label"] == f"descent 1 over {'all parameters' if everywhere else 'the two shown'}"
+    assert found.best == pytest.approx(0.0 if everywhere else 4.0, abs=1e-6)
+    assert found.end == pytest.approx([0.5, 4 / 6, 0.75 if everywhere else 0.25], abs=1e-3)
+    assert found.run.episodes < 60
+    assert found.run.label == f"descent 1 over {'all parameters' if everywhere else 'the two shown'}"
 
 
 def test_a_function_has_no_film_and_says_so(exploration: Exploration) -> None:
-    assert exploration.film([0.5, 0.5, 0.5])["said"] == "valley has no episodes to draw"
+    assert exploration.film([0.5, 0.5, 0.5]).said == "valley has no episodes to draw"
 
 
 def test_what_is_kept_is_a_slice_and_its_command_makes_it_again(exploration: Exploration, tmp_path: Path) -> None:
     exploration.turn(Look((0, 1), (0.5, 0.5, 0.125)))
     kept = exploration.keep()
-    words = shlex.split(kept["command"])
+    words = shlex.split(kept.command)
     assert words[:5] == ["landscape", "slice", "my.py:valley", "--set", "k=3"]
     assert "--port" not in words
-    dataset = gs.open_slice(kept["folder"]).data
+    dataset = gs.open_slice(kept.folder).data
     through = Path(words[words.index("--through") + 1])
     assert np.loadtxt(through)[2] == 0.5
     assert words[-2:] == ["--resolution", str(SIDE)]
     assert dataset["loss"].shape == (SIDE, SIDE)
-    assert (Path(kept["folder"]) / "landscape.png").exists()
+    assert (Path(kept.folder) / "landscape.png").exists()
     exploration.turn(Look((0, 1), (0.1, 0.2, 0.5)))
-    assert "--through center" in exploration.keep()["command"]
+    assert "--through center" in exploration.keep().command
 
 
 def test_an_error_of_the_simulator_is_said_and_another_look_goes_on(tmp_path: Path) -> None:

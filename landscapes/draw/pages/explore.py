@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
+from ...space import LOG10
 from .rendering import STATIC, STYLE, scripts, templates
 from .report import inert
 
@@ -24,7 +24,7 @@ def explore_page(
     """
     values = [space.to_values(end).tolist() for end in (space.lower, space.upper)]
     parameters = [
-        {"name": name, "unit": unit, "low": low, "high": high, "logarithmic": scale == "log10"}
+        {"name": name, "unit": unit, "low": low, "high": high, "logarithmic": scale == LOG10}
         for name, unit, low, high, scale in zip(space.names, space.units, *values, space.scales, strict=True)
     ]
     entry = {
@@ -41,8 +41,3 @@ def explore_page(
         style=(STATIC / STYLE).read_text(encoding="utf-8"),
         scripts=[(STATIC / name).read_text(encoding="utf-8") for name in (*scripts(2), SCRIPT)],
     )  # fmt: skip
-
-
-def as_text(value: Any) -> bytes:
-    """Return an answer to the page as JSON."""
-    return json.dumps(value, separators=(",", ":")).encode()

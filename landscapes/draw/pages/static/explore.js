@@ -127,7 +127,7 @@
     try {
       const film = await ask("film", { at: from });
       if (!same() || !film.mp4) return note(film.said);
-      const [column, row] = [Math.round(from[place_.dims[0]] * (columns - 1)), Math.round(from[place_.dims[1]] * (rows - 1))];
+      const [column, row] = at(index);
       SLICE.episodes = [{ ...film, row, column, why: "episode of the node" }];
       if (node !== index) return redraw();
       showEpisode();
