@@ -19,7 +19,7 @@ endif
 # A gallery that was built (`landscape gallery build`) becomes a part of the documentation.
 GALLERY ?= out/gallery
 
-.PHONY: demo test test-all test-nightly wheel docs setup setup-test setup-docs check clean
+.PHONY: demo test test-all test-nightly wheel archive docs setup setup-test setup-docs check clean
 
 demo: setup
 	$(BIN)/landscape slice fluid --dims 6 8 --resolution 14
@@ -43,6 +43,15 @@ test-nightly: setup-test
 # Builds the wheel, installs it with all it needs into an empty environment, and tries it there; tests borrow the rest.
 wheel: setup-test
 	INSTALL_DEPENDENCIES=1 $(BIN)/python -m pytest tests/test_wheel.py
+
+# The gallery's data as one file with its checksum, for an archive such as Zenodo. One commit always makes the same bytes.
+VERSION := $(shell sed -n 's/^__version__ = "\(.*\)"/\1/p' src/gradscape/__init__.py)
+DIST ?= dist
+DATA := gradscape-data-$(VERSION)
+archive:
+	mkdir -p "$(DIST)"
+	git archive --format=zip --prefix=$(DATA)/ --output="$(DIST)/$(DATA).zip" HEAD gallery/data LICENSE CITATION.cff
+	cd "$(DIST)" && sha256sum $(DATA).zip > $(DATA).zip.sha256
 
 check: setup-test
 	$(BIN)/ruff check .

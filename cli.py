@@ -1,4 +1,4 @@
-"""The command `landscape`, made of the functions of `api`: its verbs in the groups of its help, and how it ends."""
+"""The command `landscape`: verbs made from the functions of `api`, in the groups of its help, and exit codes."""
 
 from __future__ import annotations
 
@@ -95,14 +95,14 @@ WORDS = Parameter(negative_bool=(), negative_iterable=(), allow_repeating=True, 
 
 @dataclass(frozen=True)
 class Option:
-    """An argument or an option of a verb: what is typed for it, and what help says of it."""
+    """An argument or an option of a verb: its names on the command line, its help, its type and its default."""
 
     names: tuple[str, ...]
     help: str
     type: Any
     required: bool
     default: str
-    """What is taken where none is typed, empty where help does not say."""
+    """The default as help shows it, empty where help shows none."""
 
 
 @dataclass(frozen=True)
@@ -311,7 +311,7 @@ def main(arguments: list[str] | None = None) -> Any:
     except (MemoryError, RuntimeError) as error:
         code = _fail(_memory(error), 1)
     except KeyboardInterrupt as stop:
-        code = _stop(stop) or _fail("stopped before anything was computed; the same command begins again", STOPPED)
+        code = _stop(stop) or _fail("stopped before anything was computed; the same command starts again", STOPPED)
     sys.exit(code)
 
 
@@ -320,14 +320,14 @@ def _run(words: list[str]) -> Any:
     written = [words[:1], *([word.partition("=")[0]] for word in words[1:] if word.startswith("--"))]
     for (word,) in filter(None, written):
         if word in RENAMED:
-            raise ValueError(f"{word} is {RENAMED[word]} today")
+            raise ValueError(f"{word} is now {RENAMED[word]}")
     planned = words[:1] == ["plan"] and not set(words[1:2]) <= {"-h", "--help"}
     words = words[planned:]
     named = next(
         (name for group in GROUPS.values() for name in group if words[: len(name.split())] == name.split()), ""
     )
     if planned and not named:
-        raise ValueError(f"plan takes a verb and its words, such as: landscape plan slice {' '.join(words)}")
+        raise ValueError(f"plan takes a verb with its arguments, such as: landscape plan slice {' '.join(words)}")
     app = make_app([named] if named else (), planned=planned)
     how: Any = {"exit_on_error": False, "print_error": False, "result_action": "return_value"}
     if DIMS not in words:
@@ -358,18 +358,18 @@ def _stop(stop: BaseException) -> int:
     if not isinstance(stop, Stopped):
         return 0
     again = shlex.join(["landscape", *sys.argv[1:]])
-    then = "continues from there" if stop.kept else "begins again"
+    then = "continues from there" if stop.kept else "starts again"
     _say(f"stopped: {stop}; the same command {then}: {again}")
     return STOPPED
 
 
 def _usage(error: CycloptsError) -> str:
-    """Return what is wrong with a command's words, and where it is said what the command takes."""
+    """Return what is wrong with a command's words, and the help that lists what it takes."""
     chain = " ".join(["landscape", *(error.command_chain or ())])
     said = " ".join(str(error).split()).rstrip(".")
     if isinstance(error, UnusedCliTokensError):
-        said = f"unexpected: {shlex.join(error.unused_tokens or ())}"
-    return f"{said} (`{chain} --help` says what it takes)"
+        said = f"unexpected words: {shlex.join(error.unused_tokens or ())}"
+    return f"{said} (see `{chain} --help`)"
 
 
 def _system(error: OSError) -> str:
@@ -378,12 +378,13 @@ def _system(error: OSError) -> str:
 
     if not isinstance(error, DiskFullError) and is_full(error):
         return (
-            f"the disk is full ({error}); each file that is there is whole: make room, and give the same command again"
+            f"the disk is full ({error}), but every finished file is complete: free some space and run the same "
+            "command again"
         )
     if error.filename is None or error.strerror is None:
         return str(error)
     name = os.fsdecode(error.filename2 or error.filename)
-    return f"{name if len(name) < LONG_PATH else name[:LONG_PATH] + '...'}: {error.strerror.lower()}; give another path"
+    return f"{name if len(name) < LONG_PATH else name[:LONG_PATH] + '...'}: {error.strerror.lower()}; use another path"
 
 
 def _memory(error: Exception) -> str:
@@ -392,7 +393,7 @@ def _memory(error: Exception) -> str:
 
     if not is_out_of_memory(error):
         raise error
-    said = str(error) or "the host has no more"
+    said = str(error) or "the host has none left"
     return said if ADVICE in said else f"out of memory: {said}; {ADVICE}"
 
 

@@ -1,1 +1,1 @@
-"""The front door for Python: the functions that the verbs of the command call, too."""
+"""The public functions in Python, which the verbs of the command also call."""

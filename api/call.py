@@ -29,9 +29,9 @@ RENAMED = {  # keywords of earlier versions, and today's
 
 @dataclass(frozen=True)
 class Call:
-    """Hold how a result is made again, and what shows the progress of making it.
+    """Record the command that makes a result again, and the watch that shows its progress.
 
-    A function of one's own is sampled in memory unless its results are to be kept `on_disk`.
+    Your own function is sampled in memory unless its results go `on_disk`.
     """
 
     command: str
@@ -66,7 +66,7 @@ def verb(function: Callable[Given, Result]) -> Callable[Given, Result]:
     @wraps(function)
     def call(*given: Given.args, **named: Given.kwargs) -> Result:
         if old := next((name for name in named if name in RENAMED), None):
-            raise ValueError(f"{function.__name__} takes {RENAMED[old]}= today; got {old}=")
+            raise ValueError(f"{function.__name__} now takes {RENAMED[old]}=; got {old}=")
         _check_numbers(function, given, named)
         if _CURRENT.get() is not None:
             return function(*given, **named)
@@ -98,10 +98,10 @@ def _check_numbers(function: Callable[..., object], given: tuple[object, ...], n
 
 
 def _wanted(name: str, value: float, hint: Any) -> str:
-    """Say what number a parameter takes by its type and the limits that stand with it, empty where `value` is one."""
+    """Describe the number that a parameter takes, by its type and limits; empty if `value` is one."""
     kind, *marks = get_args(hint) if hasattr(hint, "__metadata__") else (hint,)
     if int in (kind, *get_args(kind)) and isinstance(value, float) and not value.is_integer():
-        return f"a whole number as {name}"
+        return f"a whole number for {name}"
     for mark in (one for one in marks if isinstance(one, Parameter)):
         for limit in (one for one in cast("tuple[object, ...]", mark.validator) if isinstance(one, Number)):
             try:

@@ -1,4 +1,4 @@
-"""`gs.compare`: hold two slices of one plane against each other."""
+"""`gs.compare`: compare two slices of one plane."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ def compare(
 ) -> SliceComparison:
     """Compare two slices of the same plane: losses, their order, gradients and the largest differences.
 
-    They may differ in fidelity, engine, options, version or environment, if the environments have the same parameters
-    and the same unit of the loss. The folder then holds compare.json and compare.png, and slice B if it was sampled
-    here. Stop at any time: the same command continues from there.
+    The slices can differ in fidelity, engine, options, version or environment. Environments must have the same
+    parameters and the same unit of the loss. The folder then contains compare.json and compare.png, and slice B if it
+    was sampled here. Stop at any time: the same command continues from there.
 
-    Raises ValueError for slices that cannot be compared, for what the scene does not have, and where the folder holds
-    something else or another comparison; Stopped where it is interrupted.
+    Raises ValueError if the slices cannot be compared, if the environment does not support a keyword, or if the folder
+    contains something else or another comparison. Raises Stopped when it is interrupted.
 
     Example: landscape compare out/my-slice bounce --fidelity standard
 
@@ -60,7 +60,7 @@ def compare(
 
 
 def _is_scene(given: str | Path | Slice | Scene) -> bool:
-    """Say whether it is something to sample, and no slice that is there."""
+    """Say whether it is something to sample, rather than an existing slice."""
     if isinstance(given, str):
         return not Path(given).exists()
     from ..landscapes.slice import Slice
@@ -75,6 +75,7 @@ def _second(given: str | Path | Slice | Scene, keywords: SceneKeywords) -> Slice
     if keywords:
         name = given if isinstance(given, str | Path) else "b"
         raise ValueError(
-            f"{', '.join(keywords)} are of an environment to sample; {name} is there already: leave them out"
+            f"compare takes {', '.join(keywords)} only if B is an environment to sample; {name} is a slice, so leave "
+            "them out"
         )
     return as_slice(given)

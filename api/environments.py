@@ -1,4 +1,4 @@
-"""`gs.list_envs`, and the verbs `envs` and `methods`: what there is to simulate, and to search with."""
+"""`gs.list_envs`, and the verbs `envs` and `methods`: the environments, and the optimisation methods."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ if TYPE_CHECKING:
 
 
 def list_envs() -> pd.DataFrame:
-    """Return every registered environment, a row each: name, dim, parameters with units, model, fidelities.
+    """Return a table of all registered environments: name, dim, parameters with units, model, fidelities.
 
-    Of those that other packages register, the class is imported for that.
+    This imports the environments that other packages register.
     """
     import pandas as pd
 
@@ -36,8 +36,9 @@ def list_envs() -> pd.DataFrame:
 def envs(name: Annotated[str | None, ARGUMENT] = None) -> Environment | list[Entry]:
     """List the environments, or describe one in full.
 
-    With NAME it shows what the environment models, its bounds, fidelities, engines, options and examples, and how
-    close its time step is to the stability limit, if `landscape study extremes` measured that. It writes no file.
+    With NAME it shows what the environment models, its bounds, fidelities, engines, options and examples. It also shows
+    how close the time step is to the stability limit, if `landscape study extremes` has measured that. It writes no
+    file.
 
     Example: landscape envs fluid
 

@@ -1,4 +1,4 @@
-"""`gs.explore`: look around in a landscape that is sampled meanwhile."""
+"""`gs.explore`: explore a landscape on a page that samples it meanwhile."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ def explore(
     browser: Annotated[bool, Parameter(negative="--no-browser")] = True,
     **keywords: Unpack[SceneKeywords],
 ) -> Explorer:
-    """Look around in a landscape, on a page of this machine that samples it meanwhile.
+    """Explore a landscape in a browser, on a local page that samples it while you look.
 
-    The page shows a plane through a point, coarse first and then finer. Choose the two parameters that vary, and move
-    the point by sliders or to a node of the map. A click on a node plays its episode, where the environment has some,
-    and draws a descent from there. What is shown can be kept as a slice in out/, with its picture and the command that
-    makes it again. Ctrl-C ends it; it writes nothing but what is kept.
+    The page shows a plane through a point, first coarse and then finer. You choose the two parameters that vary, and
+    move the point with sliders or to a node of the map. A click on a node draws a descent from there, and plays its
+    episode if the environment can draw one. You can save the plane as a slice in out/, with its picture and the command
+    that makes it again. Ctrl-C ends the page. It writes no other file.
 
-    Raises ValueError for what the scene does not have, and OSError for a port in use.
+    Raises ValueError if the environment does not support a keyword, and OSError if the port is in use.
 
     Example: landscape explore pinball-16 --dims 13 14
 
@@ -41,9 +41,9 @@ def explore(
     dims
         The two parameters that vary at first, by number or by name. The default is the first two.
     port
-        Port of the page on this machine; 0 takes a free one.
+        Port of the page on this machine. 0 picks a free one.
     browser
-        Open the page in this system's browser. Its address is printed in any case.
+        Open the page in the default browser. The address is always printed.
     """
     call = current()
     env = environment(scene, keywords, dims=dims)

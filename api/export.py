@@ -17,15 +17,15 @@ def export(
     what: Annotated[str | Path, ARGUMENT],
     *,
     to: Literal["csv", "parquet", "netcdf"] = "csv",
-    out: Annotated[str | Path | None, Parameter(help="File to write; by default it lies in the folder.")] = None,
+    out: Annotated[str | Path | None, Parameter(help="File to write. The default is in the same folder.")] = None,
     force: Force = False,
 ) -> Path:
     """Write a slice or a run as CSV, Parquet or netCDF, for other programs.
 
-    A table has a row per sample or episode, and columns with units. netCDF holds the arrays with names, units and
-    provenance. The default file is slice.csv or run.csv in the folder. Returns the file.
+    A table has a row per sample or episode, and columns with units. netCDF stores the arrays with names, units and
+    provenance. The default file is slice.csv or run.csv in the folder. In Python it returns the path of the file.
 
-    Raises ValueError where there is no slice and no run, and where the file exists already.
+    Raises ValueError if there is no slice or run, or if the file exists already.
 
     Example: landscape export out/my-run --to parquet
 
@@ -38,7 +38,7 @@ def export(
     """
     from ..landscapes.storage.paths import refuse_missing
 
-    refuse_missing(str(what), "slice and no run")
+    refuse_missing(str(what), "slice or run")
     from ..jobs.export import export as write
 
     written = write(Path(what), to, out=as_path(out), force=force)

@@ -1,4 +1,4 @@
-"""The verbs of `landscape gallery`: make what its figures lack, list them, build and serve the site."""
+"""The verbs of `landscape gallery`: compute its figures, list them, build and serve the site."""
 
 from __future__ import annotations
 
@@ -31,23 +31,23 @@ def compute(
     scheduler: Scheduler = None,
     data: Data = None,
 ) -> Computed:
-    """Compute what is missing of the figures, after an estimate of its cost.
+    """Compute the missing data of the figures, after an estimate of the cost.
 
-    The data folder then holds a folder per figure: slice.zarr.zip at the fidelity of the figure, companions.json (the
-    same slice through other points), episode-*.mp4 at some of its points, sweep.mp4 at draft fidelity, report.json
-    and measures.json. runs/ holds searches at the fidelity of the figures, studies/ the accuracy and time of each
-    environment, league/ races of nine methods. Stop at any time: the same command continues from there. A figure that
-    fails does not stop the others; the exit code is then 1.
+    The data folder then contains a folder per figure: slice.zarr.zip at the fidelity of the figure, companions.json
+    (the same slice through other points), episode-*.mp4 at some of its points, sweep.mp4 at draft fidelity, report.json
+    and measures.json. It also contains searches at the fidelity of the figures (runs/), the accuracy and time of each
+    environment (studies/) and races of nine methods (league/). Stop at any time: the same command continues from there.
+    A figure that fails does not stop the others, and the exit code is then 1.
 
     Example: landscape gallery compute --only fluid --part slices --device cuda
 
     Parameters
     ----------
     only
-        A figure's id or an environment. It may be repeated; the default is all figures.
+        A figure's id or an environment. It can be repeated. The default is all figures.
     part
         Part to compute: slices, companions (the same slice through other points), sweeps, episodes, searches, reports,
-        fidelities, league or league-slices. It may be repeated; the default is all but the league, which takes longest.
+        fidelities, league or league-slices. It can be repeated. The default is all except league, which takes longest.
     fidelity
         Accuracy of the simulation: draft, standard or reference. The default is that of each figure.
     resolution
@@ -65,7 +65,8 @@ def compute(
     if failed:
         watch.note(
             f"{len(failed)} of {len(figures)} figures failed: {', '.join(failed)}\n"
-            f"to sample one again where other settings or another model began it, delete its folder in {root}"
+            f"if a figure was begun with other settings or another model, delete its folder in {root} to sample it "
+            "again"
         )
     return Computed(root, len(figures), tuple(failed))
 
@@ -74,11 +75,11 @@ def compute(
 def list_(
     folder: Annotated[str | Path | None, ARGUMENT] = None, *, where: str | None = None, data: Data = None
 ) -> FigureList | SliceTable:
-    """List the figures, and how much of each is computed; or the slices in a folder, by what their summaries say.
+    """List the figures and how much of each is computed, or the slices in a folder.
 
-    It writes no file but a table of the slices in that folder, .slices.sqlite, which may be deleted.
+    For a folder it reads the summaries of the slices. It writes one file there, .slices.sqlite, which you can delete.
 
-    Raises ValueError where there is no such folder, and for what is no condition.
+    Raises ValueError if there is no such folder, or if `where` is not a valid condition.
 
     Example: landscape gallery list out --where "env = 'branin' and lowest < 0.5"
 
@@ -87,15 +88,15 @@ def list_(
     folder
         A folder with slices, at any depth, to list instead of the figures.
     where
-        List only slices for which this condition holds: one of SQLite over the columns that `landscape gallery list
-        FOLDER --json` names.
+        List only slices that meet this SQLite condition over the columns that `landscape gallery list FOLDER --json`
+        prints.
     """
     if folder is not None:
         from ..jobs.slices import find_slices
 
         return find_slices(Path(folder), where)
     if where is not None:
-        raise ValueError("--where chooses among the slices in a folder; give that folder, too")
+        raise ValueError("--where selects slices in a folder; give that folder, too")
     from ..gallery.figures import read_figures
     from ..gallery.files import data_folder
     from ..gallery.parts import FigureList, SlicePart
@@ -108,7 +109,8 @@ def list_(
 def build(*, data: Data = None, out: Site = "out/gallery") -> None:
     """Build the site from the computed data, without simulating.
 
-    The folder then holds the whole site: index.html opens it without a network, manifest.json lists it for programs.
+    The folder then contains the whole site: index.html opens it without a network, and manifest.json lists its content
+    for programs.
 
     Example: landscape gallery build --out site
     """
@@ -123,7 +125,7 @@ def build(*, data: Data = None, out: Site = "out/gallery") -> None:
     from ..landscapes.storage.files import until_full
 
     watch, start = current().watch, time.perf_counter()
-    with until_full(lambda: f"{out} is as it was before"):
+    with until_full(lambda: f"{out} is unchanged"):
         manifest = site.build_site(
             read_figures(),
             data_folder(data),

@@ -9,7 +9,7 @@ from .call import verb
 
 @dataclass(frozen=True)
 class Info:
-    """Say what is installed: versions by package, and the devices that are here."""
+    """Record the installed versions by package, and the devices of this machine."""
 
     gradscape: str
     python: str

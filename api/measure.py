@@ -1,4 +1,4 @@
-"""What a scene is like, costs and needs: `gs.check`, `card`, `pairs`, `hessian`, `remedy`, `census`, `bench`."""
+"""Measures of a scene: `gs.check`, `card`, `pairs`, `hessian`, `remedy`, `census`, `bench`."""
 
 from __future__ import annotations
 
@@ -43,14 +43,14 @@ if TYPE_CHECKING:
 OtherScenes = Annotated[
     Any,
     ARGUMENT,
-    Parameter(help="Further environments, each as above; FILE.py:* stands for all that are in a file of your own."),
+    Parameter(help="Further environments, each as above. FILE.py:* means all simulators in your own file."),
 ]
 Junit = Annotated[
     str | Path | None,
-    Parameter(help="Also write the findings to this file, in the XML of JUnit that services for tests read."),
+    Parameter(help="Also write the findings to this file as JUnit XML, which CI services read."),
 ]
 CheckFolder = Annotated[
-    str | Path | None, Parameter(help="Folder of the results of one environment; without it they are not kept.")
+    str | Path | None, Parameter(help="Folder for the results of one environment. Without it nothing is saved.")
 ]
 
 
@@ -96,35 +96,36 @@ def check(
     force: Force = False,
     **keywords: Unpack[SceneKeywords],
 ) -> CheckReport | CheckReports:
-    """Check that the gradients of an environment are right: where they are not, why, and what to do.
+    """Check the gradients of an environment: where they are wrong, why, and what to do.
 
-    It holds gradients against differences over many steps at random points, at special places and by every parameter,
-    and says at which share of the box they are wrong, with its interval, in which region, by which parameters and from
-    which cause. It also checks shapes, refusals, batches, determinism, growth with the horizon, corners of the box and
-    beyond, long time steps, materials, horizons and precision. A warning is no failure: the gradient is right, but
-    useless over an optimiser's step. The exit code is 0 if the environment passes, else 1. Of several environments
-    there is a line and a verdict for each, and the exit code is 1 where one fails or cannot be checked.
+    It compares gradients with finite differences over many steps, at random points, at special points and for every
+    parameter. It reports the share of the box where they are wrong, with its interval, the region, the parameters and
+    the cause. It also checks shapes, refused input, batches, determinism, growth with the horizon, points at the
+    corners of the box and outside it, long time steps, materials, horizons and precision. A warning is not a failure:
+    the gradient is right, but useless over an optimiser's step. The exit code is 0 if the environment passes, else 1.
+    For several environments it prints a line and a verdict each. The exit code is then 1 if one fails or cannot be
+    checked.
 
-    It writes no file but those that --junit and --out name. The folder then holds check.json and check.png: over which
-    steps gradients say how the loss changes.
+    It writes only the files that --junit and --out name. The folder then contains check.json and check.png, which shows
+    over which steps gradients predict the change of the loss.
 
-    Raises ValueError for what the scene does not have, TooLargeError for more points than there is memory for,
-    StoreMismatchError where the folder holds another check; Stopped where it is interrupted.
+    Raises ValueError if the environment does not support a keyword, TooLargeError if the points do not fit in memory,
+    and StoreMismatchError if the folder contains another check. Raises Stopped when it is interrupted.
 
     Example: landscape check bounce
 
     Parameters
     ----------
     power
-        Share of the box, as 5% or 0.05: a defect that fills it is found with 95 %. A smaller one takes more points (59
-        at 5 %, 299 at 1 %, 14 at 20 %).
+        Share of the box, such as 5% or 0.05. A defect that fills this share is found with a probability of 95 %. A
+        smaller share takes more points (59 at 5 %, 299 at 1 %, 14 at 20 %).
     jobs
-        Number of processes that check environments, one each at a time. In Python, more than one needs a script whose
-        own work stands under `if __name__ == '__main__':`.
+        Number of processes. Each checks one environment after another. In Python, more than one requires a script whose
+        code is under `if __name__ == '__main__':`.
     """
     call, share, folder, prints = current(), as_power(power), as_path(out), as_widths(figure_width_mm)
     if prints and folder is None:
-        raise ValueError("--figure-width-mm is of a figure in a folder; give --out, too")
+        raise ValueError("--figure-width-mm writes a figure to a folder; give --out, too")
     names = [name for one in (scene, *others) for name in (names_in_file(one) if isinstance(one, str) else [one])]
     specs = [spec_of(name, keywords).resolve(call.watch) for name in names]
     from ..jobs.check import CheckJob
@@ -132,7 +133,9 @@ def check(
 
     found: CheckReport | CheckReports
     if (many := bool(others) or len(specs) > 1) and folder is not None:
-        raise ValueError(f"--out is the folder of one environment; got {len(specs)} environments")
+        raise ValueError(
+            f"--out takes the results of one environment; got {len(specs)} environments, so check each by itself"
+        )
     if many:
         found = whole = ChecksJob(specs, share, seed, jobs, call.command).run(call.watch)
     else:
@@ -156,22 +159,21 @@ def card(
 ) -> Card:
     """Check the gradients of several engines in the same scenes, and show their landscapes side by side.
 
-    Every installed engine, ours included, goes through the same `landscape check` and is sampled on one small plane.
-    The folder then holds card.html, a page of its own with a table and a panel for each engine, card.json, card.npz
-    (the slices) and card.png. The table says at which share of the points gradients are wrong, with its interval, the
-    cause, and, in scenes with a closed form, how far gradients are from that. All of it is measured, so another release
-    of an engine is measured again. Stop at any time: the same command continues with the next engine. The exit code is
-    always 0.
+    It runs the same `landscape check` on every installed engine, ours included, and samples each on one small plane.
+    The folder then contains card.html (a single page with a table and a panel for each engine), card.json, card.npz
+    (the slices) and card.png. The table gives the share of points where gradients are wrong, with its interval, and the
+    cause. In scenes with a closed form it also gives the error of gradients against that. A new release of an engine is
+    measured again. Stop at any time: the same command continues with the next engine. The exit code is always 0.
 
-    Raises ValueError for a scene that the card does not have, StoreMismatchError where the folder holds a card of other
-    versions; Stopped where it is interrupted.
+    Raises ValueError if the card does not have a scene, and StoreMismatchError if the folder contains a card of other
+    versions. Raises Stopped when it is interrupted.
 
     Example: landscape card --scene "flight"
 
     Parameters
     ----------
     scenes
-        A scene of the card, such as flight. It may be repeated; the default is all scenes.
+        A scene of the card, such as flight. It can be repeated. The default is all scenes.
     resolution
         Number of points along each axis of the small slices.
     """
@@ -197,19 +199,19 @@ def pairs(
 ) -> PairRanking:
     """Rank pairs of parameters by sensitivity, ruggedness and misleading gradients, to choose which to slice.
 
-    The folder then holds pairs.json (all pairs) and the evaluated episodes. Stop at any time: the same command
+    The folder then contains pairs.json (all pairs) and the evaluated episodes. Stop at any time: the same command
     continues from there.
 
-    Raises ValueError where the scene has one parameter, StoreMismatchError where the folder holds another study;
-    Stopped where it is interrupted.
+    Raises ValueError if the environment has only one parameter, and StoreMismatchError if the folder contains another
+    study. Raises Stopped when it is interrupted.
 
     Example: landscape pairs fluid
 
     Parameters
     ----------
     samples
-        Number of base points, of 1 + 5 x dim + 28 episodes each (fewer below 8 parameters). The default is 16, and down
-        to 4 with many parameters.
+        Number of base points. Each takes 1 + 5 x dim + 28 episodes, or fewer below 8 parameters. The default is 16,
+        falling to 4 with many parameters.
     """
     spec = spec_of(scene, keywords)
     from ..jobs.pairs import PairsJob
@@ -236,15 +238,15 @@ def hessian(
 ) -> Hessian:
     """Measure the Hessian of an environment at a point: eigenvalues with errors, trace, condition, negative curvature.
 
-    All is in box units: every parameter runs from 0 to 1 between its bounds. The Hessian is of central differences of
-    gradients, whose step is chosen, or of losses where there are no gradients, of up to 30 parameters. Of up to 100
-    parameters the whole matrix is computed; of more, the ends of the spectrum by ARPACK, and trace and density by
-    Lanczos' method from random probes. An eigenvalue whose error is larger than itself "cannot be told". The folder
-    then holds hessian.json, hessian.npz (eigenvalues, eigenvectors, density) and hessian.png. Stop at any time: the
-    same command continues from there.
+    All values are in box units: every parameter runs from 0 to 1 between its bounds. The Hessian comes from central
+    differences of gradients, with a step chosen automatically. Without gradients it comes from losses, for up to 30
+    parameters. With up to 100 parameters the whole matrix is computed. With more, ARPACK finds the ends of the
+    spectrum, and Lanczos' method estimates trace and density from random probes. The sign of an eigenvalue is "cannot
+    tell" if its error is larger than its size. The folder then contains hessian.json, hessian.npz (eigenvalues,
+    eigenvectors, density) and hessian.png. Stop at any time: the same command continues from there.
 
-    Raises ValueError for what the scene does not have, and where points fail that the Hessian needs; StoreMismatchError
-    where the folder holds another Hessian; Stopped where it is interrupted.
+    Raises ValueError if the environment does not support a keyword, or if points fail that the Hessian needs. Raises
+    StoreMismatchError if the folder contains another Hessian, and Stopped when it is interrupted.
 
     Example: landscape hessian rosenbrock --through center
 
@@ -252,11 +254,11 @@ def hessian(
     ----------
     through
         Point to measure at: center, random:SEED, example:NAME, best, best:RUN, a file of numbers, or a row of a table,
-        TABLE.csv:ROW. In Python also its numbers.
+        TABLE.csv:ROW. Python also takes the numbers themselves.
     eigenpairs
         Number of eigenvalues to examine at each end of the spectrum, with their directions.
     probes
-        Number of random directions that sample the spectrum of more than 100 parameters.
+        Number of random directions that sample the spectrum if there are more than 100 parameters.
     """
     spec = spec_of(scene, keywords)
     from ..jobs.hessian import HessianJob
@@ -274,7 +276,7 @@ def remedy(
     scene: Scene,
     *,
     remedies: Annotated[
-        Names, Parameter(help="A remedy to try, as --remedy takes it. It may be repeated. The default is all.")
+        Names, Parameter(help="A remedy to try, written as for --remedy. It can be repeated. The default is all.")
     ] = (),
     dims: Annotated[Dims, Parameter(help="Parameters of the plane that is drawn. The default is the first two.")] = (),
     starts: Annotated[int, at_least(6)] = 32,
@@ -285,15 +287,16 @@ def remedy(
     force: Force = False,
     **keywords: Unpack[SceneKeywords],
 ) -> RemedyStudy:
-    """Find out which remedy helps a search: descents from the same starts at the same cost, with each and without.
+    """Find out which remedy helps a search, by descents from the same starts at the same cost.
 
     A remedy is smoothing, clipping, an average over numerical replicas, another scale of parameters, a shorter episode
-    or softer contact; docs/remedies.md explains them. L-BFGS-B descends from random starts. What it finds is evaluated
-    without the remedy, and compared start by start. The folder then holds remedy.json, remedy.npz (losses on a plane)
-    and remedy.png. Stop at any time: the same command continues with the next remedy.
+    or softer contact. docs/remedies.md explains them. L-BFGS-B descends from random starts, with each remedy and
+    without. The points it finds are evaluated without the remedy, and compared start by start. The folder then contains
+    remedy.json, remedy.npz (losses on a plane) and remedy.png. Stop at any time: the same command continues with the
+    next remedy.
 
-    Raises ValueError for what the scene does not have; StoreMismatchError where the folder holds another study; Stopped
-    where it is interrupted.
+    Raises ValueError if the environment does not support a keyword, and StoreMismatchError if the folder contains
+    another study. Raises Stopped when it is interrupted.
 
     Example: landscape remedy branin --starts 8 --budget 48
 
@@ -302,8 +305,8 @@ def remedy(
     starts
         Number of random starts.
     budget
-        Cost of each descent, as a number of episodes with gradient. A remedy that takes several episodes a point gets
-        fewer points.
+        Cost of each descent, in episodes with gradient. A remedy that takes several episodes per point gets fewer
+        points.
     """
     spec = spec_of(scene, keywords)
     from ..jobs.remedy import RemedyJob
@@ -335,13 +338,14 @@ def census(
 ) -> Census:
     """Measure many random slices of an environment, and report what they have in common.
 
-    A census measures each slice as `landscape report` does. It says to which fraction of the slices each word applies,
-    how each measure is distributed, and how much of its variance comes from the point, the orientation, the resolution
-    and the fidelity. The folder then holds census.json, census.npz (the losses, in half precision from 0 to 1 between
-    `low` and `high` of each slice) and census.png. Stop at any time: the same command continues with the next slice.
+    A census measures each slice as `landscape report` does. It reports the fraction of slices that each word fits, and
+    how each measure is distributed. It also reports how much of a measure's variance comes from the point, the
+    orientation, the resolution and the fidelity. The folder then contains census.json, census.npz (losses in half
+    precision, scaled to 0 to 1 between `low` and `high` of each slice) and census.png. Stop at any time: the same
+    command continues with the next slice.
 
-    Raises ValueError where the scene has one parameter, StoreMismatchError where the folder holds another census;
-    Stopped where it is interrupted.
+    Raises ValueError if the environment has only one parameter, and StoreMismatchError if the folder contains another
+    census. Raises Stopped when it is interrupted.
 
     Example: landscape census bounce --slices 16
 
@@ -352,10 +356,9 @@ def census(
     resolution
         Number of points along each axis of a slice.
     gradients
-        Compute gradients only at every N-th sample per axis. 2 halves the time if a gradient costs as much as three
-        losses.
+        Compute gradients only at every N-th sample per axis. 2 halves the time if a gradient costs three times a loss.
     along
-        How slices are oriented: pairs of parameters, or random directions, both over the whole box.
+        Orientation of the slices: pairs of parameters, or random directions, both over the whole box.
     second_fidelity
         Repeat every fourth slice at this fidelity, to see its effect.
     """
@@ -387,10 +390,10 @@ def bench(
 ) -> Bench:
     """Measure episodes per second, with and without gradients, and where the time goes.
 
-    Rates are the median of alternating repetitions, each at other points of the box. With --second-engine the engines
-    alternate too, so that ratios come from one run. It writes no file.
+    Rates are the median of alternating repetitions, each at different points of the box. With --second-engine the
+    engines alternate too, so ratios come from one run. It writes no file.
 
-    Raises ValueError for an engine that the scene does not have, TooLargeError for a batch that does not fit.
+    Raises ValueError if the environment does not have the engine, and TooLargeError if a batch does not fit in memory.
 
     Example: landscape bench fluid --second-engine taichi
 
@@ -399,7 +402,7 @@ def bench(
     second_engine
         A second engine, timed in turn with the first.
     batch
-        Batch size in episodes. It may be repeated; the default is 1 and the preferred batch of the environment.
+        Batch size in episodes. It can be repeated. The default is 1 and the preferred batch of the environment.
     seconds
         Approximate time to spend on each batch size [s].
     same_points

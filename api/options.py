@@ -1,6 +1,6 @@
 """The arguments and options that several verbs share, each declared once: its type, its limits and its help.
 
-Types are what Python takes; the command line reads words, which the functions of `values` make something of.
+Types are those of Python. The command line passes text, which the functions of `values` convert.
 """
 
 from __future__ import annotations
@@ -52,40 +52,41 @@ Scene = Annotated[
     ARGUMENT,
     Parameter(
         name="env",
-        help="The environment: a name that `landscape envs` lists, or FILE.py:NAME for a simulator in a file of your "
-        "own.",
+        help="The environment: a name that `landscape envs` lists, or FILE.py:NAME for a simulator in your own file.",
     ),
 ]
-"""What every function takes for a simulator: the name of a scene, FILE.py:NAME, an environment (`gs.from_torch` and
-its like make one of a function) or its class, a `SceneSpec`, or an object of one's own with `space` and `evaluate`."""
+"""A simulator, as every function takes it: the name of a scene, FILE.py:NAME, an environment (`gs.from_torch` and
+similar functions make one from a function) or its class, a `SceneSpec`, or any object with `space` and `evaluate`."""
 
 Count = Annotated[int, at_least(1)]
 Side = Annotated[Resolution, at_least(2)]
 Seed = Annotated[int, at_least(0), Parameter(help="Random seed.")]
-Out = Annotated[str | Path | None, Parameter(help="Folder of the results; by default one named after them, in out/.")]
-Force = Annotated[bool, Parameter(help="Replace what is in the folder already.")]
+Out = Annotated[
+    str | Path | None, Parameter(help="Folder for the results. The default is in out/, named after the settings.")
+]
+Force = Annotated[bool, Parameter(help="Replace the results that are already in the folder.")]
 FigureWidth = Annotated[
     Widths,
     Parameter(
         validator=Number(gte=80, lte=400),
         help="Also write the figure for print, as PDF and SVG of this width [mm]: 85 for a column, 170 for a page. "
-        "It may be repeated.",
+        "It can be repeated.",
     ),
 ]
 Scheduler = Annotated[
     str | None,
     Parameter(
         help="Compute on Dask workers: the address of a scheduler, or local:N for N workers on this machine. "
-        "local alone starts one per GPU, or per core."
+        "Without :N, local starts one per GPU, or one per core."
     ),
 ]
-Device = Annotated[str, Parameter(help="Device to compute on: auto, cpu or cuda. auto takes CUDA if there is a GPU.")]
+Device = Annotated[str, Parameter(help="Device to compute on: auto, cpu or cuda. auto uses CUDA if there is a GPU.")]
 Gradients = Annotated[
     Stride | None,
     Parameter(
         negative_none="no-",
         show_default=False,
-        help="Compute gradients only at every N-th sample per axis; none with --no-gradients.",
+        help="Compute gradients only at every N-th sample per axis. --no-gradients computes none.",
     ),
 ]
 Of = Annotated[
@@ -97,12 +98,12 @@ Of = Annotated[
 ]
 Data = Annotated[
     str | Path | None,
-    Parameter(help="Folder with the data of the figures. The default is that of a checkout, else out/gallery-data."),
+    Parameter(help="Folder with the data of the figures. The default is the checkout's, or else out/gallery-data."),
 ]
 
 
 SceneOptions = Annotated[
-    Settings, Parameter(name="--set", help="An option of the environment, as name=value. It may be repeated.")
+    Settings, Parameter(name="--set", help="An option of the environment, as name=value. It can be repeated.")
 ]
 
 
@@ -117,30 +118,30 @@ class MadeKeywords(TypedDict, total=False):
     engine: Annotated[
         str | None,
         Parameter(
-            help="Engine that simulates. The default is the first of the environment, usually warp; some also have "
+            help="Simulation engine. The default is the environment's first, usually warp. Some environments also have "
             "taichi, as an independent reference."
         ),
     ]
     preset: Annotated[
         str | None,
         Parameter(
-            help="Options that are set together, such as paper: the settings of the paper. `landscape envs NAME` lists "
-            "them, and --set changes single ones."
+            help="Set several options at once, such as paper for the settings of the paper. `landscape envs NAME` "
+            "lists the presets. --set changes single options."
         ),
     ]
     options: SceneOptions
     policy: Annotated[
         str | None,
         Parameter(
-            help="Let a neural policy decide, and take its weights as the parameters: mlp:32x32 has two hidden layers "
-            "of 32. It has gradients where the environment differentiates what it shows, as cartpole does."
+            help="Control the environment by a neural policy, whose weights are then the parameters. mlp:32x32 has two "
+            "hidden layers of 32. Gradients exist if the environment differentiates its observations, as cartpole does."
         ),
     ]
     remedy: Annotated[
         str | None,
         Parameter(
-            help="What is done about the landscape, such as smooth:2% or smooth:1%:zeroth:32,clip:0.5: smooth, clip, "
-            "average, rescale, shorten, soften, one after another. docs/remedies.md explains them."
+            help="Remedies to apply to the landscape in this order, such as smooth:2% or smooth:1%:zeroth:32,clip:0.5. "
+            "They are smooth, clip, average, rescale, shorten and soften. docs/remedies.md explains them."
         ),
     ]
 

@@ -40,13 +40,13 @@ def overlay(
 ) -> Overlay:
     """Draw runs over a slice, with their distance from its plane.
 
-    The folder then holds overlay.png, and overlay.rrd to walk around in and to play back. It also says how many points
-    the slice does not show. Runs of Python may also be what `gradscape.optimize` returns, pandas tables, an Optuna
-    study, or an Ax experiment or its client; values of a study that maximises are negated. Rows without a number for
-    each parameter are skipped and counted.
+    The folder then contains overlay.png, and overlay.rrd, a 3-D recording to move around in and to play back. It prints
+    how many points are outside the map. In Python, runs can also be results of `gradscape.optimize`, pandas tables, an
+    Optuna study, or an Ax experiment or its client. If a study maximises, its values are negated. Rows without a number
+    for each parameter are skipped and counted.
 
-    Raises ValueError for runs of other landscapes than the slice's, for a slice of a line, where a table lacks a
-    column, has one twice or holds no point, and where the folder holds something else; Stopped where it is interrupted.
+    Raises ValueError if a run searched another landscape, if the slice is a line, if a table lacks a column, has one
+    twice or contains no point, or if the folder contains something else. Raises Stopped when it is interrupted.
 
     Example: landscape overlay out/fluid-6-8 out/race-fluid --through best
 
@@ -55,11 +55,11 @@ def overlay(
     slice
         Folder of the slice.
     runs
-        Folders of runs or of races, or CSV and Parquet tables of points. A table has a column per parameter, with its
-        name, and a column loss, or is what Optuna's trials_dataframe() returns.
+        Folders of runs or of races, or CSV and Parquet tables of points. A table has a column with the name of each
+        parameter and a column loss, or comes from Optuna's trials_dataframe().
     through
-        Sample a new slice through a point: best for the best of all runs, the folder of a run for its best, or any
-        point of `landscape slice --through`.
+        Sample a new slice through a point: best for the best point of all runs, the folder of a run for its best point,
+        or any point that `landscape slice --through` takes.
     plane
         Sample a new slice along the two principal directions of the runs: pca.
     resolution
@@ -93,7 +93,7 @@ def overlay(
     )  # fmt: skip
     recording = job.folder / STREAM
     if spawn and not serve:
-        check_display(recording, "leave out --spawn, or take --serve to look at it in a browser")
+        check_display(recording, "leave out --spawn, or use --serve to open it in a browser")
     drawn = job.run(call.watch)
     if spawn or serve:
         show_recording(recording, serve=serve)

@@ -1,4 +1,4 @@
-"""`gs.plan`: what another verb takes, before anyone starts."""
+"""`gs.plan`: what another verb will take, before it starts."""
 
 from __future__ import annotations
 
@@ -30,23 +30,24 @@ class _Planner(Watch):
 def plan(verb: Annotated[Callable[..., Any], ARGUMENT], *given: Any, **named: Any) -> Plan:
     """Predict the episodes, time, memory and disk of another verb before computing it.
 
-    A plan is arithmetic: the episodes of the job times what an episode takes here, timed now on a few, and the bytes of
-    its files by formula. What search methods and pictures take themselves is not in it. For a CUDA device that is not
-    here, it uses rates that `landscape study fidelity` stored. It writes no file.
+    The time is the number of episodes times the time of one, which is measured now on a few. A formula gives the size
+    of the files. The time of search methods and pictures themselves is not included. For a CUDA device that this
+    machine does not have, it uses rates that `landscape study fidelity` stored. It writes no file.
 
-    Raises ValueError for what the verb refuses, and where nothing is known of a device that is not here.
+    Raises ValueError if the verb refuses its arguments, or if no rates are stored for a device that is not here.
 
     Example: landscape plan slice fluid --dims 6 8 --resolution 48 --fidelity standard
 
     Parameters
     ----------
     verb
-        The verb to plan, followed by its own arguments and options: in Python the function, such as `gradscape.slice`.
+        The verb to plan, followed by its own arguments and options. In Python it is the function, such as
+        `gradscape.slice`.
     """
     call, elsewhere = current(), _elsewhere(named)
     works = work_of(verb, given, named | ({"device": "cpu"} if elsewhere else {}))
     if not works:
-        raise ValueError(f"{verb.__name__} simulates nothing that could be planned: what it writes is there in seconds")
+        raise ValueError(f"{verb.__name__} simulates nothing, so there is nothing to plan: it takes only seconds")
     from ..jobs.plan import plan_work
 
     return plan_work(works, call.command, call.watch, device=elsewhere)

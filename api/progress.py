@@ -68,7 +68,7 @@ class Described(TextColumn):
 
 @dataclass
 class Announcement:
-    """Hold how long a job said it would take [s], and when; a bar `begun` later says how much of it is done."""
+    """Record the estimated time of a job [s], and when it was announced; a bar `begun` later says how much is done."""
 
     seconds: float
     said: float
@@ -81,17 +81,17 @@ class Announcement:
         self.begun, self.first, self.share = time.monotonic(), share, share
 
     def describe_delay(self) -> str:
-        """Say that it takes longer, and how long if enough is done to tell; nothing where it does not."""
+        """Say that it takes longer, and how long if enough is done to estimate that; empty if it does not."""
         now = time.monotonic()
         if now - self.said <= max(LATE * self.seconds, self.seconds + LATE_SECONDS):
             return ""
         from ..landscapes.cost import duration
 
-        done, said = self.share - self.first, f"takes longer than announced: {duration(self.seconds)} said"
+        done, said = self.share - self.first, f"slower than estimated: the estimate was {duration(self.seconds)}"
         if done < ENOUGH_DONE:
-            return f"{said}, {duration(now - self.said)} gone"
+            return f"{said}, {duration(now - self.said)} have passed"
         whole = self.begun - self.said + (now - self.begun) * (1 - self.first) / done
-        return f"{said}, now about {duration(whole)}"
+        return f"{said}, it is now about {duration(whole)}"
 
 
 class Bars(Watch):
@@ -105,7 +105,7 @@ class Bars(Watch):
         self._announced: Announcement | None = None
 
     def announce(self, text: str, seconds: float) -> None:
-        """Print a line, and hold the job to it."""
+        """Print a line, and compare the job's progress with it later."""
         self.note(text)
         self._announced = Announcement(seconds, time.monotonic())
 

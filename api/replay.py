@@ -27,10 +27,10 @@ def replay(
 ) -> EpisodeSummary:
     """Simulate one episode, draw it and film it.
 
-    The folder then holds episode.png (key frames side by side), episode.mp4 and episode.gif (films), episode.rrd (a
+    The folder then contains episode.png (key frames side by side), episode.mp4 and episode.gif (films), episode.rrd (a
     3-D scene, which `landscape view` opens) and episode.json (parameters, loss and settings).
 
-    Raises ValueError for what the scene does not have, and where it has no episodes to draw.
+    Raises ValueError if the environment does not support a keyword, or if it has no episodes to draw.
 
     Example: landscape replay fluid --params example:scoop
 

@@ -1,4 +1,4 @@
-"""`gs.report`: what a landscape is like, in numbers and in words, with the paper's."""
+"""`gs.report`: measures of a landscape, with a verdict in words and the paper's words."""
 
 from __future__ import annotations
 
@@ -34,32 +34,32 @@ def report(
 ) -> Report | Reports:
     """Measure one landscape: minima, flatness, jumps, correlation and gradient quality, with a verdict in words.
 
-    The folder then holds report.json, measures.json, gradient-quality.png and gradient-quality.npz (the data of the
-    picture); with --html also report.html. Several slices have a folder each, with report.json and the table report.md.
-    Stop at any time: the same command continues with the next slice. With --all a slice that fails is named at the end,
-    and the exit code is 1. docs/measures.md explains each number.
+    The folder then contains report.json, measures.json, gradient-quality.png and gradient-quality.npz (the data of the
+    picture). With --html it also contains report.html. For several slices it contains a folder for each, and
+    report.json and the table report.md for all. Stop at any time: the same command continues with the next slice. With
+    --all it lists failed slices at the end, and the exit code is then 1. docs/measures.md explains each number.
 
-    Raises ValueError for a slice without gradients or on no disk, for what the scene does not have, and where the
-    folder holds something else or another report; Stopped where it is interrupted.
+    Raises ValueError if the slice has no gradients or is not on disk, if the environment does not support a keyword, or
+    if the folder contains something else or another report. Raises Stopped when it is interrupted.
 
     Example: landscape report out/fluid-6-8-draft-24x24-4e5ab2
 
     Parameters
     ----------
     what
-        Folder of a slice, the slice itself, or an environment: its figures of the gallery, else a slice that is sampled
-        for it.
+        Folder of a slice, the slice itself, or an environment. For an environment it takes the sampled figures of the
+        gallery, or else samples a slice.
     all
         Report on every figure of the gallery that is sampled.
     points_per_axis
         Number of points along each axis at which new evaluations test gradients.
     features
-        Also measure landscape features over all parameters, from 50 new points for each. A report that is there
-        already gets them added.
+        Also measure landscape features over all parameters, from 50 new points per parameter. They are added to an
+        existing report.
     html
-        Also write report.html, one page with all of it that needs no network: to read, and to send.
+        Also write report.html, one page with all results, which opens without a network.
     include
-        Folder of a run, a race or a check that the page shows, too. It may be repeated.
+        Folder of a run, a race or a check that the page also shows. It can be repeated.
     """
     _refuse_words(what, all, keywords, env)
     from ..gallery.files import data_folder
@@ -84,12 +84,12 @@ def report(
         return found.reports[0]
     for failed, why in found.failed.items():
         call.watch.note(f"not reported: {failed}: {why}")
-    call.watch.finish(job.folder, [*REPORTS.files, "and a folder of each slice"])
+    call.watch.finish(job.folder, [*REPORTS.files, "and a folder for each slice"])
     return found
 
 
 def _refuse_words(what: Any, everything: bool, keywords: SceneKeywords, env: Scene) -> None:
-    """Raise ValueError unless it is said what to report on, once, and for an environment that there is not."""
+    """Raise ValueError unless exactly one subject is given, and if its environment does not exist."""
     from ..envs.registry import refuse_unknown
 
     if (what is None) != everything:
@@ -97,7 +97,9 @@ def _refuse_words(what: Any, everything: bool, keywords: SceneKeywords, env: Sce
     if isinstance(what, str) and not Path(what).exists():
         spec_of(what, keywords)
     elif (isinstance(what, str | Path) or what is None) and (more := set(keywords) - {"device"}):
-        raise ValueError(f"{', '.join(sorted(more))} are of an environment to sample; a slice is there: leave them out")
+        raise ValueError(
+            f"report takes {', '.join(sorted(more))} only for an environment to sample; leave them out for a slice"
+        )
     if isinstance(env, str):
         refuse_unknown(env)
 
@@ -109,21 +111,21 @@ def _figures(root: Path) -> list[ReportedSlice]:
 
     there = [ReportedSlice.of(root / figure.id) for figure in read_figures() if _is_finished(root / figure.id)]
     if not there:
-        raise ValueError(f"{root} holds no figures yet; `landscape gallery compute` samples them")
+        raise ValueError(f"{root} contains no figures yet; `landscape gallery compute` samples them")
     return there
 
 
 def _subjects(
     what: Any, root: Path, env: Scene, points: int, features: bool, keywords: SceneKeywords
 ) -> tuple[list[ReportedSlice], Scene]:
-    """Return a slice, or an environment's figures, or a slice sampled now for want of any; and its simulator."""
+    """Return a slice, an environment's figures, or a slice sampled now if it has no figures; and its simulator."""
     from ..gallery.figures import read_figures
     from ..jobs.report import ReportedSlice, sample_subject
     from ..landscapes.slice import Slice
 
     if isinstance(what, Slice):
         if what.folder is None:
-            raise ValueError("report takes a slice on disk; this one is in memory alone, so use its own report()")
+            raise ValueError("report takes a slice on disk; this one is only in memory, so call its method report()")
         return [ReportedSlice.of(what.folder)], env or (what.remake() if what.remake else None)
     if isinstance(what, Path) or (isinstance(what, str) and Path(what).exists()):
         return [ReportedSlice.of(Path(what))], env

@@ -31,7 +31,9 @@ def spec_of(scene: Scene, keywords: SceneKeywords, *, dims: Sequence[int | str] 
         named["options"] = as_settings(named["options"])
         if taken := OWN & set(named["options"]):
             name = min(taken)
-            raise ValueError(f"--set takes a scene's own options; {name} is none, and chosen by --{name} if at all")
+            raise ValueError(
+                f"--set takes options of the environment; {name} is not one, so use --{name} if the verb has it"
+            )
     if policy := named.get("policy"):
         hidden_layers(policy)
     if isinstance(scene, SceneSpec):
@@ -65,8 +67,9 @@ def environment(scene: Scene, keywords: SceneKeywords, *, dims: Sequence[int | s
 
 
 def is_in_memory(env: Environment, out: object) -> bool:
-    """Say whether a slice or a run is kept in memory alone: that of a function which is given no folder.
+    """Say whether a slice or a run is kept only in memory: for your own function, without a folder.
 
-    Functions change from one call to the next, as in a notebook; a folder of results that do not fit would be refused.
+    In a notebook such functions change from one call to the next, and the folder of the earlier function would refuse
+    the new one.
     """
     return out is None and not env.model_version and not current().on_disk

@@ -44,7 +44,7 @@ else:
 Methods = Annotated[
     Names,
     Parameter(
-        help="Methods to race, a,b or repeated. The default is all that can run here; `landscape methods` lists them."
+        help="Methods to race, as a,b or repeated. `landscape methods` lists them. The default is all that can run."
     ),
 ]
 RunBudget = Annotated[Count, Parameter(help="Number of episodes of each run. It is never exceeded.")]
@@ -54,8 +54,8 @@ Workers = Annotated[
     Parameter(
         name="--workers",
         help="Number of processes that fit Gaussian processes. The default is one per core for the command, and 1 in "
-        "Python, where more need a script whose own work stands under `if __name__ == '__main__':`. Results do not "
-        "depend on it.",
+        "Python, where more require a script whose code is under `if __name__ == '__main__':`. Results do not depend "
+        "on it.",
     ),
 ]
 
@@ -66,27 +66,27 @@ def advise(
     *,
     budget: Annotated[int, at_least(200)] = 1000,
     seed: Seed = 0,
-    out: Annotated[str | Path | None, Parameter(help="Folder of the advice; without it nothing is kept.")] = None,
+    out: Annotated[str | Path | None, Parameter(help="Folder for the advice. Without it nothing is saved.")] = None,
     force: Force = False,
     **keywords: Unpack[SceneKeywords],
 ) -> Advice:
-    """Advise with which method, remedy and fidelity to begin a search, by evidence from landscapes that were alike.
+    """Advise on the method, remedy and fidelity to start a search with, by evidence from similar landscapes.
 
-    It evaluates 50 points, or a tenth of the budget if that is less: a quarter of them with gradients. It measures how
-    far gradients hold, what fails, how losses are distributed, and compares that with cases in which nine methods were
-    raced: the 24 functions of BBOB, functions of known character and our scenes. docs/advice.md says how often such
-    advice is right. Where it was not better than one method for everything, it says so, and advises that method. The
-    folder then holds advice.json.
+    It evaluates 50 points, or a tenth of the budget if that is less, a quarter of them with gradients. It measures over
+    which steps gradients are accurate, what fails, and how losses are distributed. It compares this with cases in which
+    nine methods were raced: the 24 functions of BBOB, functions of known character, and our scenes. docs/advice.md says
+    how often this advice is right. If it has not proved better than one method for everything, it says so and advises
+    that method. With --out the folder then contains advice.json.
 
-    Raises ValueError for what the scene does not have, TooLargeError for a budget that would not fit here,
-    StoreMismatchError where the folder holds other advice; Stopped where it is interrupted.
+    Raises ValueError if the environment does not support a keyword, TooLargeError if the budget does not fit this
+    machine, and StoreMismatchError if the folder contains other advice. Raises Stopped when it is interrupted.
 
     Example: landscape advise branin
 
     Parameters
     ----------
     budget
-        Number of episodes that the search is to have. A tenth of them is what the advice takes at most.
+        Number of episodes planned for the search. The advice uses at most a tenth of them.
     """
     call, folder = current(), as_path(out)
     env = environment(scene, keywords)
@@ -112,26 +112,26 @@ def optimize(
     force: Force = False,
     **keywords: Unpack[SceneKeywords],
 ) -> Run:
-    """Search for the lowest loss with one method, and keep every evaluated point.
+    """Search for the lowest loss with one method, and save every evaluated point.
 
-    The folder then holds run.zarr (every episode), progress.png and summary.json. Stop at any time: the same command
-    continues from there. A larger budget continues the run, which is then the same as one that had this budget from the
-    start. A function is searched in memory unless it is given a folder.
+    The folder then contains run.zarr (every episode), progress.png and summary.json. Stop at any time: the same command
+    continues from there. A larger budget continues the run, and the result is the same as with that budget from the
+    start. In Python, your own function is searched in memory unless you give a folder.
 
-    Raises ValueError for what the scene or the method does not have, and where the folder holds something else or
-    another run; Stopped where it is interrupted.
+    Raises ValueError if the environment or the method does not support a keyword, or if the folder contains something
+    else or another run. Raises Stopped when it is interrupted.
 
     Example: landscape optimize fluid --method bo-leap --budget 300
 
     Parameters
     ----------
     method
-        Method to search with. `landscape methods` lists them. `auto` first measures the landscape, at a tenth of the
-        budget at most, and then takes the method that `landscape advise` would advise.
+        Method to search with. `landscape methods` lists them. `auto` first measures the landscape with at most a tenth
+        of the budget, and then uses the method that `landscape advise` would advise.
     budget
         Number of episodes to evaluate. It is never exceeded.
     method_options
-        An option of the method, as name=value. It may be repeated.
+        An option of the method, as name=value. It can be repeated.
     """
     from ..optim.registry import find_method
 
@@ -169,22 +169,22 @@ def race(
 ) -> Race:
     """Compare methods on the same budget over several seeds: best losses, targets reached and ranks.
 
-    All runs advance in lockstep, and one batch evaluates the proposals of all of them. The folder then holds race.png,
+    All runs advance in lockstep, and one batch evaluates all their proposals. The folder then contains race.png,
     race.json (ranks, pairwise comparisons, running times, curves) and a folder per run. Stop at any time: the same
     command continues from there. More methods, seeds or episodes also continue from there, and finished runs are not
-    repeated. --workers and --scheduler exclude each other.
+    repeated. Use either --workers or --scheduler.
 
-    Raises ValueError for what the scene or a method does not have, and where the folder holds something else or other
-    runs; Stopped where it is interrupted.
+    Raises ValueError if the environment or a method does not support a keyword, or if the folder contains something
+    else or other runs. Raises Stopped when it is interrupted.
 
     Example: landscape race fluid --methods random,bo-leap --budget 200 --seeds 3
 
     Parameters
     ----------
     method_options
-        An option of a method, as METHOD.NAME=VALUE. It may be repeated.
+        An option of a method, as METHOD.NAME=VALUE. It can be repeated.
     best_known
-        Lowest loss known from elsewhere, at which the targets end.
+        Lowest loss known from elsewhere. The targets extend down to it.
     """
     from ..optim.registry import check_methods
     from ..optim.registry import methods as registered
@@ -223,21 +223,21 @@ def league(
 ) -> League:
     """Race the same methods in many environments, and rank them in each and overall.
 
-    It first says what is there of each environment and how long the others take to simulate. The folder then holds a
-    race per environment, as `landscape race` leaves it, league.png (mean ranks) and league.json (a row per environment
-    and method, and the best points). Stop at any time: the same command continues from there. More environments,
-    methods, seeds or episodes also continue from there. An environment that fails is named with the reason, the others
-    are raced, and the exit code is 1.
+    It first says how many episodes of each environment are done and how long the rest will take. The folder then
+    contains a race per environment, as from `landscape race`, league.png (mean ranks) and league.json (a row per
+    environment and method, and the best points). Stop at any time: the same command continues from there. More
+    environments, methods, seeds or episodes also continue from there. If an environment fails, it gives the reason and
+    races the others. The exit code is then 1.
 
-    Raises ValueError for scenes, fidelities and methods that there are not, where the folder holds something else, and
-    where no scene could be raced; Stopped where it is interrupted.
+    Raises ValueError if a scene, a fidelity or a method does not exist, if the folder contains something else, or if no
+    scene could be raced. Raises Stopped when it is interrupted.
 
     Example: landscape league bounce fluid@standard --methods random,cma-es,bo-leap --budget 200 --seeds 3
 
     Parameters
     ----------
     scenes
-        Environments to race in, as ENV or ENV@FIDELITY. The default is all sixteen that gradscape simulates itself.
+        Environments to race in, as ENV or ENV@FIDELITY. The default is the sixteen scenes of gradscape.
     """
     from ..optim.registry import check_methods
 
@@ -261,9 +261,9 @@ def league(
 
 
 def open_run(path: str | Path) -> Run:
-    """Open a run from its folder, with the episodes that are there, finished or not.
+    """Open a run from its folder, finished or not, with the episodes so far.
 
-    Raises ValueError where there is no run, and where it is damaged.
+    Raises ValueError if there is no run, or if it is damaged.
     """
     from ..jobs.folder import RUN_STORE, store_in
     from ..optim.runs.store import RunStore
@@ -283,9 +283,9 @@ def _league_spec(scene: Any, keywords: SceneKeywords) -> SceneSpec:
 def _check_workers(workers: int | None, scheduler: str | None) -> None:
     """Raise ValueError for workers and a scheduler, and for less than one worker."""
     if workers and scheduler:
-        raise ValueError(f"--scheduler has workers of its own, so --workers is left out; got {workers}")
+        raise ValueError(f"--scheduler brings its own workers; leave out --workers (got {workers})")
     if workers is not None and workers < 1:
-        raise ValueError(f"a number of workers is a whole number of at least 1; got {workers}")
+        raise ValueError(f"--workers takes a whole number of at least 1; got {workers}")
 
 
 def _processes(workers: int | None) -> int:

@@ -64,30 +64,30 @@ def slice(
 ) -> Slice:
     """Sample losses and gradients on a plane through parameter space, and draw them.
 
-    The folder then holds slice.zarr.zip (the samples), landscape.png and summary.json. Stop at any time: the same
-    command continues from there. The status of each sample tells which are interpolated, and no measure uses those. A
-    function is sampled in memory unless it is given a folder.
+    The folder then contains slice.zarr.zip (the samples), landscape.png and summary.json. Stop at any time: the same
+    command continues from there. The status of a sample says whether it is interpolated, and no measure uses
+    interpolated samples. In Python, your own function is sampled in memory unless you give a folder.
 
-    Raises ValueError for what the scene does not have, and where the folder holds something else or another slice;
-    Stopped where it is interrupted.
+    Raises ValueError if the environment does not support a keyword, or if the folder contains something else or another
+    slice. Raises Stopped when it is interrupted.
 
     Example: landscape slice fluid --dims 6 8 --resolution 24
 
     Parameters
     ----------
     dims
-        One or two parameters to vary, by number or by name. An environment with at most two needs none.
+        One or two parameters to vary, by number or by name. With at most two parameters the default is all.
     along
         Directions to vary instead of --dims: random:SEED, filters:SEED (normalised by the weights of each neuron),
         gradient, hessian, pca:RUN, training:FOLDER (of checkpoints), the line A:B through two points, or the plane
-        A:B:C through three. What lies outside the bounds is left out.
+        A:B:C through three. Samples outside the bounds are left out.
     resolution
         Number of points along each axis.
     through
         Point that the slice passes through: center, random:SEED, example:NAME, best, best:RUN, a file of numbers, a
         checkpoint of a training (.pt, .pth, .npz, .zip), or a row of a table, TABLE.csv:ROW. Row 1 of a table is its
-        heading; without ROW it is the row with the lowest loss. The command takes several points, A,B, and makes a
-        slice in a folder of its own for each.
+        heading. Without ROW it takes the row with the lowest loss. The command also takes several points, A,B, and
+        makes a slice for each, in separate folders.
     window
         Range to cover: a fraction of the box around the point, or the values LOW:HIGH. The default is the whole box.
     refine
@@ -96,11 +96,12 @@ def slice(
     budget
         Adaptive sampling with at most this many episodes, alone or together with --refine.
     floor
-        Evaluate the replicas of the environment, the same physics computed otherwise, at every sample. The standard
-        deviation between their losses, the numerical floor, is drawn as a map. Each replica costs as much as the slice.
+        Also evaluate the replicas of the environment, the same physics with other numerics, at every sample. It draws a
+        map of the numerical floor, the standard deviation between their losses. Each replica costs as much as the
+        slice.
     picture
-        Draw landscape.png, which takes longer than the samples of a quick function; --no-picture leaves it out. It can
-        be drawn from the samples at any time.
+        Draw landscape.png. For a fast function this takes longer than the samples, and --no-picture skips it. You can
+        draw it from the samples later.
     """
     from ..jobs.cut import PlaneSpec
 
@@ -147,9 +148,9 @@ def bounce(
 ) -> Slice:
     """Draw loss and gradient of the bouncing ball along one velocity, and mark where the number of bounces changes.
 
-    The folder then holds slice.zarr.zip (the samples), landscape.png and summary.json.
+    The folder then contains slice.zarr.zip (the samples), landscape.png and summary.json.
 
-    Raises ValueError for another axis, and as `slice` does.
+    Raises ValueError for another axis, and the errors of `slice`.
 
     Example: landscape bounce --axis y
 
@@ -177,7 +178,7 @@ def bounce(
 def sample(scene: Scene, plane: Plane, *, gradients: bool | int = True) -> xr.Dataset:
     """Evaluate a simulator on any plane, in memory, and return the samples.
 
-    `gradients` is that of `slice`. Raises ValueError for what is no simulator, and for a plane of another space.
+    `gradients` is as for `slice`. Raises ValueError if `scene` is not a simulator, or if the plane is in another space.
     """
     from ..envs.registry import as_environment
     from ..landscapes.sampling.fill import sample as fill
@@ -187,13 +188,13 @@ def sample(scene: Scene, plane: Plane, *, gradients: bool | int = True) -> xr.Da
 
 
 def open_slice(path: str | Path, *, env: Scene = None) -> Slice:
-    """Open a slice: the folder that `slice` or `landscape slice` left it in, or its store.
+    """Open a slice from the folder that `slice` or `landscape slice` wrote, or from its store.
 
-    `env` is the simulator that it was sampled from, where it is not registered by its name: a function, a class or
-    FILE.py:NAME. It is needed only for what evaluates it again, such as `report`.
+    `env` is the simulator that it was sampled from, if that is not registered by name: a function, a class or
+    FILE.py:NAME. Only methods that evaluate it again need it, such as `report`.
 
-    What is not sampled yet is NaN, with status MISSING. Raises StoreError, a ValueError, where there is no slice, and
-    where it is damaged.
+    Samples that are still missing are NaN, with status MISSING. Raises StoreError, a ValueError, if there is no slice,
+    or if it is damaged.
     """
     from ..landscapes.storage.store import open_slice as read
 
@@ -202,12 +203,13 @@ def open_slice(path: str | Path, *, env: Scene = None) -> Slice:
 
 
 def slices(folder: str | Path, where: str | None = None) -> pd.DataFrame:
-    """Return what the summaries of all slices in a folder say, a row each, without opening them.
+    """Return a table of all slices in a folder, one row each, from their summaries.
 
-    It looks at any depth. `where` is a condition of SQLite over the columns: "env = 'branin' and lowest < 0.5". What is
-    read is kept as .slices.sqlite in the folder; only summaries that are new or changed are read the next time.
+    It searches subfolders at any depth, and opens no slice. `where` is an SQLite condition over the columns, such as
+    "env = 'branin' and lowest < 0.5". The table is stored as .slices.sqlite in the folder. The next call reads only
+    summaries that are new or changed.
 
-    Raises ValueError where there is no such folder, and for what is no condition.
+    Raises ValueError if there is no such folder, or if `where` is not a valid condition.
     """
     from ..jobs.slices import find_slices
 

@@ -53,31 +53,32 @@ def study(
 ) -> StudyRecord:
     """Measure several variants of an environment at the same points and compare them with a reference.
 
-    fidelity: errors and times of cheaper and dearer variants. The reference is the last fidelity. What is measured is
-    also kept for --tolerance of other verbs.
+    fidelity: errors and times of cheaper and more expensive variants. The reference is the last fidelity. The result is
+    also stored for --tolerance of other verbs.
 
-    convergence: is the reference converged? Each setting of it is refined. 16 points are enough.
+    convergence: is the reference converged? It refines each setting of the reference. 16 points are enough.
 
-    model: what each part of the model is for. Each part is left out, or put in where it is missing. The reference is
-    the full model at --fidelity.
+    model: the effect of each part of the model. It removes each part, or adds it if it is missing. The reference is the
+    full model at --fidelity.
 
-    mixed: what draft and standard should be, by a search over all settings together.
+    mixed: the best settings for draft and standard, by a search over all settings together.
 
-    extremes: how far time step, grid, stiffness, controls and horizon can be changed before a simulation fails. Each
-    setting is scanned and its first failure bisected; pairs of settings are mapped. The default fidelity is standard.
-    `landscape envs NAME` shows what was found about the time step.
+    extremes: how far time step, grid, stiffness, controls and horizon can be changed before a simulation fails. It
+    scans each setting, bisects to the first failure, and maps pairs of settings. The default fidelity is standard.
+    `landscape envs NAME` shows the result for the time step.
 
-    symmetry: the numerical floor: how much losses and gradients move where only the numerics change. The replicas are
-    the scene's own: a moved grid, other particles, another mesh, shorter steps. A function has them by replicas=.
+    symmetry: the numerical floor, or how much losses and gradients change if only the numerics change. The scene
+    provides the replicas: a shifted grid, other particles, another mesh, shorter steps. For your own function, give
+    them with replicas=.
 
-    updates: how losses are distributed after one update along the gradient, and after random steps as long, with the
-    left-tail probability. An update follows the gradient at a point that is moved at random. Most such studies are of
-    the weights of a policy, --policy.
+    updates: the distribution of losses after one update along the gradient and after random steps of the same length,
+    with the left-tail probability. Each update follows the gradient at a randomly shifted point. This is mostly used
+    for the weights of a policy (--policy).
 
-    The folder then holds KIND.json and KIND.png. Stop at any time: the same command continues with the next variant.
+    The folder then contains KIND.json and KIND.png. Stop at any time: the same command continues with the next variant.
 
-    Raises ValueError for options that the kind does not take, and where there is nothing to compare; StoreMismatchError
-    where the folder holds another study; Stopped where it is interrupted.
+    Raises ValueError if the kind does not take an option, or if there is nothing to compare. Raises StoreMismatchError
+    if the folder contains another study, and Stopped when it is interrupted.
 
     Example: landscape study fidelity bounce --settings dt,precision
 
@@ -86,38 +87,38 @@ def study(
     kind
         Study to run: fidelity, convergence, model, mixed, extremes, symmetry or updates.
     points
-        Number of points at which every variant is measured. The default is 64, 16 for extremes and 32 for symmetry. Of
-        updates: their number, by default 256.
+        Number of points at which every variant is measured. The default is 64, or 16 for extremes and 32 for symmetry.
+        For updates: the number of updates, by default 256.
     settings
-        Settings to change, a,b or repeated. Of fidelity: dt, resolution, particles, precision, stiffness, engine,
-        device. Of convergence: dt, resolution, particles, joint, precision. Of extremes: dt, resolution, box, horizon
+        Settings to change, as a,b or repeated. For fidelity: dt, resolution, particles, precision, stiffness, engine,
+        device. For convergence: dt, resolution, particles, joint, precision. For extremes: dt, resolution, box, horizon
         and options that are positive numbers. The default is all that the environment has.
     pairs
-        Of extremes: pairs of settings to map, as dt:ke, or none. The default is dt with each other setting.
+        For extremes: pairs of settings to map, as dt:ke, or none. The default is dt with each other setting.
     precisions
-        Of extremes: precisions to test, float32, float64 or both. The default is all there are.
+        For extremes: precisions to test, float32, float64 or both. The default is all that the environment has.
     grid
-        Of extremes: number of values of each setting on a map. The default is 8.
+        For extremes: number of values of each setting on a map. The default is 8.
     width
-        Of extremes: relative width at which the bisection of a limit stops. The default is 0.05.
+        For extremes: relative width at which the bisection of a limit stops. The default is 0.05.
     tolerance
-        Of extremes: loss error that counts as accurate, at the 95th percentile and as a share of the spread of losses.
-        The default is 10%.
+        For extremes: largest accurate loss error, at the 95th percentile, as a share of the spread of losses. The
+        default is 10%.
     reference
-        Of extremes: fidelity that finite losses are compared with. The default is the last.
+        For extremes: fidelity that finite losses are compared with. The default is the last.
     max_cost
-        Of mixed: largest cost of a variant, as a multiple of the present one. The default is 4.
+        For mixed: largest cost of a variant, as a multiple of the present one. The default is 4.
     time_limit
-        Of mixed: time to spend on measurements [s]. The default is 600.
+        For mixed: time to spend on measurements [s]. The default is 600.
     chaotic
-        Of mixed: ignore gradients, because the motion is chaotic.
+        For mixed: ignore gradients, because the motion is chaotic.
     through
-        Of updates: point that they start from, as for `landscape slice`. The default is the center.
+        For updates: point that the updates start from, as for `landscape slice`. The default is the center.
     noise
-        Of updates: how far points are moved at random before their gradient is taken, a standard deviation as a share
-        of the box. The default is 1%.
+        For updates: standard deviation of the random shift of points before their gradient is taken, as a share of the
+        box. The default is 1%.
     rate
-        Of updates: learning rate, by which gradients are multiplied. By default updates are 1 % of the box long.
+        For updates: learning rate, by which gradients are multiplied. The default makes updates 1 % of the box long.
     """
     spec = spec_of(scene, cast("SceneKeywords", keywords))
     from ..jobs.study import StudyJob
@@ -137,5 +138,5 @@ def study(
     )  # fmt: skip
     found = job.run(call.watch)
     if path := keep(found):
-        call.watch.note(f"kept for other verbs: {path}")
+        call.watch.note(f"stored for other verbs: {path}")
     return found

@@ -21,10 +21,10 @@ def surface(
 ) -> Path:
     """Draw a slice as a lit surface with the loss as height and colour, and runs on top.
 
-    The folder then holds surface.png, and surface.gltf for any viewer of 3-D models. Failed samples are holes. Returns
-    the folder.
+    The folder then contains surface.png, and surface.gltf for any viewer of 3-D models. Failed samples are holes. In
+    Python it returns the folder.
 
-    Raises ValueError where there is no slice or run, and where a run searched another landscape.
+    Raises ValueError if there is no slice or run, or if a run searched another landscape.
 
     Example: landscape surface out/my-slice out/my-run
 

@@ -1,4 +1,4 @@
-"""`gs.sweep`: sample slices of a scene as something else moves, and film them."""
+"""`gs.sweep`: sample slices of a scene over a third quantity, and film them."""
 
 from __future__ import annotations
 
@@ -46,22 +46,22 @@ def sweep(
 ) -> Sweep:
     """Sample one slice per value of a third parameter, and film them on one colour scale.
 
-    The folder then holds frames/ (the samples of each frame; slice.zarr.zip if there is only one slice), sweep.mp4,
-    sweep.gif, sweep.rrd (a 3-D scene, which `landscape view` opens) and summary.json. Stop at any time: the same
-    command continues from there. Smoothed losses have no gradients.
+    The folder then contains frames/ (the samples of each frame, or slice.zarr.zip if there is only one slice),
+    sweep.mp4, sweep.gif, sweep.rrd (a 3-D scene, which `landscape view` opens) and summary.json. Stop at any time: the
+    same command continues from there. Smoothed losses have no gradients.
 
-    Raises ValueError for what the scene does not have or cannot be swept, where nothing is to move, and where the
-    folder holds something else or another sweep; Stopped where it is interrupted.
+    Raises ValueError if the environment does not support a keyword, if `over` is missing or cannot be swept, or if the
+    folder contains something else or another sweep. Raises Stopped when it is interrupted.
 
     Example: landscape sweep fluid --dims 6 8 --over 7 --frames 12
 
     Parameters
     ----------
     dims
-        One or two parameters to vary, by number or by name. An environment with at most two needs none.
+        Two parameters to vary, by number or by name. An environment with two parameters needs none.
     over
-        What changes from frame to frame: a third parameter over its bounds, horizon (the duration of the episode), or
-        smoothing (of one slice).
+        Quantity that changes from frame to frame: a third parameter between its bounds, horizon (the duration of the
+        episode), or smoothing (of one slice).
     along
         Directions to vary instead of --dims, as for `landscape slice`.
     frames
@@ -69,12 +69,12 @@ def sweep(
     resolution
         Number of points along each axis.
     through
-        Point that the slices pass through, as for `landscape slice`. The command takes several points, A,B.
+        Point that the slices pass through, as for `landscape slice`. The command also takes several points, A,B.
     window
         Range to cover: a fraction of the box around the point, or the values LOW:HIGH. The default is the whole box.
     """
     if over is None:
-        raise ValueError("a sweep takes over: a third parameter, horizon or smoothing; got none")
+        raise ValueError("sweep takes --over: a third parameter, horizon or smoothing; got none")
     from ..jobs.cut import PlaneSpec
 
     spec, call = PlaneSpec(dims, along, through, as_window(window), resolution), current()

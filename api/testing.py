@@ -1,4 +1,4 @@
-"""`gs.testing.assert_gradients`: a check of gradients as one line of anybody's tests."""
+"""`gs.testing.assert_gradients`: a check of gradients in one line of your own tests."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ def assert_gradients(
 ) -> CheckReport:
     """Assert that the gradients of an environment are right, and return the report of `gs.check`; it prints nothing.
 
-    `scene`, `power` and the other keywords are those of `gs.check`: a defect that fills a share `power` of the box is
-    found with 95 %. A warning is no failure.
+    `scene`, `power` and the other keywords are those of `gs.check`. A defect that fills a share `power` of the box is
+    found with a probability of 95 %. A warning is not a failure.
 
         def test_gradients_of_my_simulator():
             gs.testing.assert_gradients(gs.from_torch(simulate, space))
 
-    Raises AssertionError with a line for each cause: what is wrong, where, and what to try. Raises ValueError for what
-    is no simulator, or what it does not have.
+    Raises AssertionError with a line for each cause: what is wrong, where, and what to try. Raises ValueError if
+    `scene` is not a simulator, or if it does not support a keyword.
     """
     name = scene if isinstance(scene, str) else getattr(scene, "name", type(scene).__name__)
     with calling(Call(f"gradscape.testing.assert_gradients({name})", Watch())):

@@ -1,4 +1,4 @@
-"""What the words of options mean: names, shares, windows, settings and paths, from the command line or from Python."""
+"""Convert the text of options, from the command line or from Python: names, shares, windows, settings and paths."""
 
 from __future__ import annotations
 

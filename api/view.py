@@ -1,4 +1,4 @@
-"""The verb `view`: open what the other verbs leave, with the viewer it is made for."""
+"""The verb `view`: open the results of other verbs in a suitable viewer."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY")  # variables of the environment that n
 def view(file: Annotated[str, ARGUMENT], *, serve: bool = False) -> None:
     """Open the results of other verbs in a viewer.
 
-    Pictures, films and pages open in the programs of this system. Recordings (.rrd) open in the rerun viewer, or with
-    --serve in a browser. It writes no file.
+    Pictures, films and pages open in the default programs of this system. Recordings (.rrd) open in the rerun viewer,
+    or in a browser with --serve. It writes no file.
 
     Example: landscape view out/my-episode --serve
 
@@ -54,7 +54,7 @@ def show_recording(path: Path, *, serve: bool) -> None:
 
     note = current().watch.note
     if not serve:
-        check_display(path, f"look at it in a browser: landscape view {shlex.quote(str(path))} --serve")
+        check_display(path, f"open it in a browser with: landscape view {shlex.quote(str(path))} --serve")
         note(f"opening {path} in rerun's viewer")
         open_viewer(path)
         return
@@ -75,7 +75,7 @@ def has_display() -> bool:
 def check_display(path: Path, instead: str) -> None:
     """Raise ValueError, saying what to do `instead`, where there is no display to open a file on."""
     if not has_display():
-        raise ValueError(f"there is no display here to open {path} on; {instead}")
+        raise ValueError(f"this machine has no display to open {path} on; {instead}")
 
 
 def _open(path: Path, *, serve: bool) -> None:
@@ -84,13 +84,14 @@ def _open(path: Path, *, serve: bool) -> None:
 
     serving = f"landscape gallery serve --out {shlex.quote(str(path.parent))}"
     if serve and path.name == SITE:
-        raise ValueError(f"a site is served by: {serving}")
+        raise ValueError(f"view does not serve a site; serve it with: {serving}")
     if serve:
-        raise ValueError(f"--serve shows recordings (.rrd) in a browser; {path} is none")
-    check_display(path, f"serve it to a browser: {serving}" if path.name == SITE else "copy it to where one is")
+        raise ValueError(f"--serve shows only recordings (.rrd) in a browser; got {path}")
+    instead = f"serve it to a browser with: {serving}" if path.name == SITE else "copy it to a machine with a display"
+    check_display(path, instead)
     current().watch.note(f"opening {path}")
     if not launch(resolve(path)):
-        raise OSError(f"no program of this system opens {path}; open it with one of your own")
+        raise OSError(f"this system has no program that opens {path}; open the file yourself")
 
 
 def launch(path: Path) -> bool:
@@ -112,11 +113,11 @@ def _choose(path: Path, *, serve: bool) -> Path:
             if (folder / name).exists():
                 return folder / name
         raise ValueError(
-            f"{path} holds none of {', '.join(SHOWN)}; what `landscape slice`, sweep, optimize, race, overlay, replay "
-            "and gallery build leave does"
+            f"{path} contains none of {', '.join(SHOWN)}; give a folder that `landscape slice`, sweep, optimize, race, "
+            "overlay, replay or gallery build has written"
         )
     if not path.exists():
-        raise ValueError(f"there is no file {path}")
+        raise ValueError(f"view found no file or folder {path}; check the path")
     if path.suffix not in (*PICTURES, ".rrd"):
         raise ValueError(f"view opens {', '.join(PICTURES)}, .rrd and results folders; got {path}")
     return path

@@ -3,14 +3,14 @@
     python -m benchmarks.advice score                             # from the published cases: seconds
     python -m benchmarks.advice rows --races FOLDER [--jobs 2]    # all cases again: some 45 minutes of one core
 
-Cases are the 24 functions of BBOB in 2 and 5 parameters and every second one in 10, the functions of known character
-of `benchmarks.words`, BoTorch's functions, and the scenes of the league. Nine methods race in each within 500 forward
-equivalents. In functions, one seed each, a gradient counts as two losses, about the median of our scenes. The races in
-FOLDER are continued. The scenes' ten seeds are those of the gallery's league, cut off at that cost.
+Cases are the 24 functions of BBOB in 2 and 5 parameters and every second one in 10, the functions of known character of
+`benchmarks.words`, BoTorch's functions, and the scenes of the league. Nine methods race in each within 500 forward
+equivalents. Functions have one seed each, and a gradient counts as two losses, about the median of our scenes. The
+races in FOLDER are continued. The scenes' ten seeds are those of the gallery's league, truncated at that cost.
 
-Losses that are nearer to the best of the race than 1e-8 of the first one's distance are level, and of level methods the
-one that was there first is ahead. A function in which no method gets beyond its first loss says nothing, and is left
-out. The cases are `optim/advice.json`, which the package brings.
+Losses closer to the best of the race than 1e-8 of the first one's distance count as equal; among equal methods, the
+first to reach its loss is ahead. A function in which no method improves on its first loss is left out. The cases are in
+`optim/advice.json`, which is part of the package.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ Found = Mapping[str, Mapping[str, Sequence[float]]]  # method -> forwards and lo
 
 @dataclass(frozen=True)
 class Subject:
-    """A function or a scene to measure, and what makes it."""
+    """A function or a scene to measure, and its factory."""
 
     name: str
     family: str
@@ -122,7 +122,7 @@ def scenes() -> list[Subject]:
 
 
 def race_in(name: str) -> Found:
-    """Let the methods race in a function, and return the improvements of each; noise is left out of their losses."""
+    """Race the methods in a function, and return the improvements of each; their losses exclude noise."""
     objective = functions()[name].make()
     env, found = gs.as_environment(objective), dict[str, Mapping[str, Sequence[float]]]()
     torch.set_num_threads(1)
@@ -148,7 +148,7 @@ def _improvements(objective: Objective, run: RunStore) -> dict[str, list[float]]
 
 
 def races(folder: Path, jobs: int) -> dict[str, Found]:
-    """Return the races in all functions, those that are in a folder already and the others."""
+    """Return the races in all functions, stored ones from a folder and new ones."""
     folder.mkdir(parents=True, exist_ok=True)
     files = {name: folder / f"{name.replace('/', '-')}.json" for name in functions()}
     left = [name for name, file in files.items() if not file.exists()]
@@ -170,7 +170,7 @@ def kept_races(scene: str) -> list[Found]:
 
 
 def ranks(found: Sequence[Found], forwards: float) -> tuple[dict[str, float], dict[str, float]]:
-    """Return the mean ranks of methods over races at a cost, and those of each if it alone has nine tenths of that."""
+    """Return the mean ranks of methods over races at a cost, and those of each if it alone has nine tenths of it."""
     places = np.array([_places(one, forwards) for one in found])  # shape (race, early or late, method, two)
     whole, late = places[:, 0], places[:, 1]
     rows = [_ranked(whole)] + [
@@ -182,7 +182,7 @@ def ranks(found: Sequence[Found], forwards: float) -> tuple[dict[str, float], di
 
 
 def _ranked(places: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the mean rank of each method over races: the least loss first, and of equal ones what was there first."""
+    """Return the mean rank of each method over races: the lowest loss first, the earliest of equal ones."""
     order = [np.unique(one, axis=0, return_inverse=True)[1].ravel() for one in places]
     found: NDArray[np.float64] = seed_ranks(np.array(order, float).T).mean(axis=1)
     return found
@@ -191,7 +191,7 @@ def _ranked(places: NDArray[np.float64]) -> NDArray[np.float64]:
 def _places(found: Found, forwards: float) -> NDArray[np.float64]:
     """Return the loss of each method at a cost and at nine tenths of it, and from which cost on, shape (2, method, 2).
 
-    Losses that are level with the best of the race are made the same. A method is at infinity before its first loss.
+    Losses equal to the best of the race are set to it. A method is at infinity before its first loss.
     """
     curves = [(np.array(found[one]["forwards"]), np.array(found[one]["loss"])) for one in METHODS]
     known = [loss for _, loss in curves if len(loss)]
@@ -277,11 +277,11 @@ def score_table() -> str:
         "best single method",
         "best in hindsight",
     )
-    return table((*head, "advised less single"), rows)
+    return table((*head, "advised minus single"), rows)
 
 
 def scene_table() -> str:
-    """Return what is advised in each of our scenes by cases of other families, and how that ranks there."""
+    """Return the advice for each of our scenes from cases of other families, and its rank there."""
     found, rows = [one for one in hold_out(read_cases().cases) if one.case.scene], []
     for name in sorted({one.case.name for one in found}):
         mine = [one for one in found if one.case.name == name]
@@ -295,18 +295,23 @@ def scene_table() -> str:
 
 
 KINDS: dict[str, Callable[[Case], bool]] = {  # of landscapes, by measures whose names are those of `measures_of`
-    "Gradients hold over steps of 0.1 % (at least 90 % of what they promise)": lambda case: promised(case) >= 0.9,
-    "Gradients mislead there (less than half of what they promise)": lambda case: promised(case) < 0.5,
+    "Gradients are accurate over steps of 0.1 % (at least 90 % of the predicted decrease)": lambda case: (
+        promised(case) >= 0.9
+    ),
+    "Gradients mislead over these steps (less than half of the predicted decrease)": lambda case: promised(case) < 0.5,
 }
 
 
 def promised(case: Case) -> float:
-    """Return how much of what gradients promise the shortest steps keep, a mean over samples; 0 if nothing tells."""
+    """Return the actual decrease of the shortest steps relative to their gradients' prediction; 0 if unknown.
+
+    It is a mean over samples.
+    """
     return float(np.nan_to_num([one.agreement[0] for one in case.characters]).mean())
 
 
 def prose() -> str:
-    """Return which methods are best in which kinds of landscapes, as a list."""
+    """Return the best methods for each kind of landscape, as a list."""
     known, lines = read_cases().cases, list[str]()
     for said, fits in KINDS.items():
         lines.append(f"- {said}: {_best([one for one in known if fits(one)], METHODS)}.")
@@ -316,7 +321,7 @@ def prose() -> str:
         lines.append(
             f"- Advice by the nearest cases, in {said} whose family was left out: mean rank "
             f"{_interval(found.advised, '.1f')}. `{found.method}` everywhere: {_interval(found.single, '.1f')}. The "
-            f"difference is {_interval(found.difference, '+.2f')}, so that {_verdict(found)}."
+            f"difference is {_interval(found.difference, '+.2f')}, so {_verdict(found)}."
         )
     return "".join(f"{line}\n" for line in lines)
 
@@ -328,7 +333,7 @@ def _verdict(found: Score) -> str:
 
 
 def _best(cases: Sequence[Case], methods: Sequence[str]) -> str:
-    """Say which methods are best in some cases, and in the scenes among them."""
+    """Name the best methods in some cases, and in the scenes among them."""
     scenes = [one for one in cases if one.scene]
     ours = f"in the {len(scenes)} scenes among them {_ranked_first(scenes, methods)}"
     return f"{_ranked_first(cases, methods)} ({len(cases)} cases); {ours}"

@@ -1,18 +1,17 @@
-"""Search for the point that each of the gallery's figures goes through: where its losses come nearest to the paper's.
+"""Search for the point of each of the gallery's figures: the one with losses closest to the paper's.
 
     python -m benchmarks.base_points [FIGURE|ENV ...] [--resolution 8] [--random 32] [--fidelity standard]
         [--device auto] [--out benchmarks/data/base-points] [--write]
 
-The paper says what its colour bars end at, and not which points its slices go through. Of each figure whose environment
-has such ends in gallery/paper.toml, losses are evaluated on a small grid over the figure's plane through the centre,
-each example of the scene, and random:1 to random:32. The point is taken whose lowest and highest loss are least off:
+The paper gives the ends of its colour bars, but not the points of its slices. For each figure whose environment has
+such ends in gallery/paper.toml, losses are evaluated on a small grid over the figure's plane, through the centre, each
+example of the scene, and random:1 to random:32. The chosen point has the smallest error of its lowest and highest loss:
 
     (|lowest - paper's lowest| + |highest - paper's highest|) / (paper's highest - paper's lowest)
 
-How rugged it looks is never asked. A figure that varies all parameters is the same through every point. A point through
-which a tenth of the episodes or more fail is not taken. What was found is kept in the folder --out, a file for each
-figure, and a search that is there, of the same code of the scene, is not made again; --write puts points and results
-into gallery/figures.toml.
+The choice ignores ruggedness. A figure that varies all parameters is the same through every point. A point with a tenth
+or more of failed episodes is not chosen. Results are stored in the folder --out, a file for each figure, and a stored
+search with the same code of the scene is not repeated. --write puts points and results into gallery/figures.toml.
 """
 
 from __future__ import annotations
@@ -73,12 +72,12 @@ class Candidate:
 
 
 def distance(found: tuple[float, float], paper: tuple[float, float]) -> float:
-    """Return how far both ends of a range of losses are off the paper's, in widths of the paper's."""
+    """Return the error of both ends of a range of losses, in widths of the paper's range."""
     return (abs(found[0] - paper[0]) + abs(found[1] - paper[1])) / (paper[1] - paper[0])
 
 
 def names_of(env: Environment, count: int) -> list[str]:
-    """Return the points that figures may go through: the centre, the examples, and so many random ones."""
+    """Return the candidate points of figures: the centre, the examples, and this many random ones."""
     return ["center", *(f"example:{name}" for name in env.examples), *(f"random:{n}" for n in range(1, count + 1))]
 
 
@@ -105,7 +104,7 @@ def _batches(points: Tensor, size: int, name: str) -> Iterator[Tensor]:
 
 
 def write_choice(path: Path, figure: str, found: dict[str, Any]) -> None:
-    """Put the point and its result into the figure's table of a list of figures, instead of those before."""
+    """Replace the point and its result in the figure's table of a list of figures."""
     text = path.read_text()
     heads = [match.start() for match in re.finditer(r"^\[\[figure\]\]$", text, flags=re.MULTILINE)] + [len(text)]
     blocks = [text[: heads[0]], *(text[low:high] for low, high in pairwise(heads))]
@@ -125,7 +124,7 @@ def write_choice(path: Path, figure: str, found: dict[str, Any]) -> None:
 
 
 def _measure(figure: Figure, asked: argparse.Namespace, paper: tuple[float, float], path: Path) -> dict[str, Any]:
-    """Return what was found of a figure, from the folder where it was kept with these settings."""
+    """Return the result of a figure, from its folder if stored with these settings."""
     kind = environment_class(figure.env)
     settings = {
         **{"figure": figure.id, "dims": list(figure.dims), "options": dict(figure.options), "paper": list(paper)},
@@ -133,7 +132,7 @@ def _measure(figure: Figure, asked: argparse.Namespace, paper: tuple[float, floa
         "model_version": kind.version_on(kind.engines[0]),
     }
     if path.exists() and {name: (kept := read_json(path)).get(name) for name in settings} == settings:
-        print(f"{figure.id}: there already", file=sys.stderr)
+        print(f"{figure.id}: already stored", file=sys.stderr)
         return dict(kept)
     env = figure.scene(asked.device, asked.fidelity).make()
     found = search(figure, env, asked.resolution, asked.random, paper)
@@ -152,7 +151,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--device", default="auto")
     parser.add_argument("--out", type=Path, default=DATA)
     parser.add_argument("--figures", type=Path, default=FIGURES, help="the list of figures")
-    parser.add_argument("--write", action="store_true", help="write what was found into the list of figures")
+    parser.add_argument("--write", action="store_true", help="write the results into the list of figures")
     asked = parser.parse_args(arguments)
     words = read_paper().words
     asked.out.mkdir(parents=True, exist_ok=True)
@@ -166,7 +165,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             continue
         found = _measure(figure, asked, paper, asked.out / f"{figure.id}.json")
         if (best := found["candidates"][0])["distance"] is None:
-            print(f"{figure.id}: a tenth of the episodes or more fail through every point; it keeps {figure.through}")
+            print(f"{figure.id}: a tenth of the episodes or more fail at every point; it keeps {figure.through}")
             continue
         ends = f"{best['lowest']:.4g} to {best['highest']:.4g}, the paper's {paper[0]:g} to {paper[1]:g}"
         print(f"{figure.id}: {best['through']}, losses {ends}, distance {best['distance']:.3g}")

@@ -1,7 +1,7 @@
 """The 24 noiseless functions of BBOB, with gradients (Hansen et al. 2009), in torch.
 
-Optima and rotations of an instance are those of the package cma, whose functions have values alone: a test holds ours
-against them. Functions are defined in the box [-5, 5], so terms that only count beyond it are left out.
+Optima and rotations of an instance are those of the package cma, whose functions have no gradients: a test compares
+ours with them. Functions are defined in the box [-5, 5], so terms that only matter outside it are left out.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ Formula = Callable[["Instance", Tensor], Tensor]
 
 @dataclass(frozen=True)
 class Instance:
-    """The numbers of one instance of a function, and parts of formulas that several of them share."""
+    """The numbers of one instance of a function, and common parts of formulas."""
 
     function: int
     dim: int
@@ -264,7 +264,7 @@ class BBOB(Objective):
         return GROUPS[max(first for first in GROUPS if first <= self.it.function)]
 
     def evaluate(self, x: Tensor, *, grad: bool = True) -> Evaluation:
-        """Return losses, and gradients if asked."""
+        """Return losses, and gradients if requested."""
         x = x.detach().double().requires_grad_(grad)
         with torch.set_grad_enabled(grad):
             loss = self.formula(self.it, x) + self.it.least

@@ -2,9 +2,9 @@
 
     python -m benchmarks.continuation bounce@standard flip rastrigin [--budget 1000] [--seeds 10] [--order zeroth]
 
-In a scene of the league the nine have the runs that are kept of it, truncated to the budget, and only continuation
-searches here; a gradient costs what it cost there. Elsewhere all ten search here. Each prints two rows of
-the table in docs/races.md.
+In a scene of the league the nine methods use their stored runs, truncated to the budget, and only continuation searches
+here; a gradient has the same cost. Elsewhere all ten search here. Each scene prints two rows of the table in
+docs/races.md.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ def function(name: str) -> Environment:
 
 
 def runs(env: Environment, methods: tuple[str, ...], budget: int, seeds: int, cost: float, order: str) -> list[KeptRun]:
-    """Return what is kept of runs of methods that search here."""
+    """Return the stored part of runs of methods that search here."""
     competitors = []
     for method in methods:
         for seed in range(seeds):
@@ -81,7 +81,7 @@ def runs(env: Environment, methods: tuple[str, ...], budget: int, seeds: int, co
 
 
 def least(found: list[KeptRun], seeds: int, *, episodes: float, forwards: float) -> Losses:
-    """Return the least losses within a number of episodes and a cost."""
+    """Return the lowest losses within a number of episodes and a cost."""
     losses: dict[str, list[float]] = {}
     for run in found:
         if run.seed < seeds:
@@ -91,7 +91,7 @@ def least(found: list[KeptRun], seeds: int, *, episodes: float, forwards: float)
 
 
 def row(losses: Mapping[str, NDArray[np.float64]]) -> list[str]:
-    """Say how continuation stands to L-BFGS-B and to all others by least losses."""
+    """Compare continuation with L-BFGS-B and all others by lowest losses."""
     found = EqualCost.within(math.nan, list(losses), np.stack(list(losses.values())))
     ranks, pairs = {one.method: one for one in found.ranks}, {one.second: one for one in seen_from(OURS, found.pairs)}
     ahead = [name for name, one in pairs.items() if one.better == OURS]

@@ -1,16 +1,16 @@
-"""Print how fast cubes sink, rise and float in the syrup of `fluid`, as shares of what is known of cubes between walls.
+"""Print how fast cubes sink, rise and float in the syrup of `fluid`, relative to known values between walls.
 
-The ladle is away. Each line is a start: the cube in the middle of the syrup, with its top at the surface, half in, or
-standing on it. In the middle, half the difference between a cube heavier than syrup and one as much lighter is held
-against the drag law, and half their sum against the weight of the syrup that the cube displaces: an error of its
-buoyancy. From the surface the heavy cube's speed is printed when its top has come to be as deep as WETTED, when it has
-slowed down, and at the end.
+There is no ladle. Each line is a start: the cube in the middle of the syrup, with its top at the surface, half in, or
+standing on it. In the middle, a cube heavier than syrup is paired with one lighter by the same amount. Half the
+difference of their speeds is compared with the drag law, and half their sum with the weight of the displaced syrup: an
+error of the buoyancy. From the surface, the heavy cube's speed is printed when its top is as deep as WETTED, when it
+has slowed down, and at the end.
 
-Known are Stokes' speed of the sphere of the cube's volume, that a cube is 0.92 times as fast (Pettyjohn and
-Christiansen, Chemical Engineering Progress 44, 157, 1948), and what slippery walls and a surface change, by images
-(Happel and Brenner, Low Reynolds Number Hydrodynamics, 1965, chapter 7), to first order in size over distance. Close
-below the surface a cube is slower, since syrup has to flow over it: what is above it is thin (a film of h lets it sink
-at about h^3 p / (600 mm^2 x 3 viscosity)).
+Known are Stokes' speed of a sphere with the cube's volume, the factor 0.92 for a cube (Pettyjohn and Christiansen,
+Chemical Engineering Progress 44, 157, 1948), and the effect of slippery walls and a surface, by images (Happel and
+Brenner, Low Reynolds Number Hydrodynamics, 1965, chapter 7), to first order in size over distance. Close below the
+surface a cube is slower, because syrup has to flow over it in a thin film (a film of h lets it sink at about h^3 p /
+(600 mm^2 x 3 viscosity)).
 
     python -m benchmarks.drag --resolution 16 --width 0.2
     python -m benchmarks.drag --resolution 32 --width 0.4 --device cuda
@@ -61,21 +61,22 @@ def main() -> None:
 
 
 def print_middle(speeds: list[float], known: float) -> None:
-    """Print what the speeds of a heavy and a light cube say of drag and buoyancy."""
+    """Print drag and buoyancy from the speeds of a heavy and a light cube."""
     half, drift = (speeds[0] - speeds[1]) / 2, (speeds[0] + speeds[1]) / 2
     error = drift / half * EXCESS / fluid.SYRUP_DENSITY
     print(
-        f"middle: {half / known:.2f} of the known speed; buoyancy {100 * error:+.1f} % of what is displaced", flush=True
+        f"middle: {half / known:.2f} of the known speed; buoyancy {100 * error:+.1f} % of the displaced weight",
+        flush=True,
     )
 
 
 def print_start(name: str, height: np.ndarray, known: float) -> None:
-    """Print how a cube goes under, by its centre's height after each control step [m]."""
+    """Print how a cube submerges, by its centre's height after each control step [m]."""
     depth = fluid.FILL - height - fluid.CUBE_EDGE / 2
     falls = -np.gradient(height, fluid.SPAN)
     under = np.flatnonzero(depth > WETTED)
     first = (
-        f"its top {WETTED * 1e3:g} mm deep after {under[0] * fluid.SPAN:.2f} s" if len(under) else "does not go under"
+        f"its top {WETTED * 1e3:g} mm deep after {under[0] * fluid.SPAN:.2f} s" if len(under) else "does not submerge"
     )
     shares = falls[10:].min() / known, falls[-10:].mean() / known
     print(f"{name}: {first}; slowest {shares[0]:.2f}, at the end {shares[1]:.2f} of the known speed", flush=True)
@@ -89,7 +90,7 @@ def speed(height: np.ndarray) -> float:
 def heights(
     fidelity: Fidelity, viscosity: float, density: float, start: float, seconds: float, device: str
 ) -> np.ndarray:
-    """Return how high a cube's centre is at the ends of control steps, without a ladle [m]."""
+    """Return the height of a cube's centre at the ends of control steps, without a ladle [m]."""
     fluid.CUBE_CENTER = (0.0, start, 0.0)
     steps = round(seconds / fluid.SPAN)
     horizon = steps * fluid.SPAN / DURATION
@@ -102,12 +103,12 @@ def heights(
 
 
 def known_speed(viscosity: float, width: float, depth: float, excess: float = EXCESS) -> float:
-    """Return how fast a cube so much heavier than syrup [kg/m^3] sinks in the middle of a square tank [m/s]."""
+    """Return the sinking speed of a cube with this excess density [kg/m^3] in the middle of a square tank [m/s]."""
     return float(SHAPE * wall_factor(width, depth) * 2 / 9 * excess * fluid.GRAVITY * RADIUS**2 / viscosity)
 
 
 def wall_factor(width: float, depth: float) -> float:
-    """Return how fast a small body sinks in the middle of a square tank, as a share of without walls.
+    """Return the sinking speed of a small body in the middle of a square tank, relative to that without walls.
 
     Slippery walls reflect: the body has images of the same force beyond them, and of the opposite force below the floor
     and above the surface. That is a lattice of forces, whose velocity is a sum over waves.

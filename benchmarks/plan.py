@@ -1,10 +1,10 @@
-"""Hold what `landscape plan` predicts, and what jobs announce, against what they then take.
+"""Compare the predictions of `landscape plan`, and the announcements of jobs, with the actual cost.
 
     python -m benchmarks.plan [--tries 3] [--only "slice of bounce"]
 
-Prints predicted / taken, the medians of some tries, plan and job in turn: `planned` seconds of the whole command after
-its start, so what a plan leaves out counts against it; `announced` seconds, of what comes after the announcement; and
-`bytes` on the disk.
+Prints predicted / actual cost, the medians of some tries, plan and job in turn: `planned` seconds of the whole command
+after its start, including everything that a plan leaves out; `announced` seconds, of the time after the announcement;
+and `bytes` on the disk.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ UNITS = {"s": 1.0, "min": 60.0, "h": 3600.0}
 
 
 def run(command: str, folder: Path) -> tuple[dict[str, float], float, float | None]:
-    """Run a command in a folder; return what it printed as JSON, its seconds, and announced / taken after that."""
+    """Run a command in a folder; return its JSON output, its seconds, and announced / actual seconds after that."""
     began, said, at = time.perf_counter(), 0.0, 0.0
     words = [sys.executable, "-m", "gradscape", *command.split(), "--json"]
     with subprocess.Popen(words, stdout=(folder / "printed").open("w"), stderr=subprocess.PIPE, cwd=folder) as job:
@@ -54,7 +54,7 @@ def run(command: str, folder: Path) -> tuple[dict[str, float], float, float | No
 
 
 def ratios(job: str, folder: Path) -> dict[str, float]:
-    """Plan a job, do it, and return what was predicted by what it took."""
+    """Plan a job, run it, and return the predicted cost over the actual one."""
     _, start, _ = run("info", folder)
     planned, _, _ = run(f"plan {job} --device cpu", folder)
     _, taken, announced = run(f"{job} --device cpu --out made", folder)

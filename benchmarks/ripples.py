@@ -1,13 +1,13 @@
-"""Look for ripples whose wavelength is a grid's cell in the losses of MPM scenes.
+"""Search the losses of MPM scenes for ripples with the wavelength of a grid cell.
 
     python -m benchmarks.ripples [fluid torus assembly table triple-move] [--grids 0.75 1 1.5 2] [--lines 8]
 
 Losses are taken along lines through random base points, each along one parameter that moves a tool by several cells.
-The ripple at a wavelength is read off the spectrum of the line's second differences, and is an amplitude by the
-line's range [%]. `own` is the greatest near the wavelength of the grid's own cells, `others` what grids of other sizes
-have there: what is the landscape's is in both, what moves with the cells in the first alone, and `excess` is the root
-of the difference of their squares. Medians over lines, and the greatest excess. Below stands by how much gradients are
-off the slopes over 1e-4 and 1e-2 of the box in random directions.
+The ripple at a wavelength comes from the spectrum of the line's second differences, as an amplitude relative to the
+line's range [%]. `own` is the largest near the wavelength of the grid's own cells, `others` that of grids with other
+sizes at the same wavelength. Ripples of the landscape are in both, ripples of the cells only in the first, and `excess`
+is the root of the difference of their squares. Values are medians over lines, and the largest excess. The last line
+gives the difference of gradients from slopes over 1e-4 and 1e-2 of the box in random directions.
 """
 
 from __future__ import annotations
@@ -49,13 +49,13 @@ def inner_points(space: gs.ParameterSpace, count: int, seed: int) -> Tensor:
 
 
 def cells_crossed(env: MpmScene, lines: Tensor) -> np.ndarray:
-    """Return by how many cells each line moves the tools at the episode's end, the farthest of them, shape (line,)."""
+    """Return the largest tool movement along each line at the episode's end, in cells, shape (line,)."""
     first, last = (env.tools(lines[:, k])[:, -1] for k in (0, -1))
     return ((last - first).abs().amax(dim=(1, 2)) / env.model.dx).numpy()
 
 
 def amplitude(losses: np.ndarray, cycles: float) -> float:
-    """Return the greatest amplitude of a line's ripples near so many cycles along it, by the line's range.
+    """Return the largest amplitude of a line's ripples near this many cycles along it, relative to the line's range.
 
     NaN where a sample failed, or where a ripple has fewer than four samples.
     """
@@ -78,7 +78,7 @@ def losses_of(env: gs.Environment, lines: Tensor) -> np.ndarray:
 
 
 def compare(losses: Mapping[int, np.ndarray], crossed: Mapping[int, np.ndarray]) -> dict[int, np.ndarray]:
-    """Return what each grid's lines have at their own cells' wavelength, and others there [%], shape (line, 2)."""
+    """Return the ripples of each grid's lines at its own wavelength, and of others there [%], shape (line, 2)."""
     found = {}
     for cells, cycles in crossed.items():
         rest = [line for other, line in losses.items() if other != cells]
@@ -107,7 +107,7 @@ def slopes(env: gs.Environment, count: int = 48, seed: int = 1) -> list[float]:
 
 
 def on_grid(env: MpmScene, part: float) -> MpmScene:
-    """Return a scene on a grid of so many times the cells, of smaller steps where cells are smaller."""
+    """Return a scene on a grid with this factor on its cells, with smaller steps if cells are smaller."""
     known = env.fidelity
     cells = round(part * known.resolution)
     finer = cells / known.resolution
@@ -146,7 +146,7 @@ def main() -> None:
         standard = gs.make(name, fidelity="standard", device=given.device)
         print("\n".join(table(standard, given.grids, given.lines)), flush=True)
         off = " and ".join(f"{100 * one:.1f} %" for one in slopes(standard))
-        print(f"\n{name}: gradients are off the slopes over {PARTS} of the box by {off} (medians)\n", flush=True)
+        print(f"\n{name}: gradients differ from the slopes over {PARTS} of the box by {off} (medians)\n", flush=True)
 
 
 if __name__ == "__main__":

@@ -1,11 +1,11 @@
-"""What the start of a command costs, and whether a change made it shorter.
+"""Measure the start-up time of a command, and the effect of a change on it.
 
     python -m benchmarks.start [pinball-2] [--repetitions 5] [--against OTHER/src]
 
-`landscape slice ENV --dims 0 1` is run again and again on warm caches, each time in a process and a folder of its own.
-Printed are the share of its time that importing takes, and the share of each package in that. With
-`--against` the same command of another checkout runs in turn with it, so that what else the machine does falls on both;
-the ratio is that of the medians. Times of different runs are not to be divided by each other.
+`landscape slice ENV --dims 0 1` runs repeatedly on warm caches, each time in its own process and folder. It prints the
+share of importing in its time, and the share of each package in that. With `--against` the same command of another
+checkout runs in turn with it, so that other load on the machine affects both; the ratio is that of the medians. Do not
+compare times of different runs.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ MAX_PACKAGES = 8
 
 @dataclass(frozen=True)
 class Spent:
-    """Seconds of a command by the clock, of processors, and of importing by package where that was asked."""
+    """Seconds of a command: wall clock, processor time, and imports by package if requested."""
 
     clock: float
     processor: float

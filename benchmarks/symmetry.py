@@ -1,10 +1,10 @@
-"""Measure the numerical floor of every scene at draft and standard, and keep it for the table of docs/fidelities.md.
+"""Measure the numerical floor of every scene at draft and standard, for the table of docs/fidelities.md.
 
     python -m benchmarks.symmetry [ENV ...] [--fidelities draft standard] [--points 32] [--device auto]
         [--out symmetry] [--data gallery/data/floors.json]
 
-Each is a `landscape study symmetry` in a folder of its own under --out, which is continued where it was stopped. A row
-of --data is replaced by one of the same scene, fidelity and device; `python -m docs.pages.tables` writes the table.
+Each is a `landscape study symmetry` in its own folder under --out, which continues after a stop. A new row replaces one
+with the same scene, fidelity and device in --data; `python -m docs.pages.tables` writes the table.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from gradscape.studies.symmetry import SymmetryRecord
 
 
 def study(scene: str, fidelity: str, asked: argparse.Namespace) -> SymmetryRecord:
-    """Return what is measured of a scene; a folder that holds another study is begun again."""
+    """Return the study of a scene; a folder with another study is started again."""
     how: dict[str, Any] = {"fidelity": fidelity, "points": asked.points, "device": asked.device}
     how["out"] = asked.out / f"{scene}-{fidelity}"
     try:
@@ -37,20 +37,20 @@ def study(scene: str, fidelity: str, asked: argparse.Namespace) -> SymmetryRecor
 
 
 def row(found: SymmetryRecord) -> dict[str, Any]:
-    """Return what is kept of a study."""
+    """Return the stored part of a study."""
     parts = ("env", "fidelity", "device", "points", "floor", "replicas", "identity", "command")
     return {name: to_json(getattr(found, name)) for name in parts}
 
 
 def replace_row(rows: list[dict[str, Any]], new: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return the rows with a new one, which takes over from one of the same scene, fidelity and device."""
+    """Return the rows with a new one, which replaces one with the same scene, fidelity and device."""
     key = ("env", "fidelity", "device")
     left = [one for one in rows if any(one[name] != new[name] for name in key)]
     return sorted([*left, new], key=lambda one: [one[name] for name in key])
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Measure what is asked for, and say the floor of each."""
+    """Measure the requested scenes, and print the floor of each."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("only", nargs="*", metavar="ENV", help="scenes, by default all")
     parser.add_argument("--fidelities", nargs="+", default=["draft", "standard"])

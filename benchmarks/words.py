@@ -1,12 +1,10 @@
-"""Judge functions of known character at seven resolutions.
-
-Is each word right, and the same at all of them?
+"""Judge functions of known character at seven resolutions, to test whether words are right and stable.
 
     python -m benchmarks.words [NAME ...] [--resolutions 12 16 24 32 48 96 192] [--samples-only]
 
-Each function says which words may be said of it; any other is wrong. It says, too, which have to be said at 96 x 96
-and more samples. A word changes where two resolutions that both resolve it disagree. The thresholds of the words were
-chosen by the functions with even numbers; those with odd numbers were looked at last.
+Each function lists its allowed words; any other is wrong. It also lists the words required at 96 x 96 and more samples.
+A word changes if two resolutions that both resolve it disagree. The thresholds of the words were chosen on the
+functions with even numbers; those with odd numbers were examined last.
 """
 
 from __future__ import annotations
@@ -39,10 +37,10 @@ Loss = Callable[[Tensor], Tensor]
 
 @dataclass(frozen=True)
 class Known:
-    """Hold a function whose character is known: the words that `may` be said of it, and those that `must` be.
+    """A function with a known character: its allowed words (`may`), and its required ones (`must`).
 
-    Its box is a square from `low` to `high`. `slope` makes its gradient where that is not the loss's own, `noise`
-    [loss unit] is the deviation of independent draws that are added, and `fails` says where it has no loss.
+    Its box is a square from `low` to `high`. `slope` makes its gradient where that is not the loss's own, `noise` [loss
+    unit] is the deviation of added independent draws, and `fails` marks where it has no loss.
     """
 
     name: str
@@ -67,7 +65,7 @@ class KnownObjective(Objective):
         self.generator = torch.Generator().manual_seed(0)
 
     def evaluate(self, x: Tensor, *, grad: bool = True) -> Evaluation:
-        """Return losses, and gradients if asked."""
+        """Return losses, and gradients if requested."""
         parts = [self._rows(rows, grad=grad) for rows in torch.split(x, ROWS)]
         return Evaluation.join(parts, dim=2, grad=grad)
 
@@ -85,7 +83,7 @@ class KnownObjective(Objective):
 
 
 def judge(known: Known, resolution: int, *, samples_only: bool = False) -> Verdict:
-    """Sample a known function, and put what is found into words."""
+    """Sample a known function, and describe it in words."""
     objective = KnownObjective(known)
     dataset = gs.sample(
         objective, gs.Plane.through(objective.space, objective.space.center, (0, 1), resolution=resolution)
@@ -154,7 +152,8 @@ def _levy(x: Tensor) -> Tensor:
 def _brownian(hurst: float, seed: int) -> Loss:
     """Return a surface whose differences grow like the distance to the power `hurst`, down to 1/16384 of the box.
 
-    A sum of plane waves, 48 in random directions for each octave of their frequency, amplitudes falling like its power.
+    A sum of plane waves, 48 in random directions for each octave of their frequency, with amplitudes falling like its
+    power.
     """
     generator = torch.Generator().manual_seed(seed)
     octaves, each = 14, 48
@@ -173,7 +172,7 @@ def _weierstrass(x: Tensor) -> Tensor:
 
 
 def _fault(part: float, *, curved: bool = False) -> Loss:
-    """Return a bowl with a step by this part of its range, along a line at an angle or along a circle."""
+    """Return a bowl with a step of this part of its range, along a line at an angle or along a circle."""
     height = 2 * part / (1 - min(part, 0.5))
 
     def loss(x: Tensor) -> Tensor:
@@ -190,7 +189,7 @@ def _spiral(x: Tensor) -> Tensor:
 
 
 def _needles(count: int, width: float) -> Loss:
-    """Return a bowl with so many narrow holes, as deep as its range, at random places."""
+    """Return a bowl with this many narrow holes, as deep as its range, at random points."""
     places = 1.8 * torch.rand(count, 2, generator=torch.Generator().manual_seed(4)).double() - 0.9
 
     def loss(x: Tensor) -> Tensor:
@@ -325,25 +324,25 @@ FUNCTIONS = tuple(one for members in KINDS.values() for one in members)
 
 @dataclass(frozen=True)
 class Row:
-    """Hold what was said of one function at each resolution, and what of it is wrong, changes or is missing."""
+    """The words of one function at each resolution, and the wrong, changing and missing ones."""
 
     known: Known
     verdicts: Mapping[int, Verdict]
 
     @property
     def wrong(self) -> list[tuple[int, str]]:
-        """The words that may not be said, with their resolutions."""
+        """The words that are not allowed, with their resolutions."""
         return [(n, word) for n, one in self.verdicts.items() for word in one.words if word not in self.known.may]
 
     @property
     def missing(self) -> list[tuple[int, str]]:
-        """The words that have to be said and are not, at fine resolutions."""
+        """The required words that are missing at fine resolutions."""
         fine = {n: one for n, one in self.verdicts.items() if n >= FINE}
         return [(n, word) for n, one in fine.items() for word in sorted(self.known.must) if word not in one.words]
 
     @property
     def changed(self) -> list[str]:
-        """The words that two resolutions disagree about though both resolve them."""
+        """The words on which two resolutions disagree although both resolve them."""
         found = set[str]()
         for one in self.verdicts.values():
             for other in self.verdicts.values():
@@ -352,7 +351,7 @@ class Row:
 
 
 def _disagree(one: Verdict, other: Verdict) -> set[str]:
-    """Return words of the first that the second denies."""
+    """Return words of the first that the second contradicts."""
     denied = set[str]()
     if one.surface.flat != other.surface.flat:
         denied.add(words.FLAT)
@@ -371,13 +370,13 @@ def _disagree(one: Verdict, other: Verdict) -> set[str]:
 
 
 def _denies(found: Jumps, other: Jumps) -> bool:
-    """Whether a search that found no jump rules out as many lines as cross one in another."""
+    """Return whether a search without jumps excludes as many lines as cross one in another."""
     return not other.found and found.share.low > other.unseen
 
 
 def table(rows: Sequence[Row]) -> str:
-    """Return a Markdown table: the words by the number of samples along a side, and what is wrong of them."""
-    lines = ["| function | said, by samples along a side | wrong | changes | missing |", "|---" * 5 + "|"]
+    """Return a Markdown table: the words by the number of samples along a side, and their errors."""
+    lines = ["| function | words, by samples along a side | wrong | changes | missing |", "|---" * 5 + "|"]
     for row in rows:
         said = {n: ", ".join(_shown(one)) or "nothing" for n, one in row.verdicts.items()}
         wrong = ", ".join(f"{word} ({n})" for n, word in row.wrong)
@@ -387,7 +386,7 @@ def table(rows: Sequence[Row]) -> str:
 
 
 def grouped(said: Mapping[int, str]) -> str:
-    """Write neighbouring resolutions that have the same words as one range."""
+    """Write neighbouring resolutions with the same words as one range."""
     runs = [list(run) for _, run in groupby(said, key=said.__getitem__)]
     ends = [f"{run[0]} to {run[-1]}" if len(run) > 1 else f"{run[0]}" for run in runs]
     return "; ".join(f"{end}: {said[run[0]]}" for end, run in zip(ends, runs, strict=True))
@@ -398,7 +397,7 @@ def _shown(one: Verdict) -> list[str]:
 
 
 def main() -> None:
-    """Judge the functions that are named, or all, and print the table."""
+    """Judge the named functions, or all, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("names", nargs="*")
     parser.add_argument("--resolutions", nargs="+", type=int, default=RESOLUTIONS)
@@ -407,7 +406,7 @@ def main() -> None:
     chosen = [one for one in FUNCTIONS if not given.names or one.name in given.names]
     rows = [Row(one, {n: judge(one, n, samples_only=given.samples_only) for n in given.resolutions}) for one in chosen]
     print(table(rows))
-    for half, part in (("chosen by", rows[::2]), ("looked at last", rows[1::2])):
+    for half, part in (("chosen by", rows[::2]), ("examined last", rows[1::2])):
         wrong, changed, missing = (
             sum(len(getattr(row, what)) for row in part) for what in ("wrong", "changed", "missing")
         )

@@ -1,1 +1,1 @@
-"""The verbs of the command `landscape`, one file each: their options, and what they print."""
+"""The output of the command `landscape`, one file per kind of result."""

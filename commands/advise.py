@@ -13,32 +13,32 @@ if TYPE_CHECKING:
 
 
 def show(found: Advice, console: Console) -> None:
-    """Print what was measured, the cases that are nearest, what to expect of each method, and what that comes to."""
+    """Print the measures, the expected rank of each method, the nearest cases and the advice."""
     console.soft_wrap = True
     console.print(_measures(found.character))
     console.print(_expected(found))
     console.print(_cases(found))
     for method, why in found.unable.items():
-        console.print(f"without {method}: {why}")
+        console.print(f"{method} cannot run here: {why}")
     if found.best is not None:
         unit = f" {found.loss_unit}" if found.loss_unit else ""
         console.print(f"best of the {found.evaluations} points: loss {found.best.loss:.6g}{unit}")
     if math.isfinite(found.gradient_cost):
-        console.print(f"an episode with gradient costs about {found.gradient_cost:.1f} episodes without")
+        console.print(f"an episode with gradient costs about {found.gradient_cost:.1f} times one without")
     console.print(f"fidelity: {found.fidelity_advice}")
     console.print(f"remedy: {found.remedy_advice}")
     console.print(f"method: {found.sentence}")
 
 
 def _measures(character: Character) -> Table:
-    shown = table("measured", "value", "which means", title=f"{character.evaluations} points over all parameters")
+    shown = table("measure", "value", "meaning", title=f"{character.evaluations} points over all parameters")
     for row in character.rows():
         shown.add_row(*row)
     return shown
 
 
 def _expected(found: Advice) -> Table:
-    shown = table("method", "mean rank to expect", title="by the nearest cases")
+    shown = table("method", "expected mean rank", title="prediction from the nearest cases")
     for method, rank in found.choice.expected.items():
         shown.add_row(method, f"{rank:.1f}")
     return shown
@@ -46,7 +46,7 @@ def _expected(found: Advice) -> Table:
 
 def _cases(found: Advice) -> Table:
     method = found.choice.method
-    shown = table("nearest case", "family", "distance", "best there", f"rank of {method}", title="evidence")
+    shown = table("nearest case", "family", "distance", "best methods", f"rank of {method}", title="evidence")
     for one in found.choice.nearest:
         shown.add_row(one.name, one.family, f"{one.distance:.2f}", ", ".join(one.best), f"{one.rank:.1f}")
     return shown

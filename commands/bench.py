@@ -18,17 +18,17 @@ def show(found: Bench, console: Console) -> None:
     for rate in found.rates:
         if rate.ratio_forward is not None:
             ratios = f"{rate.ratio_forward:.2f} forward, {rate.ratio_with_gradient:.2f} with gradient"
-            console.print(f"batch {rate.batch}, {rate.engine} : {found.against} = {ratios}")
+            console.print(f"batch {rate.batch}, speed of {rate.engine} relative to {found.against}: {ratios}")
         if rate.failed:
             console.print(f"batch {rate.batch}, {rate.engine}: {rate.failed} episodes failed")
     if found.kernels and found.kernels["forward"].kernels:
         console.print(_kernels(*found.kernels.values()))
     if one := found.adapter:
         console.print(
-            f"a batch of {one.batch}: {one.forward:.1%} of the time is not the engine's own program, "
+            f"a batch of {one.batch}: {one.forward:.1%} of the time is spent outside the engine's own program, "
             f"{one.with_gradient:.1%} with gradient",
         )
-    said = f"sampling {found.sampler.points} points: {found.sampler.share:.1%} of the time is the sampler's own"
+    said = f"sampling {found.sampler.points} points: the sampler itself takes {found.sampler.share:.1%} of the time"
     console.print(said)
 
 
@@ -40,13 +40,13 @@ def _subject(found: Bench) -> str:
     unit = work.unit + "s" * (work.count != 1)
     lines = [
         f"{found.env} · {found.fidelity} · {found.device} ({found.hardware}) · {found.engine}",
-        f"points: {'the same' if found.same_points else 'others'} in each repetition",
+        f"points: {'the same' if found.same_points else 'different'} in each repetition",
         f"an episode: {work.count:,} {unit}, about {size(memory.estimated)}"
-        + (f"; {size(memory.measured)} of the GPU" if memory.measured is not None else ""),
+        + (f"; {size(memory.measured)} on the GPU" if memory.measured is not None else ""),
     ]
     for engine, start in found.start.items():
         modules = {None: "", 0: ", kernels from the cache"}.get(
-            start.compiled, f", {start.compiled} modules of kernels compiled"
+            start.compiled, f", {start.compiled} kernel modules compiled"
         )
         lines.append(f"{engine} was ready in {duration(start.seconds)}{modules}")
     return "\n".join(lines)

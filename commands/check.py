@@ -1,4 +1,4 @@
-"""What a check found, on the terminal: what is wrong and what to try, then tables, then each check."""
+"""The result of a check, on the terminal: what is wrong and what to try, then tables, then each check."""
 
 from __future__ import annotations
 

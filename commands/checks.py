@@ -1,4 +1,4 @@
-"""What the checks of several environments found, on the terminal."""
+"""The results of checks of several environments, on the terminal."""
 
 from __future__ import annotations
 

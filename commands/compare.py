@@ -13,7 +13,7 @@ LISTED = 12  # settings that differ, in the terminal
 
 
 def show(found: SliceComparison, console: Console) -> None:
-    """Print a row for each number, where losses part, and the settings that differ."""
+    """Print a row for each number, the largest difference, and the settings that differ."""
     console.print(f"A: {found.a}\nB: {found.b}")
     rows = table("measure", "value, 95 % interval", box=SIMPLE, padding=(0, 1))
     for name, one in found.table().iterrows():
@@ -35,13 +35,13 @@ def _format(row: Any) -> str:
 
 
 def lines(found: SliceComparison) -> list[str]:
-    """Say where losses part, how points ended differently, and which settings differ."""
+    """Describe the largest difference, points with different statuses, and the settings that differ."""
     from ..jobs.compare import RECORD
 
     said, unit = list[str](), f" {found.loss_unit}".rstrip()
     if apart := found.parting:
         place = ", ".join(f"{label} {value:.4g}" for label, value in apart.place.items())
-        said.append(f"farthest apart at {place}: A {apart.a:.4g}{unit}, B - A {apart.b - apart.a:.4g}{unit}")
+        said.append(f"largest difference at {place}: A {apart.a:.4g}{unit}, B - A {apart.b - apart.a:.4g}{unit}")
     said += [f"{one.points} points are {one.a} in A and {one.b} in B" for one in found.statuses]
     differing = found.settings()
     said += differing[:LISTED] or ["no setting differs"]

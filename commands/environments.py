@@ -1,4 +1,4 @@
-"""What there is: environments, methods, versions and devices."""
+"""Environments, methods, versions and devices, on the terminal."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 def show_entries(found: list[Entry], console: Console) -> None:
     """Print every registered environment as a row of a table.
 
-    One whose engine is not installed is grey, and below is what installs it.
+    An environment whose engine is not installed is grey, and a line below says how to install it.
     """
     from ..envs.registry import installs
 
@@ -32,7 +32,7 @@ def show_entries(found: list[Entry], console: Console) -> None:
     for line in sorted({installs(entry) for entry in found} - {""}):
         names = ", ".join(entry.name for entry in found if installs(entry) == line)
         console.print(f"not installed: {names}; {line}", soft_wrap=True)
-    console.print("`landscape envs NAME` shows one in full: bounds, options, examples, fidelities, what it models.")
+    console.print("`landscape envs NAME` describes one in full: its model, bounds, options, examples and fidelities.")
 
 
 def show_environment(env: Environment, console: Console) -> None:
@@ -43,7 +43,7 @@ def show_environment(env: Environment, console: Console) -> None:
     from ..landscapes.space import LOG10
     from ..studies.kept import describe_margins
 
-    about = env.about() or "It says nothing of itself: its class has no docstring."
+    about = env.about() or "No description: its class has no docstring."
     console.print(f"{env.name}: {env.space.dim} parameter{'s' if env.space.dim > 1 else ''}\n")
     console.print(f"{_flowing(about)}\n")
     bounded = table("no.", "parameter", "lower", "upper", "unit")
@@ -130,7 +130,7 @@ def show_methods(found: list[Method], console: Console) -> None:
     for method in found:
         shown.add_row(method.name, method.summary, f"extra {method.extra}" if method.extra else "")
     console.print(shown)
-    console.print("`landscape methods NAME` shows one in full: what it does, its options and their defaults.")
+    console.print("`landscape methods NAME` describes one in full: what it does, its options and their defaults.")
 
 
 def show_method(kind: type[Optimizer], console: Console) -> None:
@@ -144,7 +144,7 @@ def show_method(kind: type[Optimizer], console: Console) -> None:
     texts = [find_method(kind.name).summary, inspect.getdoc(kind) or ""]
     texts += [f"gradients: {'yes' if kind.needs_grad else 'no'}", in_full(kind.Options)]
     if sources := defaults(kind.Options):
-        texts.append("whose defaults: " + ", ".join(f"{one.option} {one.source}" for one in sources))
+        texts.append("sources of defaults: " + ", ".join(f"{one.option} {one.source}" for one in sources))
     console.print(_flowing(f"{kind.name}: " + "\n\n".join(texts)))
 
 

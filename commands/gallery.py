@@ -1,4 +1,4 @@
-"""What the gallery holds, on the terminal."""
+"""The content of the gallery, on the terminal."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def show_computed(found: Computed, console: Console) -> int:
 
 
 def show_figures(found: FigureList, console: Console) -> None:
-    """Print a row for each figure, and how many are missing or older."""
+    """Print a row for each figure, and how many are missing or out of date."""
     listed = table("figure", "paper", "environment", "dims", "through", "data", title=f"figures in {found.folder}")
     for figure, state in found.figures:
         dims, number = " ".join(map(str, figure.dims)), str(figure.caption.number or "ours")
@@ -29,12 +29,13 @@ def show_figures(found: FigureList, console: Console) -> None:
     console.print(listed)
     missing = sum(not state.finished for _, state in found.figures)
     console.print(
-        f"{len(found.figures) - missing} there, {missing} missing; `landscape gallery compute` samples what is missing",
+        f"{len(found.figures) - missing} sampled, {missing} missing; `landscape gallery compute` samples the missing "
+        "ones",
         soft_wrap=True,
     )
     if older := sum(bool(state.changed) for _, state in found.figures):
         console.print(
-            f"{older} are older: they were sampled with other settings than their fidelity has now; "
+            f"{older} out of date: the settings of their fidelity have changed since; "
             f"to sample one again, delete its folder in {found.folder}",
             soft_wrap=True,
         )
@@ -48,11 +49,9 @@ def show_slices(found: SliceTable, console: Console) -> None:
         about = (str(row[name] or "") for name in ("env", "dims", "resolution"))
         listed.add_row(os.path.relpath(row["folder"], found.folder), *about, losses, str(row["failed"]))
     console.print(listed)
-    more = f", the first {MAX_ROWS} of them here; --json prints all" if len(found.rows) > MAX_ROWS else ""
+    more = f", the first {MAX_ROWS} are shown; --json prints all" if len(found.rows) > MAX_ROWS else ""
     count = len(found.rows)
     console.print(f"{count} slice{'s' * (count != 1)} in {found.folder}{more}", soft_wrap=True)
-    for count, what in ((found.damaged, "a damaged summary"), (found.bare, "no summary, as they are not finished")):
+    for count, what in ((found.damaged, "with a damaged summary"), (found.bare, "unfinished, without a summary")):
         if count:
-            console.print(
-                f"{count} more have {what}; the commands that made them continue from what is there", soft_wrap=True
-            )
+            console.print(f"{count} more {what}: run the commands that made them again to continue", soft_wrap=True)

@@ -12,23 +12,25 @@ if TYPE_CHECKING:
 
 
 def show(found: Hessian, console: Console) -> None:
-    """Print the eigenvalues with errors and directions, then what all of them say, and what makes it doubtful."""
+    """Print the eigenvalues with errors and directions, then the summary of the spectrum, then warnings."""
     unit = f" [{found.loss_unit}]" if found.loss_unit else ""
     console.print(f"{found.env} · {found.fidelity} · at {found.through}: {found.kind}; {found.episodes} episodes")
-    console.print(f"In {found.units}. Differences of {found.source} over {found.step:.2g} of the box.")
+    console.print(f"In {found.units}. From differences of {found.source} over {found.step:.2g} of the box.")
     rows = table("no.", f"eigenvalue{unit}", "error", "sign", "by losses", "direction", box=SIMPLE)
     rows.columns[0].no_wrap = True
     for pair in found.pairs:
         numbers = (f"{pair.value:.6g}", f"{pair.error:.2g}", pair.sign, number(pair.by_losses, ".6g"))
         rows.add_row(str(pair.place), *numbers, pair.direction())
     console.print(rows)
-    console.print(f"trace: {_estimate(found.trace)}{'' if found.whole else f', of {len(found.nodes)} random probes'}")
+    console.print(f"trace: {_estimate(found.trace)}{'' if found.whole else f', from {len(found.nodes)} random probes'}")
     console.print(f"condition number: {_condition(found.condition)}")
-    untold = f"; of {found.undecided:.0%} the sign cannot be told" if found.undecided else ""
+    untold = f"; the sign of {found.undecided:.0%} is uncertain" if found.undecided else ""
     share = found.negative
     bounds = "" if found.whole and not found.undecided else f" ({share.low:.0%} to {share.high:.0%})"
     console.print(f"negative curvature: {share.value:.0%} of the eigenvalues{bounds}{untold}")
-    console.print(f"asymmetry: {found.asymmetry:.1g}, of which differences explain {found.asymmetry_explained:.1g}")
+    console.print(
+        f"asymmetry: {found.asymmetry:.1g}, of which the finite differences explain {found.asymmetry_explained:.1g}"
+    )
     for warning in found.warnings:
         console.print(f"warning: {warning}")
 

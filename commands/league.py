@@ -11,9 +11,9 @@ if TYPE_CHECKING:
 
 
 def show(found: League, console: Console, *, claims: bool = False) -> int:
-    """Print mean ranks by scene, and if asked the paper's claims with what was measured.
+    """Print mean ranks by scene, and the paper's claims with the results if asked.
 
-    The exit code is 1 where a scene could not be raced.
+    The exit code is 1 if a scene could not be raced.
 
     Parameters
     ----------
@@ -29,7 +29,7 @@ def show(found: League, console: Console, *, claims: bool = False) -> int:
             console.print(f"{scene.env}: not distinguishable from random search: {', '.join(lost)}")
         if best := scene.best:
             unit = f" {scene.loss_unit}" if scene.loss_unit else ""
-            console.print(f"{scene.env}: least loss {best.loss:.6g}{unit}, by {best.method}, seed {best.seed}")
+            console.print(f"{scene.env}: lowest loss {best.loss:.6g}{unit}, by {best.method}, seed {best.seed}")
     if claims:
         shown = _claims(found)
         console.print(shown if shown.row_count else "The paper compares no optimisers in these scenes.")
@@ -37,7 +37,7 @@ def show(found: League, console: Console, *, claims: bool = False) -> int:
 
 
 def _ranks(found: League) -> Table:
-    title = "mean ranks after all episodes, 1 is best, with 95 % intervals over seeds"
+    title = "mean ranks after all episodes (1 is best), with 95 % intervals over seeds"
     shown = table("scene", *found.methods, title=title)
     for scene in found.scenes:
         by = {one.method: _format(one.rank, one.rank_low, one.rank_high) for one in scene.standings}
@@ -47,7 +47,7 @@ def _ranks(found: League) -> Table:
 
 
 def _cost_ranks(found: League) -> Table:
-    """Show ranks within the same cost, which a gradient takes more of than a loss."""
+    """Show ranks within the same cost, because a gradient costs more than a loss."""
     title = "mean ranks at equal forward equivalents, with 95 % intervals over seeds"
     shown = table("scene", *found.methods, title=title)
     for scene in found.scenes:
@@ -62,8 +62,8 @@ def _cost_ranks(found: League) -> Table:
 def _claims(found: League) -> Table:
     from ..gallery.paper import read_paper
 
-    headings = ("scene", "claim", "this league", "wins", "corrected p", "where the paper says so")
-    shown = table(*headings, title="what the paper claims, and this league")
+    headings = ("scene", "claim", "this league", "wins", "corrected p", "place in the paper")
+    shown = table(*headings, title="claims of the paper, and this league")
     for scene in found.scenes:
         for finding in scene.findings(read_paper().claims_about(scene.env)):
             one = finding.superiority

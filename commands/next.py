@@ -1,4 +1,4 @@
-"""What to do next: a command for each kind of result, which a verb says last."""
+"""The next command for each kind of result, which a verb prints last."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ LEADERS = {"interaction": "strongest interaction", "ruggedness": "most rugged", 
 
 
 def show(ranking: PairRanking, console: Console, *, top: Annotated[int, at_least(1)] = 10) -> None:
-    """Print the highest pairs, who leads in each measure, and the command that slices the first.
+    """Print the highest pairs, the leading pair in each measure, and the command that slices the first.
 
     Parameters
     ----------
@@ -33,9 +33,9 @@ def show(ranking: PairRanking, console: Console, *, top: Annotated[int, at_least
     console.print(said)
     console.print(found)
     console.print(
-        "sensitivity: share of the loss's variance that a slice shows on average; interaction: what both do only "
-        "together; ruggedness: ups and downs along a tenth of the box, in standard deviations; disagreement of "
-        "gradients with slopes over a twentieth of it: 0 none, 1 zero or opposite; "
+        "sensitivity: share of the loss's variance that a slice shows on average; interaction: share that needs both "
+        "parameters together; ruggedness: ups and downs along a tenth of the box, in standard deviations; "
+        "disagreement: of gradients with slopes over a twentieth of the box, 0 none, 1 zero or opposite; "
         "score: sensitivity x (1 + the others).",
     )
     for line in _leaders(ranking):

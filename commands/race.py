@@ -16,7 +16,7 @@ PAPER_SEEDS = 10  # as many as the paper has
 
 
 def show(race: Race, console: Console, *, claims: bool = False) -> None:
-    """Print ranks and comparisons, and if asked the paper's claims with what was measured.
+    """Print ranks and comparisons, and the paper's claims with the results if asked.
 
     Parameters
     ----------
@@ -65,7 +65,7 @@ def _running_times(race: Race) -> Table:
     figures = race.statistics
     some = figures.targets.some[::-1]
     losses = [f"{figures.targets.loss[number]:.3g}" for number in some]
-    title = f"episodes that a method takes to reach a loss{_unit(race)}, by restarts until it does"
+    title = f"expected episodes to reach a loss{_unit(race)}, with restarts"
     shown = table("method", *losses, title=title)
     for rank in figures.ranks:
         times = figures.running_times[rank.method][some]
@@ -74,7 +74,7 @@ def _running_times(race: Race) -> Table:
 
 
 def _comparisons(race: Race) -> Iterator[str]:
-    """Say who leads, and of each method, by rank, which others it is better than, and which cannot be told from it."""
+    """Say which method leads, and which others each method is better than, or not distinguishable from, by rank."""
     figures = race.statistics
     seen = [one for pair in figures.superiorities for one in (pair, pair.reversed)]
     if not seen:
@@ -83,7 +83,7 @@ def _comparisons(race: Race) -> Iterator[str]:
     yield f"after {race.budget} episodes: {figures.lead.describe()}"
     at_cost = figures.equal_cost
     yield f"within {at_cost.forwards:.0f} forward equivalents each: {at_cost.lead.describe()}"
-    yield f"p is that of the rank test, corrected for {count} comparison{'s' if count > 1 else ''}"
+    yield f"p is from the rank test, corrected for {count} comparison{'s' if count > 1 else ''}"
     for method in (rank.method for rank in figures.ranks):
         own = [one for one in seen if one.first == method]
         if said := [_pair(one) for one in own if one.better == method]:
@@ -100,15 +100,15 @@ def _doubt(seeds: int) -> str:
     from ..optim.race import name_seeds
 
     if seeds == 1:
-        return "one seed: no intervals, so no method is better than another"
+        return "one seed gives no intervals, so no method counts as better than another"
     return (
-        f"{name_seeds(seeds)}: too few for intervals as wide as they should be "
-        "(with 3 they cover the true mean in 75 % of cases, with 10 in 91 %)"
+        f"the intervals from {name_seeds(seeds)} are too narrow "
+        "(with 3 seeds they cover the true mean in 75 % of cases, with 10 in 91 %)"
     )
 
 
 def _claims(race: Race) -> Table | str:
-    """Return what the race makes of the paper's claims about its environment, or why there is none."""
+    """Return the paper's claims about the environment with the results of this race, or why there is no claim."""
     from ..gallery.paper import read_paper
     from ..optim.claims import check_claims
 
@@ -116,8 +116,8 @@ def _claims(race: Race) -> Table | str:
     if not claimed.claims:
         return claimed.silence or ""
     means = f"difference of mean losses{_unit(race)}"
-    headings = ("claim", "this race", "wins", "corrected p", means, "where the paper says so")
-    shown = table(*headings, title="what the paper claims, and this race")
+    headings = ("claim", "this race", "wins", "corrected p", means, "place in the paper")
+    shown = table(*headings, title="claims of the paper, and this race")
     for finding in check_claims(claimed.claims, race.statistics.differences, race.statistics.superiorities):
         one = finding.difference
         numbers = _format_interval(one.mean, one.low, one.high, 3) if one else ""

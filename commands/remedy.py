@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 
 def show(found: RemedyStudy, console: Console) -> None:
-    """Print a row for each remedy, then what they come to."""
+    """Print a row for each remedy, then the conclusion."""
     from rich.box import SIMPLE
 
     unit = f" [{found.loss_unit}]" if found.loss_unit else ""
@@ -28,10 +28,11 @@ def show(found: RemedyStudy, console: Console) -> None:
     console.print(rows)
     console.print(
         f"{found.starts} descents by L-BFGS-B from the same starts, each at the cost of {found.budget} episodes with "
-        f"gradient, which costs {found.gradient_cost:.2g} episodes without. Losses are those without a remedy.\n"
-        "better: share of the starts from which a descent gets farther than without; p is corrected for the number of "
-        "remedies. falls: share of the starts at which a step of 1 % of the box along the gradient lowers the loss. "
-        "moved: how far the lowest point moves, as a share of the box."
+        f"gradient. One of these costs {found.gradient_cost:.2g} episodes without. All losses are evaluated without a "
+        "remedy.\n"
+        "better: share of starts where the descent reaches a lower loss than without a remedy. p is corrected for the "
+        "number of remedies. falls: share of starts where a step of 1 % of the box along the gradient lowers the loss. "
+        "moved: distance that the lowest point moves, as a share of the box."
     )
     console.print(found.sentence)
 

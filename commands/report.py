@@ -25,7 +25,7 @@ def show(report: Report, console: Console) -> None:
 
 def _features_table(features: Features) -> Table:
     """Return the features over all parameters, a row each."""
-    found = table("feature over all parameters", "value, 95 % interval", "what it says")
+    found = table("feature over all parameters", "value, 95 % interval", "meaning")
     for row in features.rows():
         found.add_row(*row)
     return found
@@ -35,7 +35,7 @@ def show_several(found: Reports, console: Console) -> int:
     """Print a row for each slice; the exit code is 1 where one failed."""
     from ..jobs.report import HEADINGS, slice_rows
 
-    rows = table(*HEADINGS, title="what landscapes are like")
+    rows = table(*HEADINGS, title="landscapes")
     for row in slice_rows(found.reports):
         rows.add_row(*row)
     console.print(rows)

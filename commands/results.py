@@ -1,4 +1,4 @@
-"""What a command shows of a result, chosen by the result's type, and the same as JSON."""
+"""The output of a command for each type of result, as text and as JSON."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A study: its tables, its verdicts, and what was refused."""
+"""A study, on the terminal: its tables, its verdicts and the refused variants."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ if TYPE_CHECKING:
     from ..studies.variants import StudyRecord
 
 MEANING = (
-    "median, 95 %: how far losses are off, as a share of the spread, at half and at 95 % of points (95 % interval); "
-    "rank: Spearman's correlation of losses; cosine, slope: of gradients, median cosine and relative error"
+    "median, 95 %: largest loss error at half and at 95 % of points, as a share of the spread (95 % interval); "
+    "rank: Spearman's correlation of losses; cosine, slope: median cosine and relative error of gradients"
 )
 
 
 def show(found: StudyRecord, console: Console) -> None:
-    """Print a study: what it is of, its tables, its verdicts, and what was refused."""
+    """Print a study: its subject, its tables, its verdicts and the refused variants."""
     for part in SHOWN[found.kind](found):
         console.print(part, soft_wrap=found.kind == "mixed" and isinstance(part, str))  # lines of Python stay whole
     for why in dict.fromkeys(refused.why for refused in found.refused):
@@ -39,15 +39,15 @@ def show(found: StudyRecord, console: Console) -> None:
 def _show_fidelity(found: FidelityRecord) -> Iterable[str | Table]:
     from ..studies.kept import find_convergence
 
-    failed = f"; {found.reference_failed} points left out, the reference fails there" if found.reference_failed else ""
-    yield f"{found.env}: {found.points} points against {found.reference}; {_scale(found)}{failed}"
+    failed = f"; without {found.reference_failed} points where the reference fails" if found.reference_failed else ""
+    yield f"{found.env}: {found.points} points compared with {found.reference}; {_scale(found)}{failed}"
     accuracy = ("variant", "median", "95 % of points", "rank", "cosine", "slope", "failed")
     rows, best = _table(*accuracy, "ms", "with grad", "memory"), set(found.front)
     for variant in found.by_time:
         mark = " *" if variant.name in best else ""
         rows.add_row(variant.name + mark, *_variant_cells(variant, reference=variant.name == found.reference))
     yield rows
-    yield f"{MEANING}; ms an episode; * none is quicker and nearer"
+    yield f"{MEANING}; ms: per episode; *: no other variant is both faster and more accurate"
     yield from _missing((one.name, one.comparison) for one in found.variants)
     yield from found.sentences()
     if converged := find_convergence(found):
@@ -79,7 +79,7 @@ def _show_convergence(found: ConvergenceRecord) -> Iterable[str | Table]:
 
 
 def _distributions(found: Distributions) -> Table:
-    rows = _table("losses over neighbourhoods", "Kolmogorov", "Wasserstein / spread", "told apart by")
+    rows = _table("losses over neighbourhoods", "Kolmogorov", "Wasserstein / spread", "distinguished by")
     noise = found.noise
     rows.add_row("noise: the reference twice", str(noise.kolmogorov), str(noise.wasserstein), "")
     for one in found.compared:
@@ -89,30 +89,25 @@ def _distributions(found: Distributions) -> Table:
 
 
 def _show_model(found: ModelRecord) -> Iterable[str | Table]:
-    about = f"{found.env}: {found.points} points against the full model at {found.fidelity}"
+    about = f"{found.env}: {found.points} points compared with the full model at {found.fidelity}"
     if found.parts:  # with which it was timed
-        about += f", {1e3 * found.seconds.with_gradient:.3g} ms an episode with gradient"
-    failed = f"; {found.failed} points left out, the full model fails there" if found.failed else ""
+        about += f", {1e3 * found.seconds.with_gradient:.3g} ms per episode with gradient"
+    failed = f"; without {found.failed} points where the full model fails" if found.failed else ""
     yield f"{about}; {_scale(found)}{failed}"
     own = found.noise.comparison
     error = own.loss_error.p95_relative
-    moves = (
-        "more than a number says at" if own.loss_error.p95.value is None else f"{_percent(error) or '0%'} at most at"
-    )
+    change = "not finite" if own.loss_error.p95.value is None else f"at most {_percent(error) or '0%'}"
     rank, cosine = _number(own.spearman) or "none", _number(own.gradient.cosine) or "none"
-    yield f"noise, the full model again: losses move by {moves} 95 % of points, rank {rank}, cosine {cosine}"
-    titles = (
-        "parts of the model, and what changing each does",
-        "parts that are missing, and what putting each in does",
-    )
+    yield f"noise (the full model run twice): loss change at 95 % of points {change}, rank {rank}, cosine {cosine}"
+    titles = ("parts of the model, and the effect of changing each", "missing parts, and the effect of adding each")
     for parts, title in zip((found.present, found.missing), titles, strict=True):
         if parts:
             yield _parts(parts, title)
     yield from found.sentences()
     yield from _missing((one.name, one.comparison) for one in (*found.present, *found.missing))
     yield (
-        f"{MEANING}; moved: points whose loss moves beyond the noise; time: of an episode with gradient, against the "
-        "full model's, in turn with it (95 % interval)"
+        f"{MEANING}; moved: share of points whose loss changes by more than the noise; time: change of an episode with "
+        "gradient relative to the full model, timed alternately (95 % interval)"
     )
 
 
@@ -130,8 +125,8 @@ def _parts(parts: Sequence[MeasuredPart], title: str) -> Table:
 def _show_mixed(found: MixedRecord) -> Iterable[str | Table]:
     measured = found.measured
     yield (
-        f"{found.env}: {len(measured.variants)} variants at {found.points} points against {measured.reference}, "
-        f"{len(found.dismissed)} given up before, {len(measured.refused)} refused"
+        f"{found.env}: {len(measured.variants)} variants at {found.points} points compared with {measured.reference}, "
+        f"{len(found.dismissed)} dropped early, {len(measured.refused)} refused"
     )
     rows = _table("", "variant", "rank", "cosine", "95 % of points", "of allowed", "ms")
     for one in found.choices:
@@ -156,8 +151,8 @@ def _choice_cells(found: MixedRecord, name: str | None, shortfall: float | None,
 
 def _show_extremes(found: ExtremesRecord) -> Iterable[str | Table]:
     about = f"{found.env}: {found.fidelity} on {found.device}, {found.points} points"
-    yield f"{about}, judged by {found.reference} (accurate: {found.tolerance:.0%} of the spread)"
-    rows = _table("setting", "it has", *found.precisions)
+    yield f"{about}, compared with {found.reference} (accurate: within {found.tolerance:.0%} of the spread)"
+    rows = _table("setting", "value now", *found.precisions)
     for first in (limit for limit in found.limits if limit.precision == found.precisions[0]):
         same = [limit for limit in found.limits if (limit.setting, limit.end) == (first.setting, first.end)]
         base = f"{first.base:.4g} {first.unit}".rstrip()
@@ -169,14 +164,14 @@ def _show_symmetry(found: SymmetryRecord) -> Iterable[str | Table]:
     floor = found.floor
     scale = f"range of the loss {floor.range:.4g} {found.loss_unit}".rstrip()
     yield f"{found.env}: {found.fidelity} on {found.device} and its replicas at {found.points} points; {scale}"
-    rows = _table("replica", "losses apart", "rank", "cosine", "lower quartile", "failed")
+    rows = _table("replica", "loss deviation", "rank", "cosine", "lower quartile", "failed")
     for one in found.replicas:
         slopes = ["" if math.isnan(cosine) else f"{cosine:z.3f}" for cosine in (one.cosine.value, one.cosine_low)]
         failed = str(one.failed) if one.failed else ""
         rows.add_row(one.name, _share(_as_bootstrap(one.apart)), _number(one.spearman), *slopes, failed)
     yield rows
     yield (
-        "losses apart: standard deviation between the scene's and the replica's, as a share of the range (95 % "
+        "loss deviation: standard deviation between losses of the scene and the replica, as a share of the range (95 % "
         "interval); rank: Spearman's correlation of losses; cosine: of gradients, median and lower quartile"
     )
     yield from found.sentences()
@@ -185,7 +180,7 @@ def _show_symmetry(found: SymmetryRecord) -> Iterable[str | Table]:
 def _show_updates(found: UpdatesRecord) -> Iterable[str | Table]:
     yield (
         f"{found.env}: {found.fidelity} on {found.device}, {found.points} updates from {found.through}; rate "
-        f"{found.rate:.3g}, {found.length:.2g} widths of the box long at the median, of gradients at points moved by "
+        f"{found.rate:.3g}, median length {found.length:.2g} widths of the box, gradients at points shifted by "
         f"{100 * found.noise:.3g} % of the box"
     )
     rows = _table("steps", "mean", "5 %", "25 %", "50 %", "75 %", "95 %", "worse", "left tail", "failed")
@@ -226,9 +221,9 @@ def _scale(found: FidelityRecord | ConvergenceRecord | ModelRecord) -> str:
 
 
 def _missing(rows: Iterable[tuple[str, Comparison]]) -> Iterable[str]:
-    """Say which variants lack gradients where the reference has them, and at what share; nothing where none does."""
+    """Say which variants lack gradients where the reference has them, and at which share of points."""
     lacking = [f"{name} at {found.missing:.0%}" for name, found in rows if found.missing]
-    return [f"no gradient, of the points that have a loss: {', '.join(lacking)}"] if lacking else []
+    return [f"points with a loss but no gradient: {', '.join(lacking)}"] if lacking else []
 
 
 def _error_cells(found: Comparison) -> list[str]:

@@ -1,4 +1,4 @@
-"""Functions of others as environments, and their libraries: torch and NumPy here, JAX and Warp among the engines."""
+"""User functions as environments, and their libraries: torch and NumPy here, JAX and Warp among the engines."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ if TYPE_CHECKING:
 
 
 class FunctionEnvironment(Environment):
-    """A function of points, in somebody's library, as an environment.
+    """A function of points, in one of the libraries, as an environment.
 
-    The model is the function's own. Parameters and loss are what its user says.
+    The function is the model. Its user describes parameters and loss.
     """
 
     model_version = 0  # nothing says when a function changes; stored results are compared with it by evaluating it
@@ -59,9 +59,9 @@ class FunctionEnvironment(Environment):
         return "float32" if self.loss_type in ("float32", "float16", "bfloat16") else self.fidelity.precision
 
     def with_horizon(self, horizon: float) -> Environment:
-        """Return this environment with episodes of another length; where the keyword is a whole number, rounded.
+        """Return this environment with episodes of another length, rounded where the keyword is a whole number.
 
-        Raises ValueError where no keyword says how long an episode is.
+        Raises ValueError where no keyword sets the length of an episode.
         """
         if self.horizon is None or self.horizon_option not in self.function.fidelity_arguments:
             return super().with_horizon(horizon)
@@ -73,18 +73,18 @@ class FunctionEnvironment(Environment):
         return self.remake(fidelity=replace(self.fidelity, name=named, settings=settings))
 
     def length(self) -> float:
-        """Return what is proportional to the time that an episode simulates: 1 where nobody says how long it is."""
+        """Return a number proportional to the simulated time of an episode: 1 where no keyword sets its length."""
         if not self.function.counts_steps:
             return 1.0
         steps: float = self._settings[self.horizon_option]
         return steps * self.fidelity.dt
 
     def about(self) -> str:  # type: ignore[override] # a function's documentation is its own, not the class's
-        """Return what the function says of itself."""
-        return inspect.getdoc(self.function.fn) or f"The function {self.name}, which says nothing of itself."
+        """Return the function's own description."""
+        return inspect.getdoc(self.function.fn) or f"The function {self.name}, which has no docstring."
 
     def noise(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, " batch"] | None:
-        """Return the standard error of the mean over seeds at each point [loss unit]; None of one seed."""
+        """Return the standard error of the mean over seeds at each point [loss unit]; None for one seed."""
         if self.function.seeds < 2:
             return None
         values = self.space.to_values(self._check_points(x))
@@ -93,9 +93,9 @@ class FunctionEnvironment(Environment):
         return error
 
     def nan_origin(self, x: Float[Tensor, " dim"]) -> str:
-        """Return which operation makes the gradient at a point not finite, where the loss is; "" where none does.
+        """Return the operation that makes the gradient at a point not finite, although the loss is; "" where none does.
 
-        A sentence's end, such as `sqrt in line 12 of my.py ("jnp.sqrt(p[0])")`.
+        The text ends a sentence, such as `sqrt in line 12 of my.py ("jnp.sqrt(p[0])")`.
         """
         found = self.evaluate(x[None])
         if int(found.status[0]) != Status.NO_GRADIENT:
@@ -103,26 +103,26 @@ class FunctionEnvironment(Environment):
         return self._first_said("nan_origin", x)
 
     def wrong_origin(self, x: Float[Tensor, " dim"]) -> str:
-        """Return which operation's own derivative is wrong at a point, where it is finite; "" where none is known.
+        """Return the operation whose own derivative is wrong at a point, where it is finite; "" where none is known.
 
-        A sentence's end, such as `kernel step in line 12 of my.py`.
+        The text ends a sentence, such as `kernel step in line 12 of my.py`.
         """
         return self._first_said("wrong_origin", x)
 
     def _first_said(self, asked: Literal["nan_origin", "wrong_origin"], x: Float[Tensor, " dim"]) -> str:
-        """Return what a library says of the function at a point, for the first seed of which it says something."""
+        """Return the library's finding on the function at a point, for the first seed with a finding."""
         values = self.space.to_values(self._check_points(x[None]))
         with torch.inference_mode(False), torch.enable_grad(), suppress(Exception):  # it is no more than a hint
             return next(filter(None, (getattr(self._compute(seed), asked)(values) for seed in self._seeds)), "")
         return ""
 
     def replicas(self) -> Mapping[str, Environment]:
-        """Return the functions that compute the same physics otherwise, with the settings of this one."""
+        """Return the functions that compute the same physics differently, with the settings of this one."""
         given = self.function.replicas or {}
         return {changed: self._with_function(self.function.with_call(fn)) for changed, fn in given.items()}
 
     def _with_function(self, function: Function) -> FunctionEnvironment:
-        """Return the environment of another function; an option that is bound in it is left out."""
+        """Return the environment of another function, without the options that are bound in it."""
         known = {one.name for one in fields(function.options_class)}
         options = {name: value for name, value in asdict(self.options).items() if name in known}
         return FunctionEnvironment(function, fidelity=self.fidelity, device=self.device, **options)
@@ -139,12 +139,12 @@ class FunctionEnvironment(Environment):
         self._computes: dict[int, Compute] = {}
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave out what was compiled and the class of the options: another process makes both again."""
+        """Leave out compiled code and the class of the options: another process makes both again."""
         left = {"_computes": {}, "Options": None, "options": asdict(self.options)}
         return {**super().__getstate__(), **left}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Take over what was sent."""
+        """Restore the state that another process sent."""
         super().__setstate__(state)
         kind = self.function.options_class
         vars(self).update(Options=kind, options=kind(**state["options"]))
@@ -182,7 +182,7 @@ class FunctionEnvironment(Environment):
         return Evaluation.from_results(torch.stack(losses).mean(dim=0), mean)
 
     def identity(self) -> dict[str, Any]:
-        """Return what decides the numbers, as plain JSON."""
+        """Return the settings that decide the numbers, as plain JSON."""
         own: dict[str, Any] = {"maximize": True} if self.function.maximize else {}
         return super().identity() | own | ({"seeds": self.function.seeds} if self.function.seeds > 1 else {})
 
@@ -205,12 +205,12 @@ def from_torch(
 ) -> Environment:
     """Make an environment of a torch function from points, shape (batch, dim), to losses, shape (batch,).
 
-    Gradients come by autograd. Each loss may depend on its own row only. With `vectorized=False` the function takes a
+    Gradients come by autograd. Each loss may depend only on its own row. With `vectorized=False` the function takes a
     single point, shape (dim,), and returns one loss. Points lie on `device`, cpu or cuda. The other keywords are those
     of `FunctionKeywords`: name, loss_unit, maximize, options, fidelities, horizon, seeds, precision, rows, replicas.
 
-    Raises ValueError for settings that the function does not take; evaluating raises it where the function returns no
-    losses of the batch, or losses that carry no gradient.
+    Raises ValueError for settings that the function does not take. Evaluating raises it where the function does not
+    return one loss per row, or its losses have no gradient.
     """
     return _wrap(fn, space, Backend("torch", partial(_Torch, vectorized), torch.cuda.is_available, device), said)
 
@@ -226,10 +226,10 @@ def from_numpy(
     """Make an environment of a NumPy function from points, shape (batch, dim), to losses, shape (batch,).
 
     The function may return (losses, gradients) instead, gradients of shape (batch, dim). If it returns losses only,
-    `differences` makes gradients by central differences with that step, a fraction of each parameter's range; at the
-    bounds they are one-sided, since the function is not asked beyond them. With `vectorized=False` the function takes a
-    single point, shape (dim,), and returns one loss, or that and its gradient. The other keywords are those of
-    `FunctionKeywords`: name, loss_unit, maximize, options, fidelities, horizon, seeds, precision, rows, replicas.
+    `differences` makes gradients by central differences with that step, a fraction of each parameter's range. At the
+    bounds they are one-sided, because the function is not evaluated outside them. With `vectorized=False` the function
+    takes a single point, shape (dim,), and returns one loss, or one loss and its gradient. The other keywords are those
+    of `FunctionKeywords`: name, loss_unit, maximize, options, fidelities, horizon, seeds, precision, rows, replicas.
 
     Raises ValueError where `differences` is no fraction of the bounds, or lost in rounding relative to them.
     """
@@ -247,15 +247,16 @@ def from_jax(
 ) -> Environment:
     """Make an environment of a JAX function from one point, an array of shape (dim,), to its loss, of shape ().
 
-    Gradients come by reverse differentiation, or forward, which loops of unknown length need and few parameters
-    favour. `batch` says how many points are computed together: `vmap` vectorizes the function, `map` calls it point
-    after point, which functions without a batching rule and large simulations need. Batches smaller than `rows` are
-    padded to the next power of four, since the function is compiled for each size. It runs in its own precision,
-    whatever JAX is configured to. Settings are static: the function is compiled for each. The other keywords are those
-    of `FunctionKeywords`: name, loss_unit, maximize, options, fidelities, horizon, seeds, precision, rows, replicas.
+    Gradients come by reverse or forward differentiation. Loops of unknown length need forward, and it is faster for few
+    parameters. `batch` says how points are computed together. `vmap` vectorizes the function. `map` calls it point by
+    point, for functions without a batching rule and for large simulations. Batches smaller than `rows` are padded to
+    the next power of four, because each size needs its own compilation. The function runs in its own precision,
+    whatever JAX is configured to. Settings are static, so each needs its own compilation, too. The other keywords are
+    those of `FunctionKeywords`: name, loss_unit, maximize, options, fidelities, horizon, seeds, precision, rows,
+    replicas.
 
-    Raises ValueError where JAX is not installed, and for other modes and batches; evaluating raises it where the
-    function returns no single number, or JAX cannot trace, differentiate or vectorize it.
+    Raises ValueError where JAX is not installed, and for other modes and batches. Evaluating raises it where the
+    function does not return a single number, or JAX cannot trace, differentiate or vectorize it.
     """
     for option, value, known in (("mode", mode, Mode), ("batch", batch, Batch)):
         if value not in get_args(known):
@@ -263,7 +264,7 @@ def from_jax(
     try:
         from .engines.jax_functions import JaxCompute, has_cuda
     except ImportError as error:
-        raise ValueError(f"from_jax needs JAX, which is not here ({error}): pip install jax") from error
+        raise ValueError(f"from_jax needs JAX, which is not installed ({error}): pip install jax") from error
     return _wrap(fn, space, Backend("jax", partial(JaxCompute, mode, batch), has_cuda, own_programs=True), said)
 
 
@@ -277,18 +278,18 @@ def from_warp(
 ) -> Environment:
     """Make an environment of a function that launches Warp kernels, from points to losses.
 
-    The function takes a Warp array of points, shape (batch, dim), and returns one of losses, shape (batch,), both of
-    its `precision`, by default float32; each loss may depend on its own row only. What it launches is recorded on a
-    tape, and the tape is played backwards for the gradients; the gradients of arrays that the function keeps are set to
-    zero after each evaluation. The losses are made with requires_grad=True.
+    The function takes a Warp array of points, shape (batch, dim), and returns one of losses, shape (batch,), both in
+    its `precision`, by default float32. Each loss may depend on its own row only. Its launches are recorded on a tape,
+    which is played backwards for the gradients. The gradients of arrays that the function keeps are set to zero after
+    each evaluation. The losses are made with requires_grad=True.
 
-    A kernel that writes to an array which an earlier one has read makes gradients wrong without a word.
-    `check_overwrites` looks for that once, before the first gradient, and builds the function's kernels again for it,
-    which may take long; leave it out for a simulator that is known to be right. The other keywords are those of
+    A kernel that overwrites an array that an earlier kernel has read makes gradients silently wrong. `check_overwrites`
+    looks for such kernels once, before the first gradient. It compiles the function's kernels again for that, which can
+    take long; switch it off for a simulator that is known to be right. The other keywords are those of
     `FunctionKeywords`: name, loss_unit, maximize, options, fidelities, horizon, seeds, precision, rows, replicas.
 
-    Raises ValueError for other precisions and devices; evaluating raises it where the function returns no such array,
-    launches nothing, does not read its points, or writes to what was read.
+    Raises ValueError for other precisions and devices. Evaluating raises it where the function returns no such array,
+    launches nothing, does not read its points, or overwrites arrays that were read.
     """
     from .engines.warp_functions import WarpCompute, cuda_available
 
@@ -307,14 +308,14 @@ def from_step(
 ) -> Environment:
     """Make an environment of a simulator with Gymnasium's `reset` and `step`: the loss is minus the sum of rewards.
 
-    A point holds the actions, the first one first; each is held for an equal share of the `steps` of an episode. An
-    episode starts with reset(seed=0), the same at every point, and ends early where `step` says terminated or
-    truncated. `step(action)` returns (observation, reward, terminated, truncated, info). Gradients come by central
-    `differences`, as for `from_numpy`.
+    A point consists of the actions in order; each lasts an equal share of the `steps` of an episode. An episode starts
+    with reset(seed=0), the same at every point, and ends early where `step` returns terminated or truncated.
+    `step(action)` returns (observation, reward, terminated, truncated, info). Gradients come by central `differences`,
+    as for `from_numpy`.
 
         gs.from_step(env.step, env.reset, gs.ParameterSpace.box([f"push {k}" for k in range(5)], -1, 1), steps=100)
 
-    Raises ValueError where the parameters are no whole number of actions.
+    Raises ValueError where the number of parameters is not a multiple of the size of an action.
     """
     steps = as_whole(steps, "from_step's steps", least=1)
 
@@ -334,12 +335,12 @@ def from_step(
 
 
 def _action_size(step: Callable[[Any], Any], space: ParameterSpace) -> int:
-    """Return how many numbers an action has: those of the simulator's action space, where `step` is its method."""
+    """Return the size of an action: that of the simulator's action space, where `step` is its method."""
     simulator = getattr(step, "__self__", None)
     shape = getattr(getattr(simulator, "action_space", None), "shape", None) or ()
     size = int(np.prod(shape))
     if space.dim % size:
-        raise ValueError(f"an action has {size} numbers, and {space.dim} parameters are no whole number of actions")
+        raise ValueError(f"an action has {size} numbers, so {space.dim} parameters are not a whole number of actions")
     return size
 
 
@@ -375,8 +376,8 @@ class _Torch(Compute):
             found = torch.stack(parts) if all(isinstance(one, Tensor) for one in parts) else parts[0]
         if isinstance(found, tuple):
             raise SimulatorError(
-                f"{self.call.name} must return losses alone, and torch differentiates them; got {len(found)} values "
-                "(from_numpy takes losses with gradients)"
+                f"{self.call.name} must return losses only, because torch differentiates them; got {len(found)} "
+                "values (from_numpy takes losses with gradients)"
             )
         if not isinstance(found, Tensor):
             raise SimulatorError(f"{self.call.name} must return a tensor; got {type(found).__name__}")
@@ -385,7 +386,7 @@ class _Torch(Compute):
 
 
 def _called(call: Function, x: Tensor, settings: Mapping[str, Any]) -> Any:
-    """Return what a function returns; say which precision it wants where torch refuses to mix two."""
+    """Return the result of a function; name the precision it needs where torch refuses to mix two."""
     try:
         return call.fn(x, **settings)
     except RuntimeError as error:
@@ -393,7 +394,7 @@ def _called(call: Function, x: Tensor, settings: Mapping[str, Any]) -> Any:
             other = "float32" if x.dtype == torch.float64 else "float64"
             raise SimulatorError(
                 f"{call.name} mixes its points with numbers of another type ({first_line(error)}); pass "
-                f"precision={other!r} to from_torch, or convert its own with .to(x)"
+                f"precision={other!r} to from_torch, or convert your tensors with .to(x)"
             ) from error
         raise
 
@@ -402,8 +403,8 @@ def _autograd(loss: Float[Tensor, " batch"], x: Float[Tensor, "batch dim"], name
     (gradient,) = torch.autograd.grad(loss.sum(), x, allow_unused=True) if loss.requires_grad else (None,)
     if gradient is None:
         raise SimulatorError(
-            f"{name} returned losses that carry no gradient; compute them from x with torch operations, "
-            "or sample with gradients=0 (--no-gradients)"
+            f"{name} returned losses without a gradient; compute them from x with torch operations, or sample with "
+            "gradients=0 (--no-gradients)"
         )
     return gradient.detach().to("cpu", torch.float64)
 
@@ -431,7 +432,7 @@ class _NumPy(Compute):
             result = _columns([_copied(self.call.fn(point, **self.settings)) for point in points])
         if isinstance(result, tuple) and len(result) != 2:
             raise SimulatorError(
-                f"{name} must return losses, or (losses, gradients); got {len(result)} values, so drop the others"
+                f"{name} must return losses, or (losses, gradients); got {len(result)} values, so drop the rest"
             )
         loss, gradient = result if isinstance(result, tuple) else (result, None)
         kind = str(np.asarray(loss).dtype)
@@ -464,7 +465,7 @@ class _NumPy(Compute):
 
 
 def _numbers(values: object, what: str) -> Tensor:
-    """Return a copy of a function's numbers as a tensor. Raises SimulatorError for what is none."""
+    """Return a copy of a function's numbers as a tensor. Raises SimulatorError for anything else."""
     try:
         return as_tensor(values, what).clone()
     except ValueError as error:
@@ -472,12 +473,12 @@ def _numbers(values: object, what: str) -> Tensor:
 
 
 def _copied(result: Any) -> Any:
-    """Return a copy of what a function returned: one that returns its own buffer fills it again at the next point."""
+    """Return a copy of a function's result, because a function may reuse its own buffer at the next point."""
     return tuple(map(_copied, result)) if isinstance(result, tuple) else np.array(result, subok=True)  # masks stay
 
 
 def _columns(found: Sequence[Any]) -> Any:
-    """Return results of single points as columns; what is none is returned for the caller to refuse."""
+    """Return results of single points as columns; return anything else unchanged for the caller to refuse."""
     if found and isinstance(found[0], tuple):
         return tuple(list(column) for column in zip(*found, strict=True))
     return list(found)
@@ -501,9 +502,9 @@ def _step(differences: object, space: ParameterSpace) -> float:
 
 
 class GivenEnvironment(Environment):
-    """An object of one's own with `space` and `evaluate` as an environment.
+    """A user's object with `space` and `evaluate` as an environment.
 
-    The model is the object's own, and so are its parameters and its loss.
+    The object defines the model, its parameters and its loss.
     """
 
     model_version = 0  # nothing says when an object changes; stored results are compared with it by evaluating it
@@ -518,7 +519,7 @@ class GivenEnvironment(Environment):
 
     @classmethod
     def of(cls, given: Any) -> GivenEnvironment:
-        """Return an object as an environment. Raises ValueError that says what it lacks."""
+        """Return an object as an environment. Raises ValueError that names what it lacks."""
         wanted = {"space": isinstance(getattr(given, "space", None), ParameterSpace)}
         wanted["evaluate"] = callable(getattr(given, "evaluate", None))
         if lacking := [name for name, there in wanted.items() if not there]:
@@ -535,12 +536,12 @@ class GivenEnvironment(Environment):
         return min(int(getattr(self.given, "preferred_batch", super().preferred_batch)), self._max_rows)
 
     def events(self, x: Float[Tensor, "batch dim"]) -> Mapping[str, Any]:
-        """Count what happens at each point, where the object says that."""
+        """Count the events at each point, where the object counts them."""
         counts: Callable[[Tensor], Mapping[str, Any]] | None = getattr(self.given, "events", None)
         return {} if counts is None else counts(x)
 
     def replicas(self) -> Mapping[str, Environment]:
-        """Return the same physics computed otherwise, where the object offers that."""
+        """Return environments that compute the same physics differently, where the object has them."""
         offered: Callable[[], Mapping[str, Any]] | None = getattr(self.given, "replicas", None)
         found = {} if offered is None else offered()
         return {name: one if isinstance(one, Environment) else GivenEnvironment.of(one) for name, one in found.items()}

@@ -1,4 +1,4 @@
-"""What every environment is: a scene with parameters, three fidelities, losses and true gradients."""
+"""The base class of all environments: a scene with parameters, three fidelities, losses and gradients."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def cores() -> int:
 
 
 class Pool(Generic[T]):
-    """Lend objects that serve one thread at a time, making a new one where none is idle; with `most` of them, wait."""
+    """Lend objects that serve one thread at a time; make a new one where none is idle, up to `most` of them."""
 
     def __init__(self, make: Callable[[], T], *, most: int | None = None) -> None:
         self._make = make
@@ -56,7 +56,7 @@ class Pool(Generic[T]):
 
     @contextmanager
     def lend(self) -> Iterator[T]:
-        """Give an idle object, or a new one, for the length of a with block."""
+        """Lend an idle object, or a new one, for the length of a with block."""
         with self._room:
             try:
                 item = self._idle.get_nowait()
@@ -69,16 +69,16 @@ class Pool(Generic[T]):
                 self._idle.put(item)
 
     def clear(self) -> None:
-        """Forget the idle objects, and so give back their memory."""
+        """Drop the idle objects, which frees their memory."""
         with suppress(queue.Empty):
             while True:
                 self._idle.get_nowait()
 
 
 class OwnMethod:
-    """A method of an object that it does not keep alive.
+    """A method of an object that does not keep the object alive.
 
-    An object that holds a method of its own is part of a cycle, whose memory is free only when garbage is collected.
+    An object that stores its own bound method is part of a cycle, whose memory is freed only by garbage collection.
     """
 
     def __init__(self, method: Callable[..., Any]) -> None:
@@ -89,25 +89,25 @@ class OwnMethod:
         return self._function(self._owner(), *values)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Go to another process with the object."""
+        """Move to another process with the object."""
         return OwnMethod, (MethodType(self._function, self._owner()),)
 
 
 def copied(values: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
     """Copy numbers out of a solver's memory, which its next run overwrites, to float64 on the CPU.
 
-    `.double().cpu()` would return that memory itself where a solver computes in float64 on a CPU.
+    `.double().cpu()` would return the same memory where a solver computes in float64 on a CPU.
     """
     return values.to("cpu", torch.float64, copy=True)
 
 
 def describe_presets(presets: Mapping[str, Mapping[str, Any]]) -> str:
-    """Return the names of presets as the end of a sentence about a scene."""
+    """Return the names of presets, to end a sentence about a scene."""
     return f"preset{'s' if len(presets) > 1 else ''} {', '.join(presets)}" if presets else "no presets"
 
 
 def describe_settings(options: Mapping[str, Any]) -> str:
-    """Return the options that a preset sets as the command line takes them; one that sets none leaves the defaults."""
+    """Return the options that a preset sets, in the spelling of the command line; empty for none."""
     said = (f"{name}={str(value).lower() if isinstance(value, bool) else value}" for name, value in options.items())
     return ", ".join(said) or "the defaults"
 
@@ -120,13 +120,12 @@ PROBES = 8  # points besides the centre that are tried where a whole batch raise
 class Environment(Objective):
     """A differentiable scene: a batch of parameter vectors in, losses and gradients out.
 
-    A scene is written by deriving from this class: the class attributes say what it is, `_evaluate` simulates; needed
-    are `space` and `_evaluate`. What only some scenes can do has a default. An environment is a torch function, too:
-    `env(x)` returns losses, shape (batch,), that can be differentiated. `fidelity` is a name from `fidelities`, the
-    first unless said otherwise, or a record of one's own; `device` is auto, cpu or cuda; `engine` is one of `engines`,
-    the first unless said otherwise; options are those of the class's `Options`. Two runs give the same bits, on a CPU
-    and on a GPU, alone or in a batch, but for an engine that cannot promise that; `deterministic` refuses such an
-    engine.
+    A new scene derives from this class. It needs `space` and `_evaluate`, which simulates; class attributes describe
+    it. Optional abilities have defaults. An environment is also a torch function: `env(x)` returns losses, shape
+    (batch,), that can be differentiated. `fidelity` is a name from `fidelities`, by default the first, or a record;
+    `device` is auto, cpu or cuda. `engine` is one of `engines`, by default the first; options are those of the class's
+    `Options`. Two runs give the same bits, on a CPU and on a GPU, alone or in a batch, except on an engine that cannot
+    promise that. `deterministic` refuses such an engine.
     """
 
     # Of all engines or by name, raised by hand when numbers change; 0 where nothing says when they do.
@@ -176,11 +175,11 @@ class Environment(Objective):
         self._setup()
         if not isinstance(getattr(self, "space", None), ParameterSpace):
             raise ValueError(
-                f"{self.name} needs its parameters: give the class a ParameterSpace as `space`, or set one in `_setup`"
+                f"{self.name} has no parameters; give the class a ParameterSpace as `space`, or set one in `_setup`"
             )
 
     def identity(self) -> dict[str, Any]:
-        """Return what decides the numbers, as plain JSON: scene and its version, options, fidelity, device, engine."""
+        """Return the settings that decide the numbers, as plain JSON."""
         return {
             "objective": self.name,
             "options": record_options(self.options),
@@ -193,11 +192,11 @@ class Environment(Objective):
         }
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave out what belongs to this process, so that an environment of Python alone can be sent to another one."""
+        """Leave out the parts of this process, so that an environment in pure Python can be sent to another one."""
         return {name: value for name, value in vars(self).items() if name != "_stop"}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Take over what was sent."""
+        """Restore the state that another process sent."""
         vars(self).update(state, _stop=threading.Event())
 
     @final
@@ -210,9 +209,9 @@ class Environment(Objective):
         deterministic: bool | None = None,
         **options: Any,
     ) -> Environment:
-        """Return this environment with other settings; those that are not given stay as they are.
+        """Return this environment with other settings; settings that are not given stay.
 
-        Raises ValueError for what the environment does not have.
+        Raises ValueError for unknown settings.
         """
         return self._remake(
             fidelity=self.fidelity if fidelity is None else fidelity,
@@ -224,12 +223,12 @@ class Environment(Objective):
 
     @final
     def evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool = True) -> Evaluation:
-        """Return losses, and gradients if asked, at points `x` of the space, shape (batch, dim).
+        """Return losses, and gradients if requested, at points `x` of the space, shape (batch, dim).
 
-        A row is a point of `space`: a parameter on a logarithmic scale is there by its decimal logarithm. Rows do not
-        depend on each other. A row whose simulation fails says so in its status; one that raises has status ERROR, and
-        the evaluation holds the first message. Raises ValueError where x has another shape, another type or values
-        that are not finite, and where the simulation raises wherever it is tried.
+        A row is a point of `space`: a parameter on a logarithmic scale is given by its decimal logarithm. Rows do not
+        depend on each other. The status of a row reports a failed simulation. A row that raises has status ERROR, and
+        the evaluation contains the first message. Raises ValueError where x has another shape, another type or values
+        that are not finite, and where the simulation raises at every tried point.
         """
         x = self._check_points(x)
         if len(x) == 0:
@@ -245,7 +244,7 @@ class Environment(Objective):
     @final
     @classmethod
     def preset_options(cls, name: str) -> dict[str, Any]:
-        """Return the options that a preset sets. Raises ValueError where there is none of that name."""
+        """Return the options that a preset sets. Raises ValueError for an unknown name."""
         if name not in cls.presets:
             raise ValueError(f"{cls.name} has {describe_presets(cls.presets)}; got preset {name!r}")
         return dict(cls.presets[name])
@@ -253,24 +252,24 @@ class Environment(Objective):
     @final
     @classmethod
     def version_on(cls, engine: str) -> int:
-        """Return the version of the model on an engine: results of different versions are never mixed."""
+        """Return the model version on an engine; results of different versions are never mixed."""
         return cls.model_version if isinstance(cls.model_version, int) else cls.model_version.get(engine, 1)
 
     @classmethod
     def about(cls) -> str:
-        """Return what a scene says of itself, and after it what its family says."""
+        """Return the description of the scene, then that of its family."""
         return "\n\n".join(inspect.cleandoc(kind.__doc__) for kind in cls.own_classes() if kind.__doc__)
 
     @final
     @classmethod
     def own_classes(cls) -> tuple[type, ...]:
-        """Return the scene's class and those it is derived from, up to this one."""
+        """Return the scene's class and its base classes, up to this one."""
         return cls.__mro__[: cls.__mro__.index(Environment)]
 
     @final
     @classmethod
     def nearest_dt(cls, dt: float) -> float:
-        """Return the time step nearest to `dt` [s] that the scene takes: whole ones fit into a control step."""
+        """Return the nearest time step to `dt` [s] that divides a control step into whole steps."""
         return cls.control_step / max(1, round(cls.control_step / dt)) if cls.control_step else dt
 
     @final
@@ -282,24 +281,24 @@ class Environment(Objective):
 
     @final
     def example(self, name: str) -> Float[Tensor, " dim"]:
-        """Return a parameter vector this scene is known for. Raises ValueError where it has no such example."""
+        """Return one of the scene's named parameter vectors. Raises ValueError where it has no such example."""
         if name not in self.examples:
             raise ValueError(f"{self.name} has no example {name!r}; it has {', '.join(self.examples) or 'none'}")
         return self.space.from_values(torch.tensor(self.examples[name], dtype=torch.float64))
 
     def episode(self, x: Float[Tensor, " dim"]) -> Episode:
         """Return the frames of the episode at one point. Raises ValueError where a scene has nothing to draw."""
-        raise ValueError(f"{self.name} has no episode to draw; a class with a method `episode` has")
+        raise ValueError(f"{self.name} has no episode to draw; give its class a method `episode`")
 
     def events(self, x: Float[Tensor, "batch dim"]) -> Mapping[str, Int[Tensor, " batch"]]:
-        """Count what happens in each episode, name -> shape (batch,); where a count changes, losses may jump."""
+        """Count the events of each episode, name -> shape (batch,); where a count changes, losses can jump."""
         return {}
 
     @final
     def energy(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch step"] | None:
-        """Return the mechanical energy [J] after each step of a motion that nothing drives, begun as `x` says.
+        """Return the mechanical energy [J] after each step of an undriven motion that starts from `x`.
 
-        Counted from rest at the lowest place, so that what there is at first is its scale: it may fall, never rise.
+        It is relative to rest at the lowest point, so its initial value is its scale. It can fall but must never rise.
         None where a scene has no such motion.
         """
         parts = [self._energy(part) for part in torch.split(self._check_points(x), self._capacity)]
@@ -308,7 +307,7 @@ class Environment(Objective):
 
     @final
     def closed_form(self, x: Float[Tensor, "batch dim"]) -> Evaluation | None:
-        """Return losses and gradients that the scene's physics has in closed form; None where it has none."""
+        """Return losses and gradients of the scene's physics in closed form; None where there is none."""
         points = self._check_points(x).clone().requires_grad_()
         with torch.inference_mode(False), torch.enable_grad():
             loss = self._closed_form(self.space.to_values(points))
@@ -319,12 +318,12 @@ class Environment(Objective):
 
     @final
     def observe(self, x: Float[Tensor, "batch dim"], decision: int) -> Float[Tensor, "batch feature"]:
-        """Return what the state is just before a decision, float64, in units that make it about one.
+        """Return an observation of the state just before a decision, float64, scaled to be about one.
 
-        Parameters that this decision and later ones set do not matter. The last feature is the share of the episode
-        that is over. It is all there is to see where parameters say how an episode begins or what it is made of: such
-        a scene is a bandit, with a single decision. Raises ValueError where there is no such decision, and at a horizon
-        other than 1, where episodes are not shared by decisions.
+        It does not depend on the parameters of this decision and later ones. The last feature is the elapsed fraction
+        of the episode. If parameters set the start of an episode or its materials, that is the only feature: the scene
+        is a bandit with a single decision. Raises ValueError where there is no such decision, and at a horizon other
+        than 1, where decisions do not divide an episode.
         """
         x, _ = self._before(self._check_points(x), decision)
         seen = torch.cat(self._map_parts(partial(self._observe, decision=decision), x))
@@ -334,13 +333,13 @@ class Environment(Objective):
     def pull_back_observation(
         self, x: Float[Tensor, "batch dim"], decision: int, weight: Float[Tensor, "batch feature"]
     ) -> Float[Tensor, "batch dim"]:
-        """Return the gradient by x of the sum of what `observe` returns, each number by its weight.
+        """Return the gradient by x of the weighted sum of an observation.
 
-        It is zero by parameters that this decision and later ones set. Raises ValueError as `observe` does, and where
-        what is seen is not differentiated.
+        It is zero for the parameters of this decision and later ones. Raises ValueError as `observe` does, and where
+        observations are not differentiated.
         """
         if not self.differentiates_observations:
-            raise ValueError(f"{self.name} does not differentiate what it shows a policy")
+            raise ValueError(f"{self.name} does not differentiate its observations")
         x, made = self._before(self._check_points(x), decision)
 
         def part(both: Float[Tensor, "some dim_and_feature"]) -> Float[Tensor, "some dim"]:
@@ -352,9 +351,9 @@ class Environment(Objective):
         return slope
 
     def _before(self, x: Float[Tensor, "batch dim"], decision: int) -> tuple[Float[Tensor, "batch dim"], int]:
-        """Return points with the middle of the box from a decision on, and how many parameters come before that."""
+        """Return points with the middle of the box from a decision on, and the number of parameters before that."""
         if self.decisions > 1 and self.horizon not in (None, 1.0):
-            raise ValueError(f"{self.name} is decided step by step at horizon 1 only; got horizon {self.horizon:g}")
+            raise ValueError(f"{self.name} takes decisions at horizon 1 only; got horizon {self.horizon:g}")
         if not 0 <= decision < self.decisions:
             raise ValueError(f"{self.name} numbers its decisions 0 to {self.decisions - 1}; got {decision}")
         made = self.space.dim * decision // self.decisions
@@ -362,7 +361,7 @@ class Environment(Objective):
 
     @final
     def prepare(self) -> None:
-        """Compile the kernels, or fetch them from the cache, so that the first evaluation is as quick as the next."""
+        """Compile the kernels, or load them from the cache, so that the first evaluation is as fast as the next."""
         self._compile_ahead()
         if self._solvers is not None:
             with self._solvers.lend():
@@ -371,14 +370,14 @@ class Environment(Objective):
 
     @final
     def shrink(self, rows: int) -> None:
-        """Take at most `rows` rows at once from now on: solvers hold room for all they take, and it was too much."""
+        """Limit batches to `rows` rows from now on, to reduce the memory of the solvers."""
         self._max_rows, self._solvers = rows, None
         free_memory()
         self._setup()
 
     @final
     def release(self) -> None:
-        """Give back the memory that solvers hold between evaluations; the next one makes them again."""
+        """Free the memory that solvers hold between evaluations; the next evaluation makes them again."""
         if self._solvers is not None:
             self._solvers.clear()
         free_memory()
@@ -388,67 +387,67 @@ class Environment(Objective):
         return 0
 
     def work(self) -> Work:
-        """Return what one episode computes, so that engines can be compared by it."""
+        """Return the amount of computation of one episode, to compare engines."""
         return Work(1, "evaluation")
 
     @property
     def precision(self) -> str:
-        """float32 or float64: what losses are computed in."""
+        """float32 or float64: the precision of the losses."""
         return self.fidelity.precision
 
     @property
     def packages(self) -> tuple[str, ...]:
-        """Packages that the environment's engine needs in addition to those that all need."""
+        """Additional packages that the environment's engine needs."""
         return EXTRAS.get(self.capabilities.extra, ())
 
     @property
     def horizon(self) -> float | None:
-        """How long an episode is, in the unit of the setting that says so; None where none does."""
+        """The length of an episode, in the unit of its setting; None where there is no such setting."""
         value = {**vars(self.options), **self.fidelity.settings}.get(self.horizon_option)
         return float(value) if isinstance(value, int | float) else None
 
     def with_horizon(self, horizon: float) -> Environment:
-        """Return this environment with episodes of another length, in whole numbers where its setting is one.
+        """Return this environment with episodes of another length, rounded where the setting is a whole number.
 
-        Raises ValueError where no setting says how long an episode is.
+        Raises ValueError where no setting gives the length of an episode.
         """
         value = vars(self.options).get(self.horizon_option)
         if value is None:
-            raise ValueError(f"{self.name} has no setting that says how long an episode is; name one as horizon")
+            raise ValueError(f"{self.name} has no setting for the length of an episode; name one as horizon")
         options: dict[str, Any] = {self.horizon_option: max(1, round(horizon)) if isinstance(value, int) else horizon}
         return self.remake(**options)
 
     def length(self) -> float:
-        """Return what is proportional to the time that an episode simulates, for one size of the scene."""
+        """Return a number proportional to the simulated time of an episode, for one size of the scene."""
         return self.work().count * self.fidelity.dt
 
     def replicas(self) -> Mapping[str, Environment]:
-        """Return the scene computed otherwise, by what was changed: the same physics at the same accuracy.
+        """Return the same physics computed differently but equally accurately, by the name of the change.
 
         {} where nothing can be changed: a closed form has neither steps nor a grid.
         """
         return {}
 
     def plain_point(self, x: Float[Tensor, "*batch dim"]) -> Float[Tensor, "*batch dim"]:
-        """Return the points of the environment within its remedies that points stand for."""
+        """Return the corresponding points of the environment without its remedies."""
         return x
 
     @property
     def gradients_from_losses(self) -> bool:
-        """Whether a gradient takes losses alone, so that it costs no more than they do."""
+        """Whether gradients are computed from losses alone and cost nothing extra."""
         return False
 
     def without(self) -> Environment:
-        """Return the environment within its remedies, itself where it has none."""
+        """Return the environment without its remedies, or itself."""
         return self
 
     def engine_call(self, x: Float[Tensor, "batch dim"], *, grad: bool) -> Callable[[], object] | None:
-        """Return what calls the engine alone at these points, for timing; None where evaluating does no more."""
+        """Return a call of the engine alone at these points, for timing; None where evaluating does nothing else."""
         return None
 
     @property
     def stiffness_parameters(self) -> tuple[str, ...]:
-        """Names of the parameters that say how stiff a material is: those that say so in their name."""
+        """Names of the parameters that set the stiffness of a material: those that contain "stiffness"."""
         return tuple(name for name in self.space.names if "stiffness" in name)
 
     @property
@@ -483,7 +482,7 @@ class Environment(Objective):
 
     @final
     def _replicas_of(self, changes: Mapping[str, Mapping[str, Any]]) -> dict[str, Environment]:
-        """Return this environment with fields of its fidelity changed, and settings added to those it has, by name."""
+        """Return this environment with changed fields of its fidelity and added settings, by name."""
         found = {}
         for name, change in changes.items():
             settings = {**self.fidelity.settings, **change.get("settings", {})}
@@ -493,7 +492,7 @@ class Environment(Objective):
 
     @final
     def _shorter_steps(self, steps: int) -> dict[str, dict[str, float]]:
-        """Return the changes of an episode of so many time steps by which contacts fall elsewhere within a step."""
+        """Return the fidelity changes that move contacts within their steps, for an episode of this many steps."""
         shorter = {
             share: max(steps + place, round(steps * (1 + share))) for place, share in enumerate(SHORTER, start=1)
         }
@@ -501,7 +500,7 @@ class Environment(Objective):
         return {names[share]: {"dt": self.fidelity.dt * steps / count} for share, count in shorter.items()}
 
     def _observe(self, x: Float[Tensor, "batch dim"], decision: int) -> Float[Tensor, "batch feature"]:
-        """Return the state just before a decision, in units that make it about one."""
+        """Return the state just before a decision, scaled to be about one."""
         return x.new_zeros(len(x), 0)
 
     def _pull_back_observation(
@@ -515,11 +514,11 @@ class Environment(Objective):
         return None
 
     def _energy(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch step"] | None:
-        """Return the energy over time of a motion that nothing drives [J], of no more rows than a solver takes."""
+        """Return the energy over time of an undriven motion [J], for at most as many rows as a solver takes."""
         return None
 
     def _evaluate_rows(self, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
-        """Evaluate rows together; where that raises, in halves, so that what raises is found."""
+        """Evaluate rows together; where that raises, in halves, to find the rows that raise."""
         try:
             return self._simulate(x, grad=grad)
         except Exception as error:
@@ -532,9 +531,9 @@ class Environment(Objective):
         return Evaluation.join(parts, dim=x.shape[1], grad=grad)
 
     def _refuse_broken(self, x: Float[Tensor, "batch dim"], found: Evaluation) -> None:
-        """Raise SimulatorError where a whole batch raised, and so does a point that has answered before, or any other.
+        """Raise SimulatorError where a whole batch raised, and every other tried point raises, too.
 
-        So an engine that is broken, or a function that cannot work, is no landscape of errors.
+        So a broken engine, or a function that cannot work, is not mistaken for a landscape of errors.
         """
         raised, self._raised = self._raised, None  # which holds all that was there, this too
         answered = found.status != Status.ERROR
@@ -550,7 +549,7 @@ class Environment(Objective):
                 self._answering = point[None]
                 return
         raise SimulatorError(
-            f"{self.name} raised wherever it was tried, at {len(x) + len(tried)} points: {found.error}; the first was "
+            f"{self.name} raised at all {len(x) + len(tried)} points where it was tried: {found.error}; the first was "
             f"x = {self.space.to_values(x[0]).tolist()}"
         ) from raised
 
@@ -561,32 +560,30 @@ class Environment(Objective):
             found = self._evaluate(values, grad=grad)
         if not isinstance(found, Evaluation):
             raise SimulatorError(
-                f"{self.name}._evaluate must return an Evaluation; got {type(found).__name__}. "
-                "Evaluation.from_results(losses, gradients) makes one"
+                f"{self.name}._evaluate must return an Evaluation; got {type(found).__name__}; make one with "
+                "Evaluation.from_results(losses, gradients)"
             )
         if grad and found.grad is None:
-            raise SimulatorError(f"{self.name}._evaluate was asked for gradients (grad=True) and returned none")
+            raise SimulatorError(f"{self.name}._evaluate must return gradients with grad=True; got none")
         if found.grad is None or self.space.is_linear:
             return found
         return replace(found, grad=self.space.chain(values, found.grad.detach().to(values)))
 
     def _setup(self) -> None:
-        """Prepare what all evaluations share; sets `space` unless the class does."""
+        """Prepare the parts that all evaluations share; sets `space` unless the class does."""
 
     def _compile_ahead(self) -> None:
         """Compile all kernels in parallel."""
 
     def _prepare(self) -> None:
-        """Make what else a first evaluation would make."""
+        """Prepare everything else that a first evaluation would make."""
 
     @final
     def _engine(self, kind: str) -> ModuleType:
         """Return the engine's module for `kind` (mpm, springs), imported only when asked for."""
         module = self.capabilities.solvers.get(kind)
         if module is None:
-            raise ValueError(
-                f"{self.name} needs an engine that simulates {kind}; got engine {self.engine}, which has none"
-            )
+            raise ValueError(f"{self.name} needs an engine that simulates {kind}; engine {self.engine} does not")
         try:
             return import_module(f".engines.{module}", __package__)
         except ImportError as error:
@@ -595,7 +592,7 @@ class Environment(Objective):
 
     @final
     def _limit_rows(self, capacity: int) -> int:
-        """Return the rows a solver takes where one that shares the cores takes `capacity`."""
+        """Return the rows a solver takes, from the `capacity` of one that shares the cores."""
         alone = self.device == "cpu" and not self.capabilities.concurrent
         return min(self._max_rows, capacity * (cores() if alone else 1))
 
@@ -603,8 +600,8 @@ class Environment(Objective):
         dt, nearest = self.fidelity.dt, self.nearest_dt(self.fidelity.dt)
         if abs(nearest - dt) > 1e-6 * dt:
             raise ValueError(
-                f"{self.name} holds a control for {self.control_step:g} s, which must be whole time steps; got dt "
-                f"{dt:.6g} s, nearest to it is {nearest:.6g} s"
+                f"{self.name} keeps each control for {self.control_step:g} s, which must be a whole number of time "
+                f"steps; got dt {dt:.6g} s, use {nearest:.6g} s"
             )
 
     def _rows_per_part(self, rows: int) -> int:
@@ -628,11 +625,11 @@ class Environment(Objective):
         x = check_points(x, self.space, self.name)
         if not bool(x.isfinite().all()):
             row = int((~x.isfinite().all(dim=1)).nonzero()[0])
-            raise ValueError(f"{self.name} takes finite parameters; row {row} of x holds {x[row].tolist()}")
+            raise ValueError(f"{self.name} takes finite parameters; row {row} of x is {x[row].tolist()}")
         if self.fidelity.precision == "float32" and bool((large := x.abs() > FLOAT32).any()):
             row = int(large.any(dim=1).nonzero()[0])
             raise ValueError(
-                f"{self.name} computes in float32, whose numbers end at 3.4e38; row {row} of x holds {x[row].tolist()}"
+                f"{self.name} computes in float32, whose largest number is 3.4e38; row {row} of x is {x[row].tolist()}"
             )
         return x
 
@@ -655,7 +652,7 @@ class Environment(Objective):
         if device not in self.devices:
             raise ValueError(f"{self.name} runs on {' and '.join(self.devices)}; got device {device!r}")
         if device == "cuda" and not self._has_cuda():
-            raise ValueError(f"{self.name} was asked to run on cuda; no CUDA device was found here, use --device cpu")
+            raise ValueError(f"{self.name} cannot run on cuda: this machine has no CUDA device; use --device cpu")
         return device
 
     def _has_cuda(self) -> bool:
@@ -665,7 +662,7 @@ class Environment(Objective):
 
 
 def check_shape(got: tuple[int, ...], wanted: tuple[int, ...], what: str, name: str) -> None:
-    """Raise SimulatorError where what a function returned has another shape than it must have."""
+    """Raise SimulatorError where a function returned another shape than expected."""
     if got == wanted:
         return
     advice = "a function of one point: vectorized=False"

@@ -1,4 +1,4 @@
-"""The Bounce scene: a ball is thrown so that it meets a target after bouncing off the ground."""
+"""The Bounce scene: throw a ball so that it hits a target after a bounce off the ground."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ VIEW = View((-0.8, 0.0, -0.7), (2.6, 5.1, 0.7), eye=(0.1, 0.25, 1.0))
 class BounceOptions(EpisodeOptions):
     """Contact: stiffness `ke` [N/m], damping `kd` and viscous friction `kf` [N s/m], Coulomb's `mu`.
 
-    `contacts`: step takes the ground's force in whole time steps, as Warp does; touch splits the step in which the ball
-    touches at that time; smooth lets damping grow with depth, to kd at 2.5 cm. `spin`: friction spins the ball, a solid
-    sphere, which does not spin at first. `drag`: coefficient of the drag of the air (1.2 kg/m^3), 0.47 for a smooth
-    sphere. The target is at (`target_x`, `target_y`, `target_z`) [m]. `downward`: only velocities with a part
-    downwards, vertical ones from -10 to 0 m/s.
+    `contacts`: step applies the ground's force in whole time steps, as Warp does. touch splits the step at the time of
+    touch. smooth lets damping grow with depth, up to kd at 2.5 cm. `spin`: friction spins the ball, a solid sphere that
+    starts without spin. `drag`: drag coefficient in air (1.2 kg/m^3); a smooth sphere has 0.47. The target is at
+    (`target_x`, `target_y`, `target_z`) [m]. `downward`: only throws downwards, with a vertical velocity from -10 to 0
+    m/s.
     """
 
     contacts: Literal["step", "touch", "smooth"] = "step"
@@ -53,34 +53,35 @@ class BounceOptions(EpisodeOptions):
 
 
 def _velocities(*, highest: float) -> ParameterSpace:
-    """Return the box of velocities up to a highest vertical one [m/s]."""
+    """Return the box of velocities with an upper bound on the vertical one [m/s]."""
     lower, upper = (torch.tensor(end, dtype=torch.float64) for end in ((-10.0, -10.0, -10.0), (10.0, highest, 10.0)))
     return ParameterSpace(("velocity x", "velocity y", "velocity z"), lower, upper, ("m/s",) * 3)
 
 
 class Bounce(Environment):
-    """Throw a ball so that it is at the target after 2 s, having bounced off the ground.
+    """Throw a ball so that it hits the target after 2 s and a bounce off the ground.
 
-    Model: a ball of radius 0.1 m and mass 1 kg flies from (-0.5, 1, 0) m under gravity; the ground y = 0 pushes back by
-    Warp's relaxed contact (penalty stiffness 1e4 N/m, damping 10 N s/m while approaching, friction); semi-implicit
+    Model: a ball of radius 0.1 m and mass 1 kg flies from (-0.5, 1, 0) m under gravity. The ground y = 0 pushes back by
+    Warp's relaxed contact: penalty stiffness 1e4 N/m, damping 10 N s/m during approach, and friction. Semi-implicit
     Euler, dt 1/480 s at standard.
     Parameters: initial velocity x, y, z [m/s].
-    Loss: squared distance of the ball's centre to the target (2, 1, 0) m at the end, after 2 s [m^2]. One bounce
-    reaches it (example `aim`).
-    Gradients are exact for the program, not for the model: damping makes the force jump from 0 to kd |v| at touch, and
-    whole steps do not differentiate when that is. d loss / d vy converges to that of a motion that always touches at
-    the same time: at steps of 1/480, 1/3840, 1/30720 s its median relative error against the model is 8.0, 7.2, 7.9,
-    its sign right in 61, 57, 57 % of 23 throws that bounce. contacts=touch splits the step at the time of touch (0.37,
-    0.24, 0.023), contacts=smooth lets damping grow with depth (2.8, 0.29, 0.026): both converge at first order, signs
-    right in 100 % at last. At 1/480 s the losses of contacts=touch are less accurate than the default's, although
-    its slopes are more truthful. The default stays the paper's contact, whose landscape the scene is about.
-    Simplifications: the ball does not spin (option), since the paper's contact is one of points; there is no air
-    (option), and no wall, since the policy has to use the ground. Viscous friction is capped so that a step cannot
-    reverse sliding.
-    Preset paper: the supplement restricts the velocities to a cone with a part downwards and does not say how wide;
-    this is the widest (downward=true). Its figure 8 looks from -10 to 10 m/s all the same, as the default does.
+    Loss: squared distance from the ball's centre to the target (2, 1, 0) m at the end, after 2 s [m^2]. One bounce is
+    enough to reach the target (example `aim`).
+    Gradients: exact for the program, not for the model. At touch, damping makes the force jump from 0 to kd |v|, and
+    whole time steps do not differentiate the time of touch. So d loss / d vy converges to the gradient of a motion with
+    a fixed time of touch. Against the model, its median relative error is 8.0, 7.2, 7.9 at steps of 1/480, 1/3840,
+    1/30720 s. Its sign is right in 61, 57, 57 % of 23 throws that bounce. contacts=touch splits the step at the time of
+    touch (errors 0.37, 0.24, 0.023). contacts=smooth lets damping grow with depth (2.8, 0.29, 0.026). Both converge at
+    first order, and their signs end up right in 100 % of the throws. At 1/480 s contacts=touch has less accurate losses
+    than the default, but more accurate gradients. The default keeps the paper's contact, because the scene is about its
+    landscape.
+    Simplifications: the ball does not spin (option), because the paper's contact is a point contact. There is no air
+    (option). There is no wall, because the policy has to use the ground. Viscous friction is capped so that a step
+    cannot reverse sliding.
+    Preset paper: the supplement restricts the velocities to a downward cone without giving its width. The preset takes
+    the widest (downward=true). The paper's figure 8 nevertheless shows -10 to 10 m/s, as the default does.
     Source: task Bounce of "Rethinking Optimization with Differentiable Simulation from a Global Perspective" (CoRL
-    2022), appendix B.1; contact constants of NVIDIA Warp's bounce example.
+    2022), appendix B.1; contact constants from NVIDIA Warp's bounce example.
     """
 
     model_version = 1
@@ -132,8 +133,8 @@ class Bounce(Environment):
     def bounces(self, x: Float[Tensor, "batch 3"]) -> Int[Tensor, " batch"]:
         """Count how often each ball leaves the ground, in a flight whose steps are split at the time of touch.
 
-        In whole steps the count would change with how deep a step happens to end: 401 times as the vertical velocity
-        goes through its box at `aim`, against 7 times.
+        In whole steps, the count would depend on how deep a step happens to end. As the vertical velocity crosses its
+        box at `aim`, it would then change 401 times instead of 7.
         """
         counts = []
         for part in torch.split(self._check_points(x), self._capacity):
@@ -147,7 +148,7 @@ class Bounce(Environment):
         return {"bounces": self.bounces(x)}
 
     def replicas(self) -> Mapping[str, Environment]:
-        """Return the flight in time steps a little shorter: a bounce falls elsewhere within a step."""
+        """Return the flight in slightly shorter time steps, which moves a bounce within its step."""
         return self._replicas_of(self._shorter_steps(round(DURATION / self.fidelity.dt)))
 
     def episode(self, x: Float[Tensor, " dim"]) -> Episode:
@@ -166,7 +167,7 @@ class Bounce(Environment):
 
     @property
     def target(self) -> Float[Tensor, " 3"]:
-        """Where the ball is wanted [m]."""
+        """Position of the target [m]."""
         o = self.options
         return torch.tensor([o.target_x, o.target_y, o.target_z], dtype=torch.float64)
 
@@ -190,7 +191,7 @@ class Bounce(Environment):
         return Evaluation(miss.square().sum(dim=1), slope, torch.full((len(x),), Status.OK, dtype=torch.int8))
 
     def _energy(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch step"]:
-        """Return kinetic and potential energy of each flight, that of the ground's spring included."""
+        """Return kinetic and potential energy of each flight, including the energy of the ground's spring."""
         with self._solvers.lend() as solver:
             flight = copied(solver.run(torch.tensor(START), x))
             roll = copied(to_torch(solver.roll)[1:, : len(x)])

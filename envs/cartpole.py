@@ -38,10 +38,10 @@ UPRIGHT = (
 
 @dataclass(frozen=True)
 class CartpoleOptions(EpisodeOptions):
-    """The tip is wanted at (`target_x`, `target_y`) [m]; the cart starts at (0, 0), its chain hangs down to (0, -3).
+    """The target of the tip is (`target_x`, `target_y`) [m]. The cart starts at (0, 0), with the tip at (0, -3).
 
-    `gravity` [m/s^2]; `taper`: each link has half the mass of the one before, or else all have the first's, 1 kg;
-    `joint_damping` [N m s/rad] of each of the three joints.
+    `gravity` [m/s^2]. `taper`: each link has half the mass of the previous one; without it, every link has 1 kg.
+    `joint_damping` [N m s/rad] applies to each of the three joints.
     """
 
     target_x: float = 0.0
@@ -54,21 +54,22 @@ class CartpoleOptions(EpisodeOptions):
 class Cartpole(Environment):
     """Swing up a chain of three links, so that its tip is at the target after 2 s.
 
-    Model: a cart moves along a rail at a prescribed velocity; from it hang three uniform rods of 1 m with masses 1, 0.5
-    and 0.25 kg, at rest at first, under gravity (9.81 m/s^2) and the torques of three motors: between cart and first
-    link, first and second, second and third. Angles and their momenta, classical Runge-Kutta, dt 0.01 s at standard.
-    Parameters: cart velocity [m/s] and torques 1, 2, 3 [N m], control by control; each of 100 controls is held for 0.02
-    s. The box, ours, is ±2 m/s and ±10, ±4, ±1 N m: less than holds the links out level (12.3, 4.9, 1.2 N m), so that
-    the tip has to be swung up, and random controls leave it hanging (3.3 to 6.1 m from the target).
-    Loss: distance of the tip to the target (0, 3) m at 2 s [m]; at the target itself its gradient is 0. Example
-    `upright` comes within 2 mm; it was found by gradient descent (Adam at standard on ten knots of each control, with
-    a small penalty on their second differences) from the best looking of 32 random starts.
-    Simplifications: links do not collide, as in the paper; there is no friction, and no limit to joints and rail, which
-    would bring contacts into a scene without any; the cart changes its velocity at once, which kicks the links, since
-    it is the velocity that the paper prescribes.
+    Model: a cart moves along a rail at a prescribed velocity. From it hang three uniform rods of 1 m with masses 1, 0.5
+    and 0.25 kg, initially at rest. Gravity (9.81 m/s^2) and three motors act on them, between cart and first link,
+    first and second, second and third. The state is angles and their momenta. Classical Runge-Kutta, dt 0.01 s at
+    standard.
+    Parameters: cart velocity [m/s] and torques 1, 2, 3 [N m], control by control. Each of 100 controls lasts 0.02 s. We
+    chose the box of ±2 m/s and ±10, ±4, ±1 N m. Holding the links out level takes more torque (12.3, 4.9, 1.2 N m), so
+    the tip has to be swung up. Random controls leave it hanging, 3.3 to 6.1 m from the target.
+    Loss: distance of the tip to the target (0, 3) m at 2 s [m]. Exactly at the target the gradient is 0. Example
+    `upright` comes within 2 mm. Gradient descent found it from the most promising of 32 random starts: Adam at standard
+    on ten knots of each control, with a small penalty on their second differences.
+    Simplifications: links do not collide, as in the paper. There is no friction. Joints and rail have no limits,
+    because limits would add contacts to a scene without any. The cart changes its velocity instantly, which kicks the
+    links, because the paper prescribes the velocity.
     Source: task 3-link Cartpole of "Rethinking Optimization with Differentiable Simulation from a Global Perspective"
-    (CoRL 2022), appendix A.1.1. The paper has 200 timesteps, four controls and 400 parameters: held for two timesteps,
-    controls satisfy all three. Masses, torques, times and target are ours.
+    (CoRL 2022), appendix A.1.1. The paper has 200 timesteps, four controls and 400 parameters; holding each control for
+    two timesteps satisfies all three. Masses, torques, times and target are ours.
     """
 
     model_version = 1
@@ -124,15 +125,15 @@ class Cartpole(Environment):
         return Work(len(CHAIN.masses) * self.steps, "body-step")
 
     def replicas(self) -> Mapping[str, Environment]:
-        """Return the chain whose angles are counted from a turn on, so that they are rounded otherwise.
+        """Return the chain with its angles counted from a full turn on, so that they are rounded differently.
 
-        Without contacts there is nothing else for steps to fall upon, and controls change at the ends of steps. The
-        mirrored chain is of no use here, since it rounds alike.
+        Without contacts, no event can happen at another moment within a step, and controls change at the ends of steps.
+        The mirrored chain does not help, because it rounds in the same way.
         """
         return self._replicas_of({f"angles {turns} turns on": {"settings": {"turns": turns}} for turns in (1, 2)})
 
     def episode(self, x: Float[Tensor, " dim"]) -> Episode:
-        """Return the cart, and the joints of the chain with its tip."""
+        """Return the cart, the joints of the chain and its tip."""
         controls = self._controls(self._row(x))
         with self._solvers.lend() as solver:
             phi = copied(self._swing(solver, controls)[:, 0])
@@ -145,7 +146,7 @@ class Cartpole(Environment):
 
     @property
     def target(self) -> Float[Tensor, " 2"]:
-        """Where the tip is wanted [m]."""
+        """Target of the tip [m]."""
         return torch.tensor([self.options.target_x, self.options.target_y], dtype=torch.float64)
 
     def _setup(self) -> None:
@@ -170,9 +171,9 @@ class Cartpole(Environment):
         return Evaluation(loss.detach(), slope, torch.full((len(x),), Status.OK, dtype=torch.int8))
 
     def _energy(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch step"]:
-        """Return the energy of the chain that swings from a cart at rest, let go at angles that the first torques set.
+        """Return the energy of a chain that swings from a cart at rest, released at angles set by the first torques.
 
-        A torque's bounds stand for half a turn either way.
+        The bounds of a torque map to half a turn either way.
         """
         torque = x.view(len(x), CONTROLS, 4)[:, 0, 1:]
         with self._solvers.lend() as solver:
@@ -199,7 +200,7 @@ class Cartpole(Environment):
     def _watch(
         self, controls: Float[Tensor, "batch control 4"], phi: Float[Tensor, "step_plus_1 batch 3"], decision: int
     ) -> Float[Tensor, "batch feature"]:
-        """Watch the cart and the sines and cosines of angles, and how fast cart and angles changed in the last step."""
+        """Observe the cart, the sines and cosines of the angles, and the rates of change in the last step."""
         step = decision * self.steps // CONTROLS
         joints = torch.cat([self._cart(controls)[:, :, None], phi.transpose(0, 1)], dim=2)
         rate = (joints[:, step] - joints[:, max(0, step - 1)]) * (TEMPO / self.fidelity.dt)
@@ -208,12 +209,12 @@ class Cartpole(Environment):
     def _swing(
         self, solver: Solver, controls: Float[Tensor, "batch control 4"]
     ) -> Float[Tensor, "step_plus_1 batch 3"]:
-        """Return the angles at the ends of steps [rad], from hanging at rest, counted from so many turns on."""
+        """Return the angles at the ends of steps [rad], starting at rest and offset by this many full turns."""
         rest = torch.zeros(3, dtype=torch.float64)
         return solver.run(rest + 2 * torch.pi * self.fidelity.settings.get("turns", 0), rest, controls)
 
     def _controls(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch control 4"]:
-        """Return cart velocity and torques in each control step; none after the last that parameters set."""
+        """Return cart velocity and torques in each control step; zero after the last one that parameters set."""
         return extend(x.view(len(x), CONTROLS, 4), self.control_steps, then=x.new_zeros(len(x), 1, 4))
 
     def _cart(self, controls: Float[Tensor, "batch control 4"]) -> Float[Tensor, "batch step_plus_1"]:
@@ -247,7 +248,7 @@ def _joints(cart: Float[Tensor, "*batch"], phi: Float[Tensor, "*batch 3"]) -> Fl
 def _pull_back(
     solver: Solver, found: Tensor, weight: Tensor, phi: Tensor, controls: Tensor, x: Tensor
 ) -> Float[Tensor, "batch dim"]:
-    """Return the gradient by x of what depends on angles and on the cart's path, each number by its weight."""
+    """Return the gradient with respect to x of the weighted sum of angles and positions of the cart."""
     adj_phi, adj_controls = torch.autograd.grad(found, (phi, controls), weight, retain_graph=True)
     (slope,) = torch.autograd.grad(controls, x, adj_controls + solver.gradient(adj_phi).cpu().double())
     return slope

@@ -1,7 +1,7 @@
-"""Where balls are after one impact, in closed form: Newton's law and the time of touch, without a time step.
+"""Positions of balls after one impact, in closed form: Newton's law and the time of touch, without a time step.
 
 The tasks are those of Zhong, Han and Brikis 2022, "Differentiable Physics Simulations with Contacts: Do They Have
-Correct Gradients w.r.t. Position, Velocity and Control?" (arXiv 2207.05060). All is differentiable in torch.
+Correct Gradients w.r.t. Position, Velocity and Control?" (arXiv 2207.05060). Everything is differentiable in torch.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ LIVELY = 0.92  # restitution of task 2; that of the others is 1
 
 
 def pushed(x: Tensor, v: Tensor, push: Tensor) -> tuple[Tensor, Tensor]:
-    """Return place and velocity after the first push, an acceleration [m/s^2] held for `HELD`."""
+    """Return position and velocity after the first push, an acceleration [m/s^2] of duration `HELD`."""
     return x + v * HELD + push * (HELD**2 / 2), v + push * HELD
 
 
 def bounce_once(y: Row, v: Row, push: Row, time: float) -> Row:
-    """Return the height [m] after a time without gravity: that of free flight, reflected by the elastic ground."""
+    """Return the height [m] after some time without gravity: free flight, reflected by the elastic ground."""
     y, v = pushed(y, v, push)
     return RADIUS + (y + v * (time - HELD) - RADIUS).abs()
 
 
 def ground_wall(x: Pair, v: Pair, push: Pair, time: float) -> Pair:
-    """Return where a ball is that falls on the ground once, and strikes the wall once, or either not yet."""
+    """Return the position of a ball that hits the ground and the wall at most once each."""
     x, v = pushed(x, v, push - push.new_tensor([0.0, GRAVITY]))
     left = time - HELD
     ahead, face = x[:, 0] + v[:, 0] * left, WALL - RADIUS
@@ -46,7 +46,7 @@ def ground_wall(x: Pair, v: Pair, push: Pair, time: float) -> Pair:
 
 
 def two_balls(x: Float[Tensor, "batch 2 2"], v: Float[Tensor, "batch 2 2"], push: Pair, time: float) -> Pair:
-    """Return where the second of two equal balls is that the first strikes, which is pushed throughout [m/s^2]."""
+    """Return the position of the second of two equal balls; the first has a constant push [m/s^2] and strikes it."""
     apart, speed = x[:, 1] - x[:, 0], v[:, 1] - v[:, 0]
     touch = time_of_touch(apart, speed, -push, 2 * REACH)
     met = touch < time
@@ -58,7 +58,7 @@ def two_balls(x: Float[Tensor, "batch 2 2"], v: Float[Tensor, "batch 2 2"], push
 
 
 def time_of_touch(apart: Pair, speed: Pair, push: Pair, reach: float) -> Row:
-    """Return when |apart + t speed + t^2 push / 2| falls to `reach`: the first root of a quartic, infinite without."""
+    """Return when |apart + t speed + t^2 push / 2| falls to `reach`: the first root of a quartic, or infinity."""
     a, b, c = apart.detach(), speed.detach(), push.detach() / 2
     quartic = [_dot(c, c), 2 * _dot(b, c), _dot(b, b) + 2 * _dot(a, c), 2 * _dot(a, b), _dot(a, a) - reach**2]
     monic = torch.stack(quartic[1:], dim=1) / quartic[0].clamp(min=1e-12)[:, None]

@@ -1,4 +1,4 @@
-"""Three scenes of balls that collide in a plane, whose losses and gradients have a closed form."""
+"""Three scenes of colliding balls in a plane, whose losses and gradients have a closed form."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ Pushes = list[tuple[Places, float]]
 class CollisionOptions(EpisodeOptions):
     """`contacts`: touch finds the time of each touch and differentiates it.
 
-    step reflects velocities in whole steps, as many simulators do; shift corrects places by the time of touch, and
-    velocities not, as DiffTaichi does.
+    step reflects velocities in whole steps, as many simulators do. shift corrects positions by the time of touch but
+    not velocities, as DiffTaichi does.
     """
 
     contacts: Contacts = "touch"
@@ -44,10 +44,11 @@ class CollisionOptions(EpisodeOptions):
 class CollisionScene(Environment):
     """Model: balls of 1 kg in an upright plane, without friction and air; impacts are instantaneous.
 
-    With contacts=touch flights are parabolas and the time of each touch is exact, to rounding: the step only says how
-    finely touches are looked for. With contacts=step and shift they are semi-implicit Euler, dt 1/480 s, in which the
-    gradients of the program converge to others than the model's.
-    Source: Zhong, Han and Brikis 2022 (arXiv 2207.05060), whose numbers the scene has; its centre is their start.
+    With contacts=touch flights are parabolas and the time of each touch is exact up to rounding. The step only sets how
+    finely touches are searched for. contacts=step and shift use semi-implicit Euler, dt 1/480 s. There, gradients of
+    the program do not converge to those of the model.
+    Source: Zhong, Han and Brikis 2022 (arXiv 2207.05060). The numbers of the scene are theirs, and the centre of the
+    box is their starting point.
     """
 
     model_version = 1
@@ -61,15 +62,15 @@ class CollisionScene(Environment):
 
     @abc.abstractmethod
     def _start(self, x: Float[Tensor, "batch dim"]) -> tuple[Places, Places, Pushes]:
-        """Return places, velocities and pushes that parameters say."""
+        """Return the positions, velocities and pushes that the parameters set."""
 
     @abc.abstractmethod
     def _loss(self, end: Places, x: Float[Tensor, "batch dim"]) -> Float[Tensor, " batch"]:
-        """Return the loss of where balls end."""
+        """Return the loss at the final positions of the balls."""
 
     @property
     def time(self) -> float:
-        """How long an episode is [s], in whole steps."""
+        """Duration of an episode [s], in whole steps."""
         dt = self.fidelity.dt
         return float(self.options.count_steps(round(self.duration / dt)) * dt)
 
@@ -79,7 +80,7 @@ class CollisionScene(Environment):
         return ROWS
 
     def memory(self) -> int:
-        """Estimate the bytes of one row: what torch keeps of every step to differentiate."""
+        """Estimate the bytes of one row: torch keeps every step for differentiation."""
         return round(self.time / self.fidelity.dt) * 600 * self.table.discs
 
     def work(self) -> Work:
@@ -123,12 +124,12 @@ def _frames(time: float) -> int:
 
 
 def _box(*around: tuple[str, float, float, str]) -> ParameterSpace:
-    """Return the space of parameters by name, middle, half width and unit."""
+    """Return the parameter space from name, centre, half width and unit of each parameter."""
     return ParameterSpace({name: (middle - half, middle + half, unit) for name, middle, half, unit in around})
 
 
 class _OneBall(CollisionScene):
-    """A ball whose place and velocity at first, and push over the first 1/480 s, are the parameters."""
+    """A ball whose initial position, initial velocity and push over the first 1/480 s are the parameters."""
 
     control_step: ClassVar[float] = HELD
     fall: ClassVar[float] = 0.0  # gravity [m/s^2]
@@ -140,12 +141,12 @@ class _OneBall(CollisionScene):
 
 
 class BounceOnce(_OneBall):
-    """Let a ball bounce off the ground once; the loss is how high it is then.
+    """Let a ball bounce off the ground once; the loss is its height afterwards.
 
     Parameters: position x, y [m], velocity x, y [m/s], and a push x, y over the first 1/480 s [m/s²].
-    Loss: height of the ball's centre after 1 s [m]. The impact is elastic and there is no gravity, so that the height
-    is linear in the parameters as long as the ball bounces: its slopes are -1 by the height at first, -1 s by the
-    vertical velocity, -(1/480 - 1/480²/2) s² by the push, and 0 by all that is horizontal.
+    Loss: height of the ball's centre after 1 s [m]. The impact is elastic and there is no gravity, so the height is
+    linear in the parameters as long as the ball bounces. Its derivatives are -1 by the initial height, -1 s by the
+    vertical velocity, -(1/480 - 1/480²/2) s² by the vertical push, and 0 by all horizontal parameters.
     """
 
     name = "bounce-once"
@@ -192,11 +193,11 @@ class GroundWall(_OneBall):
 
 
 class TwoBalls(CollisionScene):
-    """Push a ball against another one, so that this comes to rest at the origin's place after 1 s, at little cost.
+    """Push a ball against a second one, so that the second one is at the origin after 1 s, at little cost.
 
-    Parameters: position x, y [m] and velocity x, y [m/s] of both, and the push x, y on the first throughout [m/s²].
-    Loss: squared distance of the second ball to the origin after 1 s [m²], and 0.1 times the push's square by its time.
-    Radii are 0.2 m, the impact is elastic, and there is no gravity.
+    Parameters: position x, y [m] and velocity x, y [m/s] of both, and a constant push x, y on the first [m/s²].
+    Loss: squared distance of the second ball to the origin after 1 s [m²], plus 0.1 times the squared push times its
+    duration. Radii are 0.2 m, the impact is elastic, and there is no gravity.
     """
 
     name = "two-balls"

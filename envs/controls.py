@@ -12,18 +12,18 @@ from torch import Tensor
 def hold(segments: Float[Tensor, "batch segment axis"], steps: int) -> Float[Tensor, "batch step axis"]:
     """Hold each of the equally long segments' values over its control steps.
 
-    Raises ValueError where control steps cannot be shared equally.
+    Raises ValueError where control steps cannot be divided equally.
     """
     count = segments.shape[1]
     if steps % count:
-        raise ValueError(f"{steps} control steps cannot be shared equally by {count} segments")
+        raise ValueError(f"{steps} control steps cannot be divided equally into {count} segments")
     return segments.repeat_interleave(steps // count, dim=1)
 
 
 def extend(
     rows: Float[Tensor, "batch row axis"], count: int, *, then: Float[Tensor, "batch 1 axis"]
 ) -> Float[Tensor, "batch count axis"]:
-    """Return the first `count` rows of a course in time, those that it lacks being `then`."""
+    """Return the first `count` rows of a course in time, extended by `then`."""
     return torch.cat([rows[:, :count], then.expand(-1, max(0, count - rows.shape[1]), -1)], dim=1)
 
 
@@ -40,7 +40,7 @@ def ramp(
 
 
 def ease(velocity: Float[Tensor, "batch step axis"], steps: int) -> Float[Tensor, "batch step axis"]:
-    """Return velocities that change over so many control steps, from rest: the mean of the last ones."""
+    """Return velocities that change over this many control steps, from rest: the mean of the last ones."""
     before = torch.cat([velocity.new_zeros(len(velocity), steps - 1, velocity.shape[2]), velocity], dim=1)
     return before.unfold(1, steps, 1).mean(dim=3)
 
@@ -88,7 +88,7 @@ SEEN = 32  # points of each body
 
 
 def watch(x: Float[Tensor, "batch point 3"], sizes: Sequence[int]) -> Float[Tensor, "batch seen 3"]:
-    """Return the centre and up to 32 points, spread evenly over their numbers, of each body of so many points."""
+    """Return the centre and up to 32 points, evenly chosen by number, of each body."""
     return torch.stack([torch.cat([_watch_body(body) for body in row.split(list(sizes))]) for row in x])
 
 
@@ -100,9 +100,9 @@ def describe_motion(
     scale: Float[Tensor, "point 1"] | float,
     intervals: int,
 ) -> Float[Tensor, "batch feature"]:
-    """Return how far points are from their start and their mean velocity in the interval since `before`.
+    """Return the displacements of points, and their mean velocity in the interval since `before`.
 
-    The unit of length is `scale`, that of time is a decision, which has so many `intervals`.
+    The unit of length is `scale`; that of time is a decision, which has `intervals` intervals.
     """
     features = torch.stack([now - start, (now - before) * intervals], dim=1) / scale
     return features.flatten(start_dim=1)

@@ -1,4 +1,4 @@
-"""BoTorch's synthetic test functions as environments: known minima and exact gradients, to hold tools against."""
+"""BoTorch's synthetic test functions as environments: known minima and exact gradients, to test tools against."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from .base import Environment, Fidelity
 
 @dataclass(frozen=True)
 class AnyDimension:
-    """`dim`: how many variables the function takes."""
+    """`dim`: number of variables of the function."""
 
     dim: int = field(default=2, metadata={"most": 100_000})  # many more, and lists of their names alone fill memory
 
@@ -26,8 +26,8 @@ class AnyDimension:
 class Function(Environment):
     """Evaluate one of BoTorch's synthetic functions and its exact gradient (float64 throughout).
 
-    Parameters: x0, x1, ..., without units, in the function's customary box. Loss: the function's value, no unit. The
-    formula holds beyond the box too.
+    Parameters: x0, x1, ..., without units, in the function's customary box.
+    Loss: the function's value, without a unit. The formula is also defined outside the box.
     """
 
     model_version = 1
@@ -47,7 +47,7 @@ class Function(Environment):
         self.space = ParameterSpace(names, lower, upper, ("",) * len(names))
 
     def memory(self) -> int:
-        """Estimate the bytes of one row: what torch keeps of it to differentiate, and its numbers."""
+        """Estimate the bytes of one row: its numbers, and what torch keeps for differentiation."""
         return 18_000 + 80 * self.space.dim
 
     def _evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:

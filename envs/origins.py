@@ -1,4 +1,4 @@
-"""Where a gradient first is not finite: the operation and the line of the program that calls it; for torch here."""
+"""Find where a gradient first is not finite: the operation and the line that calls it; here for torch."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def describe_origin(operation: str, place: Place | None) -> str:
 
 
 def callers_line(frames: Iterable[Place], library: str) -> Place | None:
-    """Return the first of the places, given from the innermost on, that lies outside of a library's folder."""
+    """Return the first call site outside a library's folder; sites start from the innermost."""
     known = list(frames)
     own = (place for place in known if not in_library(place[0], library) and place[0] not in _PYTHON)
     return next(own, known[0] if known else None)
@@ -64,7 +64,7 @@ def torch_origin(losses: Callable[[Tensor], Tensor], x: Float[Tensor, "one dim"]
 def _look(
     seen: list[int], number: int, produced: tuple[Tensor | None, ...], arrived: tuple[Tensor | None, ...]
 ) -> None:
-    """Remember a node that was given finite derivatives and makes others of them."""
+    """Remember a node that receives finite derivatives and returns derivatives that are not."""
     if not seen and _finite(arrived) and not _finite(produced):
         seen.append(number)
 
@@ -75,7 +75,7 @@ def _finite(values: Iterable[Tensor | None]) -> bool:
 
 @contextmanager
 def _lines_recorded() -> Iterator[None]:
-    """Let torch record with each operation where it was called: `detect_anomaly` does so too, but prints."""
+    """Let torch record the call site of each operation; `detect_anomaly` does so too, but prints."""
     before = torch.is_anomaly_enabled(), torch.is_anomaly_check_nan_enabled()
     torch.autograd.set_detect_anomaly(True, check_nan=False)
     try:
@@ -96,7 +96,7 @@ def _graph(last: Any) -> Iterator[Any]:
 
 
 def _describe_node(node: Any) -> str:
-    """Return what a node computes and where it was called: SqrtBackward0 is torch's `sqrt`."""
+    """Return a node's operation and its call site: SqrtBackward0 is torch's `sqrt`."""
     name, _, number = node.name().partition("Backward")
     if number:  # torch's own
         name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name).lower()

@@ -1,4 +1,4 @@
-"""The Pinball scenes: a ball falls through a grid of bars whose angles lead it to a goal."""
+"""The Pinball scenes: a ball falls through a grid of bars, and the angles of the bars lead it to a goal."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ VIEW = View((0.0, -0.8, -0.5), (WIDTH, HEIGHT, 0.5), eye=(0.08, 0.1, 1.0), groun
 
 @dataclass(frozen=True)
 class PinballOptions(EpisodeOptions):
-    """`contacts`: impact follows the ball to the time of impact, step reflects it in fixed steps, whose gradients err.
+    """`contacts`: impact computes the time of each impact; step reflects in fixed steps, and its gradients are wrong.
 
-    `restitution` and Coulomb's `friction` of walls and bars; restitution fades to zero below `crawl` [m/s]; `spin`: the
-    ball is a solid sphere, or else one that cannot spin. The ball is wanted at (`goal_x`, `goal_y`) [m].
+    `restitution` and Coulomb's `friction` apply to walls and bars. Restitution fades to zero below `crawl` [m/s].
+    `spin`: the ball is a solid sphere that spins, or else it cannot spin. The goal is at (`goal_x`, `goal_y`) [m].
     """
 
     contacts: Literal["impact", "step"] = "impact"
@@ -44,29 +44,30 @@ class PinballOptions(EpisodeOptions):
 
 
 def angles(count: int) -> ParameterSpace:
-    """Return the box of the angles of so many colliders."""
+    """Return the box of the angles of this many colliders."""
     return ParameterSpace.box([f"collider {k} angle" for k in range(count)], -1.0, 1.0, "rad")
 
 
 class Pinball(Environment):
-    """Model: a solid sphere (0.25 m, 1 kg) that spins, on an upright board 8 m wide and 10 m high, walled in all round.
+    """Model: a spinning solid sphere (0.25 m, 1 kg) on an upright board 8 m wide and 10 m high, with walls all round.
 
-    It is dropped at rest on a grid of bars, 0.2 m thick with round ends, each held at its angle on a pivot: from (3.75,
-    9.5) m on pivots at (2.2, 6), (5.8, 6) m, or from (3.5, 9.5) m on rows at 8.1, 6.7, 5.3, 3.9 m with pivots at 0.97,
-    2.99, 5.01, 7.03 m. Impacts are instantaneous, with restitution 0.5 (fading below 0.1 m/s, so that a ball comes to
-    rest) and Coulomb friction 0.2 (options). Flights and slides along faces are parabolas, whose times of impact are
-    exact: faces and walls in closed form, round ends by a root of the quartic, rolling around an end by Runge-Kutta
-    steps of 1/240 s. So the step only bounds how far one looks ahead. contacts=step reflects the velocity in steps that
-    find the ball overlapping, as many simulators do: it can pass through a bar, and its gradients lack the time of
+    It is dropped at rest onto a grid of bars, 0.2 m thick with round ends, each fixed at its angle on a pivot. With two
+    bars it starts at (3.75, 9.5) m, above pivots at (2.2, 6) and (5.8, 6) m. With sixteen it starts at (3.5, 9.5) m,
+    above rows at 8.1, 6.7, 5.3, 3.9 m with pivots at 0.97, 2.99, 5.01, 7.03 m. Impacts are instantaneous, with
+    restitution 0.5 and Coulomb friction 0.2 (options). Restitution fades below 0.1 m/s, so that a ball comes to rest.
+    Flights and slides along faces are parabolas with exact times of impact. Faces and walls have a closed form, round
+    ends take a root of the quartic. Rolling around an end takes Runge-Kutta steps of 1/240 s. So the step only bounds
+    how far ahead impacts are searched for. contacts=step reflects the velocity at the end of a step in which the ball
+    overlaps something, as many simulators do. The ball can then pass through a bar, and its gradients lack the time of
     impact.
-    Fidelity: of 100 random boards, with two bars and with sixteen, ends at steps of 1/15 and 1/240 s in float64 differ
-    by less than 1e-6 m in all. What remains is rounding, which impacts amplify: float32 at 1/30 s ends within 1e-3 m of
-    float64 in 100 and 63 %, within 0.1 m in 100 and 97 %.
+    Fidelity: on 100 random boards, with two bars and with sixteen, ends at steps of 1/15 and 1/240 s in float64 differ
+    by less than 1e-6 m. What remains is rounding, which impacts amplify. Ends in float32 at 1/30 s are within 1e-3 m of
+    float64 on 100 and 63 % of the boards, and within 0.1 m on 100 and 97 %.
     Parameters: angles of the bars [rad], row by row from the top, 0 horizontal, counterclockwise.
     Loss: distance of the ball's centre to the goal (7, 0.65) m at the end, after 4 s [m].
-    Simplifications: bars are held, since their angles are the parameters; there is no drag and no rolling resistance,
-    since 4 s are short; a ball that would be back on its surface within 1 ms stays on it; one that is jammed between
-    surfaces, at 8 impacts at once, stays where it is until the next step.
+    Simplifications: bars do not move, because their angles are the parameters. There is no drag and no rolling
+    resistance, because 4 s are short. A ball that would return to its surface within 1 ms stays on it. A ball jammed
+    between surfaces (8 impacts at once) stays in place until the next step.
     Source: task Pinball of "Rethinking Optimization with Differentiable Simulation from a Global Perspective" (CoRL
     2022), appendix A.1.2; ball, bars, start, goal and duration are ours.
     """
@@ -102,7 +103,7 @@ class Pinball(Environment):
 
     @property
     def goal(self) -> Float[Tensor, " 2"]:
-        """Where the ball is wanted [m]."""
+        """Position of the goal [m]."""
         return torch.tensor([self.options.goal_x, self.options.goal_y], dtype=torch.float64)
 
     def memory(self) -> int:
@@ -115,7 +116,7 @@ class Pinball(Environment):
         return Work(self.steps, "body-step")
 
     def events(self, x: Float[Tensor, "batch dim"]) -> Mapping[str, Int[Tensor, " batch"]]:
-        """Count the impacts of each episode that are faster than crawling."""
+        """Count the impacts of each episode that are faster than `crawl`."""
         counts = [torch.zeros(0, dtype=torch.int64)]
         for part in torch.split(self._check_points(x), self._capacity):
             with self._solvers.lend() as solver:
@@ -124,7 +125,7 @@ class Pinball(Environment):
         return {"impacts": torch.cat(counts)}
 
     def replicas(self) -> Mapping[str, Environment]:
-        """Return the fall in time steps a little shorter: between them numbers are rounded, which impacts amplify."""
+        """Return the fall in slightly shorter time steps: each step rounds, and impacts amplify the rounding."""
         return self._replicas_of(self._shorter_steps(round(DURATION / self.fidelity.dt)))
 
     def episode(self, x: Float[Tensor, " dim"]) -> Episode:
@@ -165,8 +166,8 @@ class Pinball(Environment):
 class Pinball2(Pinball):
     """Lead a falling ball to the goal by the angles of two bars, 3.4 m long.
 
-    The ball falls between them untouched where the left one is steep: a flat region. Example `aim`, as that of the
-    other scene, is among the best of 4096 random points at draft, taken for its small loss at all fidelities.
+    Where the left bar is steep, the ball falls between the bars without touching them: a flat region. The example `aim`
+    of both scenes is among the best of 4096 random points at draft, chosen for its small loss at all fidelities.
     """
 
     name = "pinball-2"

@@ -20,9 +20,9 @@ FORMS = (
 
 
 def point(environment: Environment, text: str) -> Float[Tensor, " dim"]:
-    """Return the point that `text` means: center, random:SEED, example:NAME or a file of the parameters' values.
+    """Return the point for a text: center, random:SEED, example:NAME or a file of the parameters' values.
 
-    Raises ValueError where there is no such example or file, or the file holds anything but the scene's parameters.
+    Raises ValueError where there is no such example or file, or the file does not contain the scene's parameters.
     """
     kind, _, value = text.partition(":")
     if text == "center":
@@ -33,7 +33,7 @@ def point(environment: Environment, text: str) -> Float[Tensor, " dim"]:
         return environment.example(value)
     path = Path(text)
     if not path.is_file():
-        raise ValueError(f"{environment.name} can be cut through {FORMS}; got {text!r}, which is none of these")
+        raise ValueError(f"{environment.name} takes as its point {FORMS}; got {text!r}, which is none of these")
     if path.suffix.lower() in SUFFIXES:
         return read_checkpoint(path, environment.space, environment.name)
     return _read(environment, path)
@@ -47,9 +47,9 @@ def _read(environment: Environment, path: Path) -> Float[Tensor, " dim"]:
             values = np.loadtxt(path, delimiter="," if "," in path.read_text() else None, ndmin=1)
         flat = torch.from_numpy(np.asarray(values, dtype=np.float64).ravel())
     except (ValueError, TypeError, OSError, EOFError) as error:
-        raise ValueError(f"{path} holds no list of numbers: {' '.join(str(error).split())}") from None
+        raise ValueError(f"{path} is not a list of numbers: {' '.join(str(error).split())}") from None
     if len(flat) != environment.space.dim or not bool(flat.isfinite().all()):
         raise ValueError(
-            f"{environment.name} takes {environment.space.dim} finite parameters; {path} holds {len(flat)} numbers"
+            f"{environment.name} takes {environment.space.dim} finite parameters; {path} has {len(flat)} numbers"
         )
     return environment.space.from_values(flat)

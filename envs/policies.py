@@ -1,7 +1,7 @@
-"""An environment over the weights of a policy that decides by what it sees: the landscape that learning walks.
+"""An environment over the weights of a policy that decides by its observations: the landscape of policy learning.
 
-The policy is a multilayer perceptron, deterministic: tanh layers, and tanh at its end, which is squashed to the box of
-each decision's parameters. What it sees is what the environment shows just before each decision.
+The policy is a deterministic multilayer perceptron: tanh layers, with a tanh at the end that is mapped to the box of
+each decision's parameters. The environment gives an observation just before each decision.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ COPIES = 8  # of the weights of all rows, at most
 
 @dataclass(frozen=True)
 class Episodes:
-    """Hold what policies `decided`, what was `seen` before each decision, and which are `blind`: they saw a NaN."""
+    """Collect what policies `decided`, what they had `seen` before each decision, and which are `blind` (saw a NaN)."""
 
     decided: Float[Tensor, "batch decided"]
     seen: Sequence[Float[Tensor, "batch feature"]]
@@ -46,16 +46,16 @@ class Policy(Remedy):
 
     @classmethod
     def of(cls, env: Environment, form: str) -> Policy:
-        """Return the policy of an environment with decisions that is so written: mlp:32x32 has two hidden layers.
+        """Return the policy of an environment with decisions from its text: mlp:32x32 has two hidden layers.
 
-        Raises ValueError for another form, and where the environment decides but once or its decisions are not alike;
-        TooLargeError for more weights than there is memory for.
+        Raises ValueError for another form, and where the environment has a single decision or unequal decisions. Raises
+        TooLargeError for more weights than fit in memory.
         """
         hidden = hidden_layers(form)
         if env.decisions == 1 or env.space.dim % env.decisions:
             raise ValueError(
-                f"{env.name} decides {'once' if env.decisions == 1 else 'unequally'} in an episode, so that there is "
-                "nothing to see for a policy; leave out --policy"
+                f"{env.name} decides {'once' if env.decisions == 1 else 'unequally'} in an episode, so a policy has "
+                "nothing to observe; leave out --policy"
             )
         features = env.observe(env.space.center[None], 0).shape[1]
         found = cls(form, tuple(pairwise([features, *hidden, env.space.dim // env.decisions])))
@@ -69,10 +69,10 @@ class Policy(Remedy):
         return self.form
 
     def space_of(self, env: Environment) -> ParameterSpace:
-        """Return the weights and biases of layer after layer.
+        """Return the weights and biases, layer by layer.
 
-        Those of a layer with n inputs lie within 3 / sqrt(n), three times as far as torch draws them at first; at the
-        centre they are zero, and every decision is the middle of its box.
+        Those of a layer with n inputs lie within 3 / sqrt(n), three times torch's initial bound. At the centre they are
+        zero, and every decision is the middle of its box.
         """
         shapes, reach = dict[str, tuple[int, ...]](), dict[str, float]()
         for layer, (n, m) in enumerate(self.layers, start=1):
@@ -85,16 +85,16 @@ class Policy(Remedy):
         return self.play(env, x.reshape(-1, x.shape[-1])).decided.reshape(*x.shape[:-1], -1)
 
     def evaluate(self, env: Environment, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
-        """Return the losses of episodes that are played with these weights, and their gradients if asked.
+        """Return the losses of episodes played with these weights, and their gradients if requested.
 
-        A policy that sees what is not finite decides on the middles of the boxes then, and its row has failed. Raises
-        SimulatorError where gradients are asked for and what is seen is not differentiated.
+        After an observation that is not finite, a policy decides on the middles of the boxes, and its row has failed.
+        Raises SimulatorError where gradients are requested but the observation has no gradient.
         """
         if grad and not env.differentiates_observations:
             raise SimulatorError(
-                f"{env.name} with policy {self.form} has no gradients, as what a policy sees there is not "
-                "differentiated; sample losses only, with --no-gradients, or estimate gradients from losses, with "
-                "--remedy smooth:1%:zeroth"
+                f"{env.name} with policy {self.form} has no gradients, because its observations are not "
+                "differentiated; sample losses only (--no-gradients), or estimate gradients from losses (--remedy "
+                "smooth:1%:zeroth)"
             )
         played = self.play(env, x)
         found = env.evaluate(played.decided, grad=grad)
@@ -104,7 +104,7 @@ class Policy(Remedy):
         return Evaluation.from_results(found.loss.masked_fill(lost, torch.nan), slope, status, found.error)
 
     def play(self, env: Environment, x: Float[Tensor, "batch dim"]) -> Episodes:
-        """Return the episodes that policies with these weights decide."""
+        """Return the episodes played by policies with these weights."""
         decided: Tensor = env.space.center.repeat(len(x), 1)
         blind, shown = torch.zeros(len(x), dtype=torch.bool), list[Tensor]()
         for decision in range(env.decisions if len(x) else 0):
@@ -119,9 +119,9 @@ class Policy(Remedy):
     def _pull_back(
         self, env: Environment, x: Float[Tensor, "batch dim"], played: Episodes, adjoint: Float[Tensor, "batch decided"]
     ) -> Float[Tensor, "batch dim"]:
-        """Return gradients by the weights, given those by all decisions as if none depended on an earlier one.
+        """Return gradients by the weights, from those by all decisions as if no decision depended on an earlier one.
 
-        From the last decision to the first: what a decision changes later, it changes by what is seen then.
+        This runs from the last decision to the first: a decision changes later ones through later observations.
         """
         slope, adjoint = torch.zeros_like(x), adjoint.clone()
         for decision in reversed(range(env.decisions)):
@@ -137,7 +137,7 @@ class Policy(Remedy):
         return slope
 
     def _act(self, x: Float[Tensor, "batch dim"], seen: Float[Tensor, "batch feature"]) -> Float[Tensor, "batch act"]:
-        """Return what each row's own perceptron answers to what it sees."""
+        """Return the decision of each row's own perceptron for its observation."""
         first = 0
         for n, m in self.layers:
             weight = x[:, first : first + n * m].view(-1, m, n)
@@ -150,8 +150,8 @@ class Policy(Remedy):
 class PolicyEnvironment(RemediedEnvironment):
     """The loss of an episode in which a policy decides, over the policy's weights.
 
-    Gradients are those of the whole loop: what is decided, what is seen after that, and what is decided then. They
-    exist where the environment differentiates what it shows.
+    Gradients are those of the whole loop of decisions and observations. They exist where the environment differentiates
+    its observations.
     """
 
     remedy: Policy
@@ -164,28 +164,28 @@ class PolicyEnvironment(RemediedEnvironment):
 
     @property
     def has_gradient(self) -> bool:  # type: ignore[override] # read only
-        """Whether what a policy sees is differentiated, and the loss, too."""
+        """Whether both the observation and the loss have gradients."""
         return self.inner.differentiates_observations and self.inner.has_gradient
 
     @property
     def horizon(self) -> float | None:
-        """None: decisions are of whole episodes."""
+        """None: decisions cover whole episodes."""
         return None
 
     def with_horizon(self, horizon: float) -> Environment:
-        """Raise ValueError: decisions are of whole episodes."""
-        raise ValueError(f"{self.name} decides whole episodes, which have one length")
+        """Raise ValueError: decisions cover whole episodes."""
+        raise ValueError(f"{self.name} decides whole episodes, so their length is fixed")
 
     def identity(self) -> dict[str, Any]:
-        """Return what decides the numbers: all that does of the environment, and the policy."""
+        """Return the settings that decide the numbers: those of the environment, and the policy."""
         return {**self.inner.identity(), "objective": self.name, POLICY: self.remedy.form}
 
     def about(self) -> str:  # type: ignore[override] # what there is to say is the other environment's
-        """Return what the environment within says of itself, and that a policy decides."""
-        return f"{self.inner.about()}\n\nOver the weights of the policy {self.remedy.form}."
+        """Return the description of the inner environment, and the policy."""
+        return f"{self.inner.about()}\n\nThe parameters are the weights of the policy {self.remedy.form}."
 
     def replicas(self) -> Mapping[str, Environment]:
-        """Return the same policy in those replicas of the environment that decide as often."""
+        """Return the same policy in those replicas of the environment that have as many decisions."""
         alike = {name: one for name, one in self.inner.replicas().items() if one.decisions == self.inner.decisions}
         return {name: PolicyEnvironment(one, self.remedy) for name, one in alike.items()}
 
@@ -197,14 +197,14 @@ class PolicyEnvironment(RemediedEnvironment):
 def with_policy(env: Environment, form: str | None) -> Environment:
     """Return an environment over the weights of a policy (mlp:32x32), itself where there is none.
 
-    Raises ValueError for what is no policy, and for an environment without decisions to take; TooLargeError for more
-    weights than there is memory for.
+    Raises ValueError for an invalid policy, and for an environment without decisions. Raises TooLargeError for more
+    weights than fit in memory.
     """
     return PolicyEnvironment(env, Policy.of(env, form)) if form else env
 
 
 def _own(env: Environment, decision: int) -> slice:
-    """Return where the parameters of a decision are."""
+    """Return the positions of a decision's parameters."""
     count = env.space.dim // env.decisions
     return slice(decision * count, (decision + 1) * count)
 

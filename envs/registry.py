@@ -1,12 +1,11 @@
-"""Find environments by name; import them only when one is made.
+"""Find environments by name; import each only when it is made.
 
-Another package registers its own by an entry point of the group `gradscape.environments`:
+Another package registers its own environment by an entry point of the group `gradscape.environments`:
 
     [project.entry-points."gradscape.environments"]
     my-arm = "my_package.arm:Arm"
 
-A program or a notebook registers a class by `register`, and the command takes whatever simulator a file holds as
-`FILE.py:NAME`.
+A program or a notebook registers a class by `register`. Commands also take any simulator in a file, as `FILE.py:NAME`.
 """
 
 from __future__ import annotations
@@ -39,9 +38,10 @@ ALL_IN_FILE = re.compile(r".+\.py:\*", re.DOTALL)
 
 
 def import_named(name: str) -> ModuleType:
-    """Import a module by its name, or a file by its path, once; what a file raises is said with its name.
+    """Import a module by its name, or a file by its path, once; errors in a file are reported with its name.
 
-    A file finds modules of its own folder as a program does. Raises ImportError for a module and ValueError for a file.
+    A file can import modules from its own folder, as a program can. Raises ImportError for a module and ValueError for
+    a file.
     """
     if not name.endswith(".py"):
         return import_module(name)
@@ -51,8 +51,8 @@ def import_named(name: str) -> ModuleType:
             sys.modules[known] = _load_file(known, name)
         except SystemExit as error:
             raise ValueError(
-                f"{name} called sys.exit({'' if error.code is None else repr(error.code)}) while it was imported; let "
-                'it do that as a program only, under `if __name__ == "__main__":`'
+                f"{name} called sys.exit({'' if error.code is None else repr(error.code)}) while it was imported; move "
+                'that call under `if __name__ == "__main__":`'
             ) from error
         except Exception as error:
             raise ValueError(f"{name} cannot be imported: {type(error).__name__}: {error}") from error
@@ -85,11 +85,11 @@ DEVICES = ("auto", "cpu", "cuda")
 
 @dataclass(frozen=True)
 class Entry:
-    """Say what an environment is without importing it.
+    """Describe an environment without importing it.
 
-    `target` is "module:Class", "FILE.py:NAME", a class or an environment. What another package's entry point cannot say
-    is empty; `complete_entry` asks the class. An environment whose engine is not always installed comes with an `extra`
-    of this package.
+    `target` is "module:Class", "FILE.py:NAME", a class or an environment. Fields that another package's entry point
+    cannot give are empty; `complete_entry` asks the class. `extra` names the extra of this package that installs an
+    optional engine.
     """
 
     name: str
@@ -144,7 +144,7 @@ BUILTIN = (
         "three-link chain on a cart, generalised coordinates",
     ),
     _scene(
-        "fluid", "mpm.fluid:Fluid", "10", "5 x (ladle speed x, ladle speed y) [· 0.2 m/s]",
+        "fluid", "mpm.fluid:Fluid", "10", "5 x (ladle speed x, ladle speed y) [m/s]",
         "MLS-MPM: viscous fluid, elastic cube, moving ladle",
     ),
     _scene("pinball-2", "pinball:Pinball2", "2", "angles of 1 x 2 colliders [rad]", BALL),
@@ -191,7 +191,7 @@ BUILTIN = (
 
 @cache
 def entries() -> dict[str, Entry]:
-    """Return every registered environment by name, ours before other packages'.
+    """Return every registered environment by name, ours before those of other packages.
 
     Raises ValueError where two packages register the same name.
     """
@@ -199,10 +199,10 @@ def entries() -> dict[str, Entry]:
 
 
 def register(what: Kind) -> Kind:
-    """Let an environment or the class of one be found by its `name` in this process, and return it.
+    """Make an environment, or a class of one, available by its `name` in this process, and return it.
 
-    It can be a decorator. Raises ValueError where another environment has that name. One that is run again, as in a
-    notebook, takes the place of the earlier one.
+    It can be a decorator. Raises ValueError where another environment has that name. Registering the same class again,
+    as in a notebook, replaces the earlier one.
     """
     from .base import Environment
 
@@ -210,23 +210,23 @@ def register(what: Kind) -> Kind:
         raise ValueError(f"register takes an environment, or a class derived from Environment; got {what!r}")
     taken = entries().get(what.name)
     if taken and (isinstance(taken.target, str) or _origin(taken.target) != _origin(what)):
-        raise ValueError(f"an environment called {what.name!r} exists already ({taken.model}); give it another name")
+        raise ValueError(f"an environment called {what.name!r} already exists ({taken.model}); choose another name")
     entries()[what.name] = Entry(what.name, what, model="registered by this program")
     return what
 
 
 def _origin(what: type[Environment] | Environment) -> str:
-    """Return what a class is called where it is written, or of what kind an environment is."""
+    """Return the module and name of a class, or of an environment's class."""
     return what.__qualname__ if isinstance(what, type) else type(what).__qualname__
 
 
 def installs(entry: Entry) -> str:
-    """Return the line that installs what an environment needs, empty where that is there."""
+    """Return the line that installs the packages an environment needs, empty if they are installed."""
     return "" if all(is_installed(package) for package in EXTRAS.get(entry.extra, ())) else install_line(entry.extra)
 
 
 def complete_entry(entry: Entry) -> Entry:
-    """Return an entry with what its class says of itself, which is imported for that."""
+    """Return an entry completed by its class, which is imported for that."""
     if entry.dim:
         return entry
     try:
@@ -234,7 +234,7 @@ def complete_entry(entry: Entry) -> Entry:
     except Exception as error:  # another package's: whatever it raises, the others are to be listed
         return replace(entry, model=f"{entry.model}; it cannot be made: {error}")
     labels = ", ".join(env.space.labels[:3]) + (", ..." if env.space.dim > 3 else "")
-    about = " ".join(env.about().partition("\n\n")[0].split()) or "says nothing of itself"
+    about = " ".join(env.about().partition("\n\n")[0].split()) or "no description"
     return replace(
         entry,
         dim=str(env.space.dim),
@@ -245,10 +245,10 @@ def complete_entry(entry: Entry) -> Entry:
 
 
 def find_environment(what: Any) -> type[Environment] | Environment:
-    """Return the environment, or the class of one, that somebody names or gives.
+    """Return the environment, or its class, for a name or an object.
 
-    That is a registered name, FILE.py:NAME, a class, an environment, or an object with `space` and `evaluate`. Raises
-    ValueError for what is none of these, and where a module or a file cannot be imported.
+    `what` is a registered name, FILE.py:NAME, a class, an environment, or an object with `space` and `evaluate`. Raises
+    ValueError for anything else, and where a module or a file cannot be imported.
     """
     from .base import Environment
 
@@ -260,8 +260,8 @@ def find_environment(what: Any) -> type[Environment] | Environment:
 
     if isinstance(what, FunctionType | BuiltinFunctionType | MethodType):
         raise ValueError(
-            f"{what.__name__} is a function, and nothing says what its parameters are: "
-            f"gs.from_torch({what.__name__}, space), from_jax, from_numpy or from_warp make an environment of it"
+            f"{what.__name__} is a function without a parameter space; make it an environment with "
+            f"gs.from_torch({what.__name__}, space), from_jax, from_numpy or from_warp"
         )
     return GivenEnvironment.of(what() if isinstance(what, type) else what)
 
@@ -273,7 +273,7 @@ def environment_class(name: str) -> type[Environment]:
 
 
 def as_environment(what: Any) -> Environment:
-    """Return what somebody names or gives as an environment. Raises ValueError as `find_environment` does."""
+    """Return the environment for a name or an object. Raises ValueError as `find_environment` does."""
     found = find_environment(what)
     return found() if isinstance(found, type) else found
 
@@ -286,10 +286,10 @@ def refuse_unknown(
     engine: str | None = None,
     dims: Sequence[str] = (),
 ) -> None:
-    """Raise ValueError for what cannot exist, where that is known without importing the scene or running its file.
+    """Raise ValueError for unknown settings, as far as possible without importing the scene or running its file.
 
-    Whoever makes the environment refuses the rest, after an import that takes seconds. `dims` are parameters, of which
-    numbers are held against how many a scene has where nothing changes that.
+    Making the environment checks everything else, after an import that takes seconds. `dims` are parameters. Their
+    numbers are compared with the number of parameters, where that is fixed.
     """
     if IN_FILE.fullmatch(what):
         _place_in_file(what)
@@ -302,14 +302,14 @@ def refuse_unknown(
     if device not in DEVICES:
         raise ValueError(f"{what} runs on {', '.join(DEVICES[:-1])} or {DEVICES[-1]}; got device {device!r}")
     if engine is not None and engine not in ENGINES:
-        raise ValueError(f"{what} has no engine {engine!r}; there are {', '.join(ENGINES)}")
+        raise ValueError(f"{what} has no engine {engine!r}; the engines are {', '.join(ENGINES)}")
     for number in map(int, filter(str.isdecimal, dims)):
         if entry.dim.isdecimal() and number >= int(entry.dim):
             raise ValueError(f"{what} has parameters numbered 0 to {int(entry.dim) - 1}; got {number}")
 
 
 def registered_environment(name: str) -> type[Environment] | Environment:
-    """Return what is registered by a name, which runs no file of anybody's.
+    """Return the environment registered by a name, without running any file.
 
     Raises ValueError where no environment has that name, or its module cannot be imported.
     """
@@ -321,16 +321,16 @@ def registered_environment(name: str) -> type[Environment] | Environment:
 
 
 def _find_entry(name: str) -> Entry:
-    """Return what is registered by a name. Raises ValueError, with a name that comes close, where nothing is."""
+    """Return the entry of a name. Raises ValueError, with a similar name, for an unknown one."""
     known = entries()
-    there = f"`landscape envs` lists all {len(known)}, and one in a file of your own is FILE.py:NAME"
+    there = f"`landscape envs` lists all {len(known)}; name one in your own file as FILE.py:NAME"
     return registry.find(known, name, "environment", there)
 
 
 def source_of(env: Environment) -> str | type[Environment] | Environment:
-    """Return what makes such an environment in another process, where not all that is registered here may be.
+    """Return what another process needs to make this environment, since its registry can differ.
 
-    A class is enough where its settings make the environment again; a function goes there itself.
+    A class is enough where settings make the environment again; a function is sent itself.
     """
     from .adapters import FunctionEnvironment, GivenEnvironment
 
@@ -342,25 +342,25 @@ def source_of(env: Environment) -> str | type[Environment] | Environment:
 
 
 def _import_from_file(text: str) -> type[Environment] | Environment:
-    """Return what a file calls by a name as an environment or the class of one, and register it by its own name."""
+    """Return the environment, or its class, with this name in a file, and register it by its own name."""
     file, path, attribute = _place_in_file(text)
     module = import_named(str(file))
     if attribute not in vars(module):
         there = ", ".join(name for name, one in vars(module).items() if _is_offered(name, one, module.__name__))
-        raise ValueError(f"{path} holds no {attribute}; it has {there or 'no simulator'}")
+        raise ValueError(f"{path} has no {attribute}; it has {there or 'no simulator'}")
     try:
         found = _named(find_environment(vars(module)[attribute]), attribute)
     except ValueError as error:
         raise ValueError(f"{text}: {error}") from None
     taken, target = entries().get(found.name), f"{file}:{attribute}"
     if taken and taken.target not in (target, found):  # a file may register its class itself
-        raise ValueError(f"{text} is called {found.name!r}, and so is {taken.target}; give it another name")
+        raise ValueError(f"{text} and {taken.target} are both called {found.name!r}; give one of them another name")
     entries()[found.name] = Entry(found.name, target, model=f"of {path}")
     return found
 
 
 def names_in_file(what: str) -> list[str]:
-    """Return FILE.py:NAME for each simulator in a file that is given as FILE.py:*, and any other text as it is.
+    """Return FILE.py:NAME for each simulator in a file given as FILE.py:*; return any other text unchanged.
 
     Raises ValueError where there is no such file, it cannot be imported, or it has no simulator.
     """
@@ -370,20 +370,22 @@ def names_in_file(what: str) -> list[str]:
     module = import_named(str(file))
     offered = {id(one): name for name, one in reversed(vars(module).items()) if _is_offered(name, one, module.__name__)}
     if not offered:
-        raise ValueError(f"{path} holds no simulator: an environment, a class of one, or an object like one")
+        raise ValueError(
+            f"{path} has no simulator; define an environment, a class of one, or an object with `space` and `evaluate`"
+        )
     return [f"{path}:{name}" for name in reversed(offered.values())]  # each once, by its first name
 
 
 def _place_in_file(text: str) -> tuple[Path, str, str]:
-    """Return the file of FILE.py:NAME, what it was called, and the name. Raises ValueError where there is no file."""
+    """Return the path of FILE.py:NAME, the path as given, and the name. Raises ValueError where there is no file."""
     path, _, name = text.rpartition(":")
     if not (file := resolve(path)).is_file():
-        raise ValueError(f"there is no file {path} to take {name} from")
+        raise ValueError(f"there is no file {path}, so {name} cannot be loaded from it")
     return file, path, name
 
 
 def _named(found: type[Environment] | Environment, attribute: str) -> type[Environment] | Environment:
-    """Return a function that has no name of its own by what its file calls it."""
+    """Return a function with the name it has in its file, unless it has its own."""
     from .adapters import FunctionEnvironment
     from .user_functions import NAMELESS
 
@@ -411,12 +413,12 @@ def make(
     preset: str | None = None,
     **options: Any,
 ) -> Environment:
-    """Make an environment with settings, of a registered name, FILE.py:NAME, a class, an environment or one's object.
+    """Make an environment from a registered name, FILE.py:NAME, a class, an environment or an object, with settings.
 
-    `fidelity` defaults to the cheapest, `engine` to the first, and both, like options, to those of an environment that
-    is given; `device` is auto, cpu or cuda. `preset` names options that are set together; those that are given win.
-    Raises ValueError where the environment does not exist, or has no such fidelity, device, engine, preset or option,
-    or where the engine does not give the same bits every time and they are to be `deterministic`.
+    `fidelity` defaults to the cheapest and `engine` to the first. If an environment is given, they and the options
+    default to those of that environment. `device` is auto, cpu or cuda. `preset` names a set of options; options given
+    explicitly win. Raises ValueError where the environment does not exist, or has no such fidelity, device, engine,
+    preset or option. With `deterministic`, it also raises where the engine does not give the same bits every time.
     """
     found = find_environment(what)
     if preset is not None:

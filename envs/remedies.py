@@ -1,7 +1,7 @@
 """Remedies: an environment around another one, whose losses or gradients are easier to search.
 
 A remedy is smoothing, clipping, a shorter episode, softer contact, a mean over numerical replicas, or another scale of
-parameters. Every verb takes the result, and `--remedy smooth:2%,clip:1` on the command line applies one after another.
+parameters. Every command takes the result. On the command line, `--remedy smooth:2%,clip:1` applies one after another.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ SENSITIVITY_POINTS = 64  # points at which `rescale` measures gradients
 
 
 class Remedy(ABC):
-    """Say how losses and gradients come from those of another environment; `cost` is the episodes of one point."""
+    """Compute losses and gradients from those of another environment; `cost` is the episodes per point."""
 
     cost: int = 1
     from_losses: bool = False  # whether gradients are estimated from losses alone
@@ -56,8 +56,8 @@ class Remedy(ABC):
 class RemediedEnvironment(Environment):
     """An environment with a remedy.
 
-    It has the settings, the episodes and the events of the environment within, `inner`. Its losses and its gradients
-    are those of the remedy. One point takes `episodes_per_point` episodes.
+    It has the settings, the episodes and the events of the inner environment, `inner`. Its losses and gradients are
+    those of the remedy. One point takes `episodes_per_point` episodes.
     """
 
     def __init__(self, inner: Environment, remedy: Remedy, /) -> None:
@@ -78,7 +78,7 @@ class RemediedEnvironment(Environment):
 
     @property
     def gradients_from_losses(self) -> bool:
-        """Whether a gradient takes losses alone, so that it costs no more than they do."""
+        """Whether gradients are computed from losses alone and cost nothing extra."""
         return self.remedy.from_losses or self.inner.gradients_from_losses
 
     @property
@@ -87,7 +87,7 @@ class RemediedEnvironment(Environment):
         return self.remedy.from_losses or self.inner.has_gradient
 
     def identity(self) -> dict[str, Any]:
-        """Return what decides the numbers: all of the environment within, and the remedies, the first one first."""
+        """Return the settings that decide the numbers: those of the inner environment, and the remedies in order."""
         within = self.inner.identity()
         remedies = ",".join(filter(None, (within.get(REMEDY, ""), self.remedy.text)))
         return {**within, REMEDY: remedies, EPISODES_PER_POINT: self.episodes_per_point}
@@ -99,12 +99,12 @@ class RemediedEnvironment(Environment):
 
     @property
     def packages(self) -> tuple[str, ...]:
-        """Packages that losses depend on, in addition to those that all depend on."""
+        """Additional packages that affect the losses."""
         return self.inner.packages
 
     @property
     def threads(self) -> int:  # type: ignore[override] # read only
-        """One: the environment within spreads its batches itself."""
+        """One: the inner environment spreads its batches itself."""
         return 1
 
     @property
@@ -117,7 +117,7 @@ class RemediedEnvironment(Environment):
         return self.remedy.cost * self.inner.memory()
 
     def about(self) -> str:  # type: ignore[override] # what there is to say is the other environment's
-        """Return what the environment within says of itself, and the remedy."""
+        """Return the description of the inner environment, and the remedy."""
         return f"{self.inner.about()}\n\nWith the remedy {self.remedy.text}."
 
     def episode(self, x: Float[Tensor, " dim"]) -> Episode:
@@ -129,11 +129,11 @@ class RemediedEnvironment(Environment):
         return self.inner.events(self.remedy.to_inner(self.inner, x))
 
     def noise(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, " batch"] | None:
-        """Return None: repeats have to tell how large the noise is that a remedy leaves."""
+        """Return None: only repeated evaluation can show how much noise a remedy leaves."""
         return None
 
     def replicas(self) -> Mapping[str, Environment]:
-        """Return the replicas of the environment within, each with the remedy."""
+        """Return the replicas of the inner environment, each with the remedy."""
         return {name: RemediedEnvironment(one, self.remedy) for name, one in self.inner.replicas().items()}
 
     def with_horizon(self, horizon: float) -> Environment:
@@ -141,11 +141,11 @@ class RemediedEnvironment(Environment):
         return type(self)(self.inner.with_horizon(horizon), self.remedy)
 
     def plain_point(self, x: Float[Tensor, "*batch dim"]) -> Float[Tensor, "*batch dim"]:
-        """Return the points of the environment within its remedies that points stand for."""
+        """Return the corresponding points of the environment without its remedies."""
         return self.inner.plain_point(self.remedy.to_inner(self.inner, x))
 
     def without(self) -> Environment:
-        """Return the environment within its remedies."""
+        """Return the environment without its remedies."""
         return self.inner.without()
 
     def _remake(self, **settings: Any) -> Environment:
@@ -179,9 +179,9 @@ SHARED = [  # what an environment with a remedy has of the one within
 class Smooth(Remedy):
     """Average the loss over a Gaussian around each point, reflected at the bounds.
 
-    L(x) = E f(x + s w), w ~ N(0, I), with `width` s as a share of every side of the box. The mean is over `samples` / 2
-    pairs of w and -w, drawn once by `seed`: losses at all points are of the same w, so that they are as smooth as the
-    mean and exactly repeatable.
+    L(x) = E f(x + s w), w ~ N(0, I), where `width` s is a fraction of every side of the box. The mean is over `samples`
+    / 2 pairs of w and -w, drawn once by `seed`. All points share these w, so losses are as smooth as the mean and
+    exactly repeatable.
     """
 
     width: float
@@ -193,9 +193,9 @@ class Smooth(Remedy):
         if not 0 < self.width <= 1:
             raise ValueError(f"smooth takes a width above 0 and up to 100 % of the box; got {self.width:g}")
         if self.estimator not in ORDERS:
-            raise ValueError(f"smooth estimates by {', '.join(ORDERS)}; got {self.estimator!r}")
+            raise ValueError(f"smooth takes the estimators {', '.join(ORDERS)}; got {self.estimator!r}")
         if as_whole(self.samples, "samples of smooth", least=2) % 2 or (self.samples < 6 and self.estimator == "mixed"):
-            raise ValueError(f"smooth takes an even number of samples, from 6 where it is mixed; got {self.samples}")
+            raise ValueError(f"smooth takes an even number of samples, at least 6 if mixed; got {self.samples}")
 
     @property
     def cost(self) -> int:  # type: ignore[override] # read only
@@ -245,23 +245,24 @@ def smooth(
 ) -> RemediedEnvironment:
     """Return an environment whose loss is averaged over a Gaussian around each point.
 
-    `width` is its standard deviation as a share of every side of the box. Gradients are estimated in one of three ways:
+    `width` is its standard deviation as a fraction of every side of the box. Gradients are estimated in one of three
+    ways:
 
     - "first": the mean of gradients. It has little variance where the loss is smooth, and is biased where it jumps.
     - "zeroth": the mean of (f(x + s w) - f(x - s w)) w / (2 s). It is unbiased, and its variance grows with the number
       of parameters.
     - "mixed": zeroth order with the first order of the other pairs as a control variate. It is unbiased everywhere.
 
-    Source: Suh et al. 2022, "Do differentiable simulators give better policy gradients?". They mix by weights that
-    depend on a bound of the bias; here no bias has to be known, as the control variate has the same mean.
+    Source: Suh et al. 2022, "Do differentiable simulators give better policy gradients?". Their mixing weights depend
+    on a bound of the bias. Here no bias needs to be known, because the control variate has the same mean.
 
-    Raises ValueError for a width, an estimator or a number of samples that there is not.
+    Raises ValueError for an invalid width, estimator or number of samples.
     """
     return RemediedEnvironment(as_environment(f), Smooth(width, estimator, samples, seed))
 
 
 def _joint_status(status: Int[Tensor, "batch part pair"], known: Tensor) -> Int[Tensor, " batch"]:
-    """Return OK where enough pairs are known, else how the first of the others ended."""
+    """Return OK where enough pairs are known, else the status of the first failed one."""
     rows = status.movedim(1, -1).flatten(1)
     bad = torch.where(rows == Status.OK, 0, rows)
     first = bad.gather(1, (bad > 0).to(torch.int8).argmax(dim=1, keepdim=True))[:, 0]
@@ -335,8 +336,8 @@ class Average(Remedy):
 def average(f: Any, replicas: Sequence[str] = ()) -> RemediedEnvironment:
     """Return an environment whose losses and gradients are means over its numerical replicas and itself.
 
-    `replicas` names some of those that `f.replicas()` offers, by default all. What depends on the discretisation alone
-    shrinks, as ripples of a grid do. Raises ValueError where there are no such replicas.
+    `replicas` names some of those in `f.replicas()`, by default all. Averaging shrinks effects of the discretisation,
+    such as ripples of a grid. Raises ValueError for unknown replicas.
     """
     env = as_environment(f)
     offered = env.replicas()
@@ -351,7 +352,7 @@ def average(f: Any, replicas: Sequence[str] = ()) -> RemediedEnvironment:
 
 @dataclass(frozen=True)
 class Rescale(Remedy):
-    """Let parameters run from bound to bound by other `scales`, linear or log10."""
+    """Let parameters run from bound to bound on other `scales`, linear or log10."""
 
     scales: tuple[str, ...]
 
@@ -367,7 +368,7 @@ class Rescale(Remedy):
         return ParameterSpace(space.names, lower, upper, space.units, self.scales)
 
     def to_inner(self, env: Environment, x: Float[Tensor, "*batch dim"]) -> Float[Tensor, "*batch dim"]:
-        """Return points of the environment within, of the same values."""
+        """Return points of the inner environment with the same values."""
         inside: Tensor = env.space.from_values(self.space_of(env).to_values(x))
         return torch.clamp(inside, env.space.lower, env.space.upper)
 
@@ -383,13 +384,12 @@ class Rescale(Remedy):
 
 
 def rescale(f: Any, scales: Sequence[str] = ()) -> RemediedEnvironment:
-    """Return an environment whose parameters run on the scales, linear or log10, on which its sensitivity is more even.
+    """Return an environment whose parameters run on the scales, linear or log10, that make its sensitivity more even.
 
-    Every verb works in shares of the box, so that a constant factor per parameter changes nothing. What matters is how
-    evenly the loss changes from bound to bound. Without `scales`, one for each parameter, gradients at 64 points decide
-    for each parameter whose bounds are positive and a decade or more apart: the scale on which slopes vary less.
-
-    Raises ValueError for scales that there are not, and where the environment has no gradients to decide by.
+    All commands work in fractions of the box, so a constant factor per parameter changes nothing. What matters is how
+    evenly the loss changes from bound to bound. `scales` has one scale for each parameter. Without it, gradients at 64
+    points decide for each parameter with positive bounds at least a decade apart: the scale with less varying gradients
+    wins. Raises ValueError for unknown scales, and where the environment has no gradients to decide by.
     """
     env = as_environment(f)
     chosen = tuple(scales) or _even_scales(env)
@@ -421,24 +421,24 @@ def _variation(slopes: Float[Tensor, "point dim"]) -> Float[Tensor, " dim"]:
 
 
 def shorten(f: Any, share: float) -> Environment:
-    """Return an environment whose episodes are `share` as long.
+    """Return an environment whose episodes have `share` of their length.
 
-    Gradients of long episodes may explode (Xu et al. 2022, "Accelerated policy learning with parallel differentiable
+    Gradients of long episodes can explode (Xu et al. 2022, "Accelerated policy learning with parallel differentiable
     simulation"). The loss is that of the shorter episode. Raises ValueError where the environment has no horizon.
     """
     env = as_environment(f)
     if not 0 < share < 1:
         raise ValueError(f"shorten takes a share of the episode between 0 and 1; got {share:g}")
     if env.horizon is None:
-        raise ValueError(f"{env.name} has no setting that says how long an episode is; name one as horizon")
+        raise ValueError(f"{env.name} has no setting for the length of an episode; name one as horizon")
     return env.with_horizon(env.horizon * share)
 
 
 def soften(f: Any, share: float | None = None, **settings: Any) -> Environment:
     """Return an environment with softer settings: its contact stiffness times `share`, or settings by name.
 
-    The names are those of its options, `fidelity` and `engine` included, such as friction=0.1. Raises ValueError where
-    the environment has no contact stiffness, and for a setting that it does not have.
+    The names are those of its options and `fidelity` and `engine`, such as friction=0.1. Raises ValueError where the
+    environment has no contact stiffness, and for an unknown setting.
     """
     env = as_environment(f)
     if share is not None:
@@ -480,16 +480,16 @@ FORMS = {
 
 
 def remedied(env: Environment, text: str) -> Environment:
-    """Return an environment with the remedies that a text names, the first one first, such as smooth:2%,clip:1.
+    """Return an environment with the remedies in a text, applied in order, such as smooth:2%,clip:1.
 
-    Raises ValueError for a remedy that there is not, or that the environment cannot take.
+    Raises ValueError for an unknown remedy, or one that the environment cannot take.
     """
     for part in filter(None, (part.strip() for part in text.split(","))):
         name, *values = part.split(":")
         if name not in READERS:
-            raise ValueError(f"there is no remedy {name!r}; there are {', '.join(FORMS.values())}")
+            raise ValueError(f"there is no remedy {name!r}; the remedies are {', '.join(FORMS.values())}")
         try:
             env = READERS[name](env, *values)
         except TypeError as error:
-            raise ValueError(f"a remedy is spelt {FORMS[name]}; got {part!r}") from error
+            raise ValueError(f"write the remedy as {FORMS[name]}; got {part!r}") from error
     return env

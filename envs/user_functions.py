@@ -1,4 +1,4 @@
-"""What a user says of a function of their own, and how a library calls and differentiates it."""
+"""The user's description of a function, and how a library calls and differentiates the function."""
 
 from __future__ import annotations
 
@@ -26,21 +26,21 @@ KINDS = (bool, int, float, str)  # of options
 class FunctionKeywords(TypedDict, total=False):
     """The keywords that every `from_...` takes.
 
-    `name` is what the function is called, by default its own name, and `loss_unit` the unit of what it returns.
-    `maximize` looks for its greatest value: losses are its negative.
+    `name` of the function, by default its own, and `loss_unit`, the unit of its result. `maximize` searches for its
+    largest value: losses are the negative of its result.
 
-    Keyword arguments of the function are its settings. `options` are those that a user sets, with their defaults; by
-    default all whose default is a number, a text or a truth value. `fidelities` names what decides how accurately it
-    simulates, the cheapest first and the most accurate last: {"draft": {"dt": 0.02}, "reference": {"dt": 0.001}}.
-    `horizon` names the keyword that says how long an episode is. What belongs together goes into the fidelities
-    together, such as the number of steps with the time step.
+    Keyword arguments of the function are its settings. `options` are the settings that a user changes, with their
+    defaults. By default they are all arguments whose default is a number, a text or a truth value. `fidelities` names
+    the settings that decide the accuracy, from the cheapest to the most accurate: {"draft": {"dt": 0.02}, "reference":
+    {"dt": 0.001}}. `horizon` names the keyword for the length of an episode. Settings that depend on each other, such
+    as the number of steps and the time step, belong together in the fidelities.
 
-    A function that takes a `key` (of JAX) or a `seed` gets the same one at every point: common random numbers. The
-    loss is the mean over `seeds` of them, and then it knows its standard error.
-    `precision`, float64 or float32, is what it is given its points in, at most `rows` of them in one call.
+    A function that takes a `key` (of JAX) or a `seed` gets the same one at every point: common random numbers. The loss
+    is the mean over `seeds` of them, which also gives its standard error.
 
-    `replicas` are functions of the same kind, by what was changed, that compute the same physics otherwise: what they
-    differ by is the numerical floor, `{"shifted grid": partial(fn, shift=0.5)}`.
+    `precision`, float64 or float32, is that of the points the function receives, at most `rows` of them in one call.
+    `replicas` maps a description of a change to a function of the same kind that computes the same physics differently:
+    `{"shifted grid": partial(fn, shift=0.5)}`. The differences between them are the numerical floor.
     """
 
     name: str
@@ -56,27 +56,27 @@ class FunctionKeywords(TypedDict, total=False):
 
 
 class Compute(abc.ABC):
-    """A function with its keyword arguments in a library, at a precision and on a device, differentiated there."""
+    """A function with bound keyword arguments in a library, at a precision and on a device, differentiated by it."""
 
     @abc.abstractmethod
     def __call__(self, x: Float[Tensor, "batch dim"], grad: bool) -> tuple[Tensor, Tensor | None, str]:
-        """Return losses, gradients if asked for, and the type of numbers that the losses came in, at points."""
+        """Return losses, gradients if requested, and the number type of the losses, at points."""
 
     def nan_origin(self, x: Float[Tensor, "one dim"]) -> str:
-        """Return which operation makes the gradient at a point not finite, and where it is called; "" where unknown."""
+        """Return the operation that makes the gradient at a point not finite, and its call site; "" where unknown."""
         return ""
 
     def wrong_origin(self, x: Float[Tensor, "one dim"]) -> str:
-        """Return which operation's own derivative is wrong at a point, where it is finite; "" where unknown."""
+        """Return the operation whose own derivative is wrong at a point, where it is finite; "" where unknown."""
         return ""
 
 
 @dataclass(frozen=True)
 class Backend:
-    """A library that a function is written in.
+    """A library in which a function is written.
 
-    `bind` makes a `Compute` of a function with keyword arguments, a precision and a device; `device` is where it runs
-    by default: auto, cpu or cuda. With `own_programs` a function is compiled for each size of batch.
+    `bind` makes a `Compute` from a function with keyword arguments, a precision and a device. `device` is the default
+    device: auto, cpu or cuda. With `own_programs`, each size of batch is compiled.
     """
 
     engine: str
@@ -89,9 +89,9 @@ class Backend:
 
 @dataclass(eq=False)
 class Function:
-    """A function of points with what its user says of it, as `FunctionKeywords` has it.
+    """A function of points with its user's description, as in `FunctionKeywords`.
 
-    Raises ValueError for what does not go together.
+    Raises ValueError for settings that contradict each other.
     """
 
     fn: Callable[..., Any]
@@ -111,9 +111,11 @@ class Function:
     def __post_init__(self) -> None:
         fn, who = self.fn, f"from_{self.backend.engine}"
         if not callable(fn):
-            raise ValueError(f"a function is wanted; got {type(fn).__name__} {fn!r}")
+            raise ValueError(f"expected a function; got {type(fn).__name__} {fn!r}")
         if not isinstance(self.space, ParameterSpace):
-            raise ValueError(f"a ParameterSpace is wanted, as gs.ParameterSpace({{'x': (-1, 1)}}); got {self.space!r}")
+            raise ValueError(
+                f"expected a ParameterSpace such as gs.ParameterSpace({{'x': (-1, 1)}}); got {self.space!r}"
+            )
         self.name, known = self.name or function_name(fn), _arguments(fn)
         given = {key: dict(value) for key, value in (self.fidelities or {}).items()}
         own = {argument: None for settings in given.values() for argument in settings if argument != "precision"}
@@ -125,7 +127,7 @@ class Function:
         self.seed_argument = next((one for one in SEED_ARGUMENTS if one in known and one not in own | chosen), "")
         if self.seeds > 1 and not self.seed_argument:
             seeded = " or ".join(SEED_ARGUMENTS)
-            raise ValueError(f"seeds={self.seeds} averages over random numbers, and {self.name} takes no {seeded}")
+            raise ValueError(f"seeds={self.seeds} averages over random numbers, but {self.name} takes no {seeded}")
         self.defaults = chosen | ({"seed": 0} if self.seed_argument else {})
         self.known_fidelities = _read_fidelities(self.name, given, _check_precision(self.precision, who))
         self.fidelity_arguments = tuple(own)
@@ -134,7 +136,7 @@ class Function:
                 raise ValueError(f"{self.name}'s replica {changed!r} must be a function; got {type(replica).__name__}")
 
     def with_call(self, fn: Callable[..., Any]) -> Function:
-        """Return another function with all that is said of this one but its replicas; what it binds is no setting."""
+        """Return another function with the description of this one, except its replicas."""
         bound = fn.keywords if isinstance(fn, partial) else {}
 
         def free(settings: Mapping[str, Any]) -> dict[str, Any]:
@@ -145,18 +147,18 @@ class Function:
         return replace(self, fn=fn, options=options, fidelities=fidelities or None, replicas=None)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave out what another process makes again."""
+        """Leave out the parts that another process makes again."""
         return {name: value for name, value in vars(self).items() if name != "options_class"}
 
     @cached_property
     def options_class(self) -> type[Any]:
-        """The dataclass of the options, each of the type of its default."""
+        """The dataclass of the options, each with the type of its default."""
         declared = [(name, type(value), field(default=value)) for name, value in self.defaults.items()]
         return make_dataclass("Options", declared, frozen=True)
 
     @cached_property
     def counts_steps(self) -> bool:
-        """Whether the horizon counts time steps: times dt, it is the same time in every fidelity."""
+        """Whether the horizon counts time steps; times dt, it is then the same time in every fidelity."""
         if not {self.horizon, "dt"} <= set(self.fidelity_arguments):
             return False
         steps: list[Any] = [one.settings.get(self.horizon or "") for one in self.known_fidelities.values()]
@@ -166,7 +168,7 @@ class Function:
         return bool(max(times) - min(times) <= SAME_TIME * max(times))
 
     def settings_of(self, options: Any, fidelity: Fidelity) -> dict[str, Any]:
-        """Return the function's keyword arguments, but for its random numbers, with these options at a fidelity."""
+        """Return the function's keyword arguments, except its random numbers, with these options at a fidelity."""
         found = {one.name: getattr(options, one.name) for one in fields(options)}
         if self.seed_argument:
             found.pop("seed")
@@ -180,13 +182,13 @@ class Function:
 
 
 def function_name(fn: Callable[..., object]) -> str:
-    """Return what a function is called, or its type where it has no name."""
+    """Return the name of a function, or of its type where it has none."""
     name = str(getattr(fn, "__name__", type(fn).__name__))
     return NAMELESS if name == "<lambda>" else name
 
 
 def _arguments(fn: Callable[..., Any]) -> dict[str, Any]:
-    """Return the keyword arguments of a function with their defaults, `inspect.Parameter.empty` where one has none."""
+    """Return the keyword arguments of a function with their defaults, or `inspect.Parameter.empty`."""
     try:
         found = list(inspect.signature(fn).parameters.values())
     except (TypeError, ValueError):  # of a function in C
@@ -195,7 +197,7 @@ def _arguments(fn: Callable[..., Any]) -> dict[str, Any]:
 
 
 def _default_options(known: Mapping[str, Any], taken: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the keyword arguments whose default is a number, a text or a truth value, and that are not `taken`."""
+    """Return the keyword arguments whose default is a number, a text or a truth value, except those `taken`."""
     free = {name: value for name, value in known.items() if name not in (*taken, *SEED_ARGUMENTS)}
     return {name: value for name, value in free.items() if isinstance(value, KINDS)}
 
@@ -203,16 +205,18 @@ def _default_options(known: Mapping[str, Any], taken: Mapping[str, Any]) -> dict
 def _check_arguments(
     name: str, known: Mapping[str, Any], options: Mapping[str, Any], own: Mapping[str, Any], horizon: str | None
 ) -> None:
-    """Raise ValueError for settings that are no keyword arguments of the function, or that are said twice."""
+    """Raise ValueError for settings that are no keyword arguments of the function, or that are given twice."""
     for option, value in options.items():
         if not isinstance(value, KINDS):
             raise ValueError(
-                f"{name}'s option {option} needs a number, a text or a truth value as default; got {value!r}"
+                f"{name}'s option {option} needs a number, a text or a truth value as its default; got {value!r}"
             )
     if twice := options.keys() & own.keys():
-        raise ValueError(f"{name} has {', '.join(sorted(twice))} in options and in fidelities; leave it in one of them")
+        raise ValueError(
+            f"{name} has {', '.join(sorted(twice))} in both options and fidelities; keep it in one of them"
+        )
     if horizon and horizon not in options.keys() | own.keys():
-        raise ValueError(f"{name}'s horizon is one of its options or fidelities' settings; got {horizon!r}")
+        raise ValueError(f"{name}'s horizon must be one of its options or fidelity settings; got {horizon!r}")
     strange = [one for one in (*options, *own) if known and one not in known]
     if strange:
         takes = ", ".join(known) or "none"
@@ -220,12 +224,14 @@ def _check_arguments(
 
 
 def _read_fidelities(name: str, given: Mapping[str, Mapping[str, Any]], precision: str) -> dict[str, Fidelity]:
-    """Return fidelities by name, of the settings that a user gave for each."""
+    """Return fidelities by name, from the settings that a user gave for each."""
     found = {}
     names = {argument for settings in given.values() for argument in settings}
     for fidelity, settings in (given or {UNNAMED: {}}).items():
         if lacking := names - settings.keys() - {"precision"}:
-            raise ValueError(f"{name}'s fidelity {fidelity} lacks {', '.join(sorted(lacking))}, which others have")
+            raise ValueError(
+                f"{name}'s fidelity {fidelity} lacks {', '.join(sorted(lacking))}, which other fidelities have"
+            )
         own = {key: value for key, value in settings.items() if key in FIDELITY_FIELDS}
         other = {key: value for key, value in settings.items() if key not in (*FIDELITY_FIELDS, "precision")}
         computed = _check_precision(settings.get("precision", precision), name)

@@ -1,4 +1,4 @@
-"""Make what is missing of the gallery's figures, part by part: slices first, since all else is made of them."""
+"""Make the missing parts of the gallery's figures: slices first, because all other parts are made from them."""
 
 from __future__ import annotations
 
@@ -44,11 +44,11 @@ def compute_parts(
     device: str = "auto",
     scheduler: str | None = None,
 ) -> list[str]:
-    """Make what is missing of these figures in `root`, and return the names of those that failed.
+    """Make the missing parts of these figures in `root`, and return the names of the figures that failed.
 
-    It makes all kinds of parts but the league where no `parts` are named. A figure that fails, by whatever cause,
-    leaves the others to be made. Raises ValueError for a part or a device that there is not, Stopped where it is
-    interrupted, and DiskFullError; the same call continues then.
+    Without `parts` it makes all kinds except the league. A figure that fails does not stop the others. Raises
+    ValueError for an unknown part or a missing device, Stopped when it is interrupted, and DiskFullError when the disk
+    is full. The same call continues after the last two.
     """
     if unknown := set(parts) - set(PARTS):
         raise ValueError(f"--part takes {', '.join(PARTS)}; got {', '.join(sorted(unknown))}")
@@ -65,7 +65,7 @@ def compute_parts(
 
 
 def _slice_work(parts: Iterable[SlicePart]) -> Iterator[Work]:
-    """Yield what is left of the figures' slices to sample; what else the gallery shows is no part of a plan."""
+    """Yield the samples that the figures' slices still lack; a plan does not include the other parts."""
     for part in parts:
         if left := part.count_left():
             env, figure = part.scene().make(), part.figure
@@ -75,9 +75,9 @@ def _slice_work(parts: Iterable[SlicePart]) -> Iterator[Work]:
 
 
 def change_figures(figures: Sequence[Figure], fidelity: str | None, resolution: int | None, root: Path) -> list[Figure]:
-    """Return figures with another fidelity and another resolution, as far as these are given.
+    """Return the figures with another fidelity and resolution, where these are given.
 
-    Raises ValueError where this machine has no room for so many points.
+    Raises ValueError if this machine has too little memory or disk for so many points.
     """
     from ..landscapes.storage.arrays import need_of
 
@@ -94,12 +94,12 @@ def _check_device(device: str) -> None:
     from ..envs.engines.runtime import cuda_available
 
     if device == "cuda" and not cuda_available():
-        raise ValueError("no CUDA device was found here, so nothing is computed on one; use --device cpu or auto")
+        raise ValueError("--device cuda needs a CUDA device, and none was found; use --device cpu or auto")
 
 
 @dataclass(frozen=True)
 class Computed:
-    """Say in which folder how many figures were computed, and which of them failed."""
+    """The folder, the number of figures computed in it, and the figures that failed."""
 
     folder: Path
     figures: int
@@ -108,14 +108,14 @@ class Computed:
 
 @dataclass(frozen=True)
 class _Work:
-    """What is done in `root`, and the names of the figures that failed in it."""
+    """The work in `root`, and the names of the figures that failed."""
 
     root: Path
     watch: Watch
     failed: set[str] = field(default_factory=set)
 
     def make(self, name: str, parts: Sequence[FigurePart]) -> None:
-        """Make what is missing of one kind of part, its cost announced."""
+        """Announce the cost of one kind of part, and make the missing ones."""
         left = [part for part in parts if not self._try(part, part.there)]
         left = self._sound(left)
         self.watch.note(f"{name}: {len(parts) - len(left)} of {len(parts)} are there already")
@@ -127,7 +127,7 @@ class _Work:
                     self.watch.note(outcome)
 
     def _announce(self, name: str, parts: Sequence[FigurePart]) -> None:
-        """Say what all of it should take, from the first figure of each scene."""
+        """Announce the total time, estimated from the first figure of each scene."""
         rates: dict[str, float] = {}
         total = 0.0
         for part in {part.shared: part for part in parts}.values():
@@ -145,15 +145,15 @@ class _Work:
         return [part for part in parts if part.figure.id not in self.failed]
 
     def _try(self, part: FigurePart, work: Callable[[], T]) -> T | None:
-        """Return what a part's work returns, None where it failed, which is said."""
+        """Return the result of a part's work; report a failure and return None."""
         try:
             return work()
         except KeyboardInterrupt as stop:
-            kept = str(stop) if isinstance(stop, Stopped) else f"all that is finished is kept in {self.root}"
+            kept = str(stop) if isinstance(stop, Stopped) else f"finished parts are kept in {self.root}"
             raise Stopped(f"in {part.figure.id}, {kept}") from stop
         except Exception as error:
             if is_full(error):
-                raise full(error, f"all that is finished is kept in {self.root}") from error
+                raise full(error, f"finished parts are kept in {self.root}") from error
             why = " ".join(str(error).split())
             self.watch.note(f"{part.figure.id} failed: {type(error).__name__}: {why}")
             self.failed.add(part.figure.id)

@@ -1,10 +1,9 @@
-"""The files of the gallery: what it shows, what the paper says, and what is computed of both, each named here alone.
+"""The files of the gallery: its figures, the paper's statements, and all computed data. Only this module names them.
 
-Of the data, a figure's folder holds `slice.zarr.zip` and what else was made of it: `sweep.mp4` with `sweep.json`,
-`episodes.json` with a film and a picture of each episode, `companions.json` and `companions.png` of the same cut
-through other points, and the files of `landscape report`. Searches lie in `runs/ENVIRONMENT-OPTIONS/`, studies in
-`studies/`, censuses in `census/`, the races of the league in `league/`: figures share them. The report card of
-gradients is in `card/`.
+In the data, a figure's folder contains `slice.zarr.zip`, `sweep.mp4` with `sweep.json`, `episodes.json` with a film and
+a picture of each episode, `companions.json` and `companions.png` of the same parameters through other points, and the
+files of `landscape report`. Figures share the searches in `runs/ENVIRONMENT-OPTIONS/`, the studies in `studies/`, the
+censuses in `census/`, and the races of the league in `league/`. The report card of gradients is in `card/`.
 """
 
 from __future__ import annotations
@@ -49,19 +48,19 @@ _EPISODE = re.compile(r"episode-\d+-\d+\.(?:mp4|webp)")
 
 
 def data_folder(named: str | Path | None) -> Path:
-    """Return where the figures' data is: as named, else a checkout's own, else under the folder where one stands."""
+    """Return the folder of the data: as named, else the checkout's own, else one under the working directory."""
     if named:
         return Path(named)
     return DATA if any(DATA.glob(f"*/{STORE}*")) else ELSEWHERE
 
 
 def dark_name(picture: str) -> str:
-    """Return the name of a picture for pages that are dark."""
+    """Return the name of a picture's variant for dark pages."""
     return picture.removesuffix(".png") + "-dark.png"
 
 
 def episode_name(row: int, column: int) -> str:
-    """Return the name of the files of an episode at a node, without their ending."""
+    """Return the file name of an episode at a node, without its ending."""
     return f"episode-{row}-{column}"
 
 
@@ -78,7 +77,7 @@ class RecordFiles:
 
     @property
     def picture(self) -> Path:
-        """The picture of what it holds."""
+        """The picture of the record."""
         return self.record.with_suffix(".png")
 
     @property
@@ -88,16 +87,16 @@ class RecordFiles:
 
     @property
     def table(self) -> Path:
-        """What it holds as a table, in the site alone."""
+        """The record as a table, which only the site has."""
         return self.record.with_suffix(".csv")
 
     def there(self) -> bool:
-        """Say whether record and picture are there."""
+        """Say whether both record and picture exist."""
         return self.record.is_file() and self.picture.is_file()
 
     @classmethod
     def of_census(cls, root: Path, env: str, device: str) -> RecordFiles:
-        """Return where the census of an environment on a device is, in the gallery's data or in its site."""
+        """Return the files of an environment's census on a device, in the gallery's data or in its site."""
         return cls(root / CENSUSES / f"{env}-{device}.json")
 
 
@@ -106,7 +105,7 @@ class StudyFiles(RecordFiles):
 
     @classmethod
     def of(cls, root: Path, env: str, device: str, kind: str) -> StudyFiles:
-        """Return where a kind of study of an environment on a device is, in the gallery's data or in its site."""
+        """Return the files of an environment's study on a device, in the gallery's data or in its site."""
         return cls(root / STUDIES / file_name(env, device, kind))
 
 
@@ -115,15 +114,15 @@ class LeagueFiles(RecordFiles):
 
     @classmethod
     def of(cls, root: Path, env: str) -> LeagueFiles:
-        """Return where the race in an environment is, in the gallery's data or in its site."""
+        """Return the files of the race in an environment, in the gallery's data or in its site."""
         return cls(root / LEAGUE / f"{env}.json")
 
     @property
     def runs(self) -> Path:
-        """What is kept of its runs."""
+        """The reduced runs of the race."""
         return self.record.with_suffix(".npz")
 
     @property
     def slice(self) -> RecordFiles:
-        """The files of the slice through its best point, in the folder of that slice."""
+        """The files of the slice through the best point of the race."""
         return RecordFiles(self.record.with_suffix("") / "medians.json")

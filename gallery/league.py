@@ -1,8 +1,8 @@
-"""The league of the gallery: a race of nine methods in every scene, kept small, and where its searches went.
+"""The league of the gallery: a race of nine methods in every scene, stored compactly, and slices of the searches.
 
-Of every run there are the episodes that lowered its least loss, what it had cost by then, and its best point in full.
-Of the median run of each method, by final loss, there are the points of these episodes, too, each parameter as one of
-65 536 places in its box, which is finer than any picture. Gradients are not kept.
+For every run it keeps the episodes that lowered the best loss, the cost up to each of them, and the best point in full.
+For the median run of each method, by final loss, it also keeps the points of these episodes, each parameter as one of
+65 536 values in its range, which is finer than any picture. It keeps no gradients.
 """
 
 from __future__ import annotations
@@ -54,20 +54,20 @@ ABOUT_MEDIANS = ("env", "method", "seed", "budget", "fidelity", "loss_unit", "id
 
 
 class LeaguePart(FigurePart):
-    """The race in the figure's environment, which its other figures share, with the options that it has by default.
+    """The race in the figure's environment with its default options; all figures of the environment share it.
 
-    Its runs stay in the folder of `landscape league` on this device, under out/: either continues with the other's.
+    Its runs stay in the folder of `landscape league` on this device, under out/. Either command continues the other.
     """
 
     of_environment = True
 
     def label(self) -> str:
-        """Return the command that runs it elsewhere."""
+        """Return the command that runs the race elsewhere."""
         how = f"--methods {','.join(METHODS)} --budget {BUDGET} --seeds {SEEDS} --device {self.device}"
         return f"landscape league {LeagueScene.of(self._own_scene, self.root)} {how}"
 
     def count_left(self) -> int:
-        """Return 1 where no race of these methods, seeds and episodes at this fidelity is kept."""
+        """Return 1 if no race of these methods, seeds and episodes at this fidelity is stored, else 0."""
         files = self._files
         kept = read_if_sound(read_standings, files.record)
         there = files.there() and files.dark.is_file()
@@ -78,12 +78,12 @@ class LeaguePart(FigurePart):
         return int(not whole or kept.fidelity != self._job.scenes[0].fidelity)
 
     def seconds_each(self) -> float:
-        """Estimate what is left of the race to simulate; what methods take themselves comes on top."""
+        """Estimate the remaining simulation time of the race, without the time of the methods themselves."""
         job = self._job
         return job.forecast(job.scenes[0], Watch())
 
     def make(self, watch: Watch) -> str:
-        """Race, or continue the race, and keep what is needed of it."""
+        """Run or continue the race, and store the reduced runs."""
         job, files = self._job, self._files
         race, left_out = job.run_race(job.scenes[0], watch)
         found = SceneStandings.of(race, left_out=left_out, command=self.label())
@@ -112,15 +112,15 @@ class LeaguePart(FigurePart):
 
     @property
     def _own_scene(self) -> SceneSpec:
-        """The figure's scene with the options that it has by default."""
+        """The figure's scene with its default options."""
         return replace(self.scene(), options={})
 
 
 class LeagueSlicePart(FigurePart):
     """Losses around the best point of the league in the figure's environment, and median runs over them.
 
-    Of the runs their improvements are laid. Losses are at the league's own fidelity, along the dims of the first of the
-    environment's figures, which share it. There is none where no league is kept.
+    The runs are drawn by their improvements. Losses are at the fidelity of the league, along the dims of the first
+    plane among the environment's figures, which share the slice. Without a stored league there is none.
     """
 
     of_environment = True
@@ -134,7 +134,7 @@ class LeagueSlicePart(FigurePart):
         return f"landscape slice {self.figure.env} --dims {dims} {how}"
 
     def count_left(self) -> int:
-        """Count the episodes where there is no such slice of the best point that is kept."""
+        """Return the number of episodes if the slice through the stored best point is missing, else 0."""
         standings, files = self._standings(), self._files.slice
         if standings is None or standings.best is None:
             return 0
@@ -142,7 +142,7 @@ class LeagueSlicePart(FigurePart):
         return 0 if there and kept_key(files.record) == self._key(standings) else RESOLUTION**2
 
     def make(self, watch: Watch) -> str:
-        """Sample the slice, lay the median runs over it, and draw both."""
+        """Sample the slice and draw it with the median runs."""
         import torch
 
         from ..jobs.slice import SliceJob
@@ -174,12 +174,12 @@ class LeagueSlicePart(FigurePart):
 
     @property
     def _dims(self) -> tuple[int, ...]:
-        """Return those of the first plane that is shown of the environment, which figures may not have."""
+        """Return the dims of the environment's first plane; an environment can have lines only."""
         planes = [one.dims for one in read_figures() if one.env == self.figure.env and len(one.dims) == 2]
         return planes[0] if planes else (0, 1)
 
     def _key(self, standings: SceneStandings) -> dict[str, Any]:
-        """Return what decides the slice and its picture."""
+        """Return the key that decides the slice and its picture."""
         assert standings.best is not None
         about = {MODEL_VERSION: standings.identity[MODEL_VERSION], "fidelity": standings.fidelity}
         about |= {"methods": list(standings.methods), "best": list(standings.best.x)}
@@ -191,10 +191,10 @@ class LeagueSlicePart(FigurePart):
 
 @dataclass(frozen=True, eq=False)
 class KeptRun:
-    """What is kept of a run: its improvements, shapes (improvement,), its whole cost, and its best point, shape (dim,).
+    """A reduced run: improvements, shapes (improvement,), the whole cost, and the best point, shape (dim,).
 
-    `episode` counts from 1 and `forwards` in forward equivalents; `loss` falls from the first to the last, which is the
-    run's final one. A run without success has no improvement, and a best point of NaN.
+    `episode` counts from 1 and `forwards` in forward equivalents; `loss` falls down to the final loss of
+    the run. A run without success has no improvement, and its best point is NaN.
     """
 
     method: str
@@ -208,7 +208,7 @@ class KeptRun:
 
     @classmethod
     def of(cls, run: Run, budget: int) -> KeptRun:
-        """Return what is kept of the first `budget` episodes of a run."""
+        """Reduce the first `budget` episodes of a run."""
         data = run.data.isel(evaluation=slice(budget))
         loss, x = data["loss"].to_numpy(), data["x"].to_numpy()
         rows = lowered(best_so_far(loss))
@@ -219,9 +219,9 @@ class KeptRun:
 
 @dataclass(frozen=True, eq=False)
 class MedianRun:
-    """The improvements of a method's median run: points as places in the box, losses, kinds, numbers of episodes.
+    """The improvements of a method's median run: quantised points, losses, kinds, and episode numbers.
 
-    Shapes are (improvement, dim) and (improvement,). `about` is what its table says of itself, as JSON.
+    Shapes are (improvement, dim) and (improvement,). `about` holds the attributes of its table as JSON.
     """
 
     places: NDArray[np.uint16]
@@ -232,7 +232,7 @@ class MedianRun:
 
     @classmethod
     def of(cls, members: Sequence[Run], budget: int) -> MedianRun:
-        """Return the improvements of the run of median final loss, of two the better."""
+        """Return the improvements of the run with the median final loss, or of the better of the two middle ones."""
         final = np.array([best_so_far(run.data["loss"].to_numpy()[:budget])[-1] for run in members])
         order = np.argsort(np.where(np.isfinite(final), final, np.inf), kind="stable")
         whole = members[order[(len(members) - 1) // 2]].data.isel(evaluation=slice(budget))
@@ -247,7 +247,7 @@ class MedianRun:
         return cls(places, losses, data["kind"].to_numpy(), rows + 1, json.dumps(about))
 
     def table(self) -> xr.Dataset:
-        """Return it with the columns of a run but for seconds, with gradients of NaN."""
+        """Return the columns of a run, without seconds and with NaN gradients."""
         about = json.loads(str(self.about))
         lower, upper = np.array(about["lower"]), np.array(about["upper"])
         x = lower + self.places / PLACES * (upper - lower)
@@ -269,24 +269,24 @@ JOINED = ("episode", "forwards", "loss")  # arrays of improvements, those of one
 
 @dataclass(frozen=True, eq=False)
 class KeptRuns:
-    """What is kept of a race: every run's improvements, and the median run of each method."""
+    """A reduced race: the improvements of every run, and the median run of each method."""
 
     runs: Sequence[KeptRun]
     packed: Mapping[str, MedianRun]
 
     @classmethod
     def of(cls, race: Race) -> KeptRuns:
-        """Return what is kept of a race."""
+        """Reduce a race."""
         runs = [KeptRun.of(run, race.budget) for members in race.runs.values() for run in members]
         return cls(runs, {method: MedianRun.of(members, race.budget) for method, members in race.runs.items()})
 
     @property
     def medians(self) -> dict[str, xr.Dataset]:
-        """The tables of the median runs by method."""
+        """The tables of the median runs, by method."""
         return {method: run.table() for method, run in self.packed.items()}
 
     def write(self, path: Path) -> None:
-        """Write it as one file, whole or not at all."""
+        """Write the runs as one file, whole or not at all."""
         arrays: dict[str, Any] = {name: np.array([getattr(one, name) for one in self.runs]) for name in EACH}
         arrays["count"] = np.array([len(one.loss) for one in self.runs])
         arrays |= {name: np.concatenate([getattr(one, name) for one in self.runs]) for name in JOINED}
@@ -297,12 +297,12 @@ class KeptRuns:
 
     @classmethod
     def read(cls, path: Path) -> KeptRuns:
-        """Read it. Raises ValueError, naming the file, where it is not what `write` wrote."""
+        """Read a file of `write`. Raises ValueError, naming the file, if it is damaged."""
         with reading(path, REMAKE.format("league")), np.load(path, allow_pickle=False) as found:
             arrays = dict(found)
             ends = np.cumsum(arrays["count"])
             if any(len(arrays[name]) != ends[-1] for name in JOINED):
-                raise ValueError("its improvements are not as many as its runs have")
+                raise ValueError("the number of improvements does not match its runs")
             parts = {name: np.split(arrays[name], ends[:-1]) for name in JOINED}
             each = {name: arrays[name] if name == "best" else arrays[name].tolist() for name in EACH}
             runs = [KeptRun(**{name: one[row] for name, one in (each | parts).items()}) for row in range(len(ends))]
@@ -316,22 +316,22 @@ class KeptRuns:
 
 
 def read_standings(path: Path) -> SceneStandings:
-    """Read what is kept of a scene. Raises ValueError, naming the file, where it is not what was written."""
+    """Read the stored standings of a scene. Raises ValueError, naming the file, if it is damaged."""
     with reading(path, REMAKE.format("league")):
         return from_json(SceneStandings, read_json(path))
 
 
 def read_league(root: Path) -> League | None:
-    """Return the league of the scenes that are kept in the gallery's data, None where there is none.
+    """Return the league of the scenes stored in the gallery's data, or None if there are none.
 
-    Raises ValueError, naming the file, where one is not what was written.
+    Raises ValueError, naming the file, if one is damaged.
     """
     scenes = [read_standings(path) for path in sorted((root / LEAGUE).glob("*.json"))]
     return League(scenes, {}, "landscape gallery compute --part league") if scenes else None
 
 
 def keep_both(picture: Picture, path: Path) -> None:
-    """Do what `save_both` does, in as few bytes as show no less: they go into the repository."""
+    """Write the pictures of `save_both` in fewer bytes, because they go into the repository."""
     from ..landscapes.draw.film import lighten
 
     save_both(picture, path)
@@ -340,7 +340,7 @@ def keep_both(picture: Picture, path: Path) -> None:
 
 
 def save_both(picture: Picture, path: Path) -> None:
-    """Write a picture, and the same for a dark page next to it."""
+    """Write a picture, and next to it its variant for dark pages."""
     from ..landscapes.draw.figures.dark import darken
     from ..landscapes.draw.figures.page import save
 

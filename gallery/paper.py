@@ -1,4 +1,4 @@
-"""What the paper says, read from paper.toml: of landscapes in words, of races in claims, of figures in captions."""
+"""The paper's statements, read from paper.toml: words for landscapes, claims about races, captions of figures."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from .files import PAPER
 if TYPE_CHECKING:
     from ..optim.claims import Claim, Claims
 
-ABSENT = "The paper does not have this environment, so it claims nothing about it."
+ABSENT = "The paper does not use this environment, so it makes no claim about it."
 
 
 @dataclass(frozen=True)
 class PaperWords:
-    """Hold the paper's words for an environment's landscape, of `verdict.WORDS`, and where it says them.
+    """The paper's words for an environment's landscape, from `verdict.WORDS`, and where they are in the paper.
 
-    `losses` are the ends of the colour bars of its slices, None where they cannot be read.
+    `losses` are the ends of the colour bars of its slices, or None if they are not legible.
     """
 
     words: tuple[str, ...]
@@ -36,22 +36,23 @@ class PaperWords:
 
 @dataclass(frozen=True)
 class PaperCaption:
-    """Hold what the paper says, in our words, of what a slice shows, and the number of its figure, None in ours.
+    """The paper's statement about a slice, in our words, and the number of its figure, or None for our own slices.
 
-    `words` are those of this slice alone, of `verdict.WORDS`, where it does not say of it what it says of the scene.
+    `words` are from `verdict.WORDS`. They are given where the paper's words for this slice differ from those for the
+    scene.
     """
 
-    says: str = "It does not show this slice."
+    says: str = "This slice is not shown."
     number: int | None = None
     words: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
 class PaperFinding:
-    """Hold what was measured of the paper's words for some slices, beyond what their reports say.
+    """Measurements that concern the paper's words for some slices, beyond their reports.
 
-    `words` are of `verdict.WORDS`, or the paper's own where it has more. `setting` is what turns our landscape into
-    the paper's, empty where none was found; `holds` says whether the words hold with it; `measured` how that is known.
+    `words` are from `verdict.WORDS`, or the paper's own where it has more. `setting` is a setting that was tried to
+    reproduce them, empty for none. `holds` says whether the words are true with it, and `measured` how that is known.
     """
 
     words: tuple[str, ...]
@@ -61,14 +62,14 @@ class PaperFinding:
 
     def __str__(self) -> str:
         said = f"{', '.join(self.words)}: {self.measured}"
-        return f"{said} ({'so with' if self.holds else 'tried:'} {self.setting})" if self.setting else said
+        return f"{said} ({'found with' if self.holds else 'not found with'} {self.setting})" if self.setting else said
 
 
 @dataclass(frozen=True)
 class Paper:
-    """Hold all that the paper says: `words`, `claims` and `silences` by environment, `captions` by slice.
+    """All statements of the paper: `words`, `claims` and `silences` by environment, `captions` by slice.
 
-    `findings` are ours, by slice.
+    `findings` are our own measurements, by slice.
     """
 
     words: Mapping[str, PaperWords]
@@ -78,20 +79,20 @@ class Paper:
     findings: Mapping[str, tuple[PaperFinding, ...]]
 
     def claims_about(self, env: str) -> Claims:
-        """Return which optimisers the paper has ahead of which others in an environment, or why it claims nothing."""
+        """Return the paper's claims about optimisers in an environment, or the reason why there are none."""
         from ..optim.claims import Claims
 
         claims = self.claims.get(env, ())
         return Claims(claims, None if claims else self.silences.get(env, ABSENT))
 
     def caption_of(self, slice_: str) -> PaperCaption:
-        """Return what the paper says of a slice of the gallery."""
+        """Return the paper's caption of a slice of the gallery."""
         return self.captions.get(slice_, PaperCaption())
 
 
 @cache
 def read_paper(path: Path = PAPER) -> Paper:
-    """Read what the paper says. Raises ValueError where it says a word that landscapes are not described in."""
+    """Read the paper's statements. Raises ValueError for a word that is not in `verdict.WORDS`."""
     from ..landscapes.measures.verdict import WORDS
     from ..optim.claims import Claim
 

@@ -1,4 +1,4 @@
-"""What the gallery makes of a figure: slices, a sweep, episodes, searches, a report, the study of fidelities."""
+"""The parts of a figure: the slice, companions, a sweep, episodes, searches, a report, the study of fidelities."""
 
 from __future__ import annotations
 
@@ -77,9 +77,9 @@ CHANGED = tuple(one for one in SETTINGS if one not in ("engine", "device"))  # t
 
 @dataclass(frozen=True)
 class State:
-    """How much of a slice is sampled: `done` of `points`, or None where the data is another slice's.
+    """How much of a slice is sampled: `done` of `points`, or None if the data is of another slice.
 
-    `changed` names the settings of its fidelity that were others when it was sampled.
+    `changed` names the settings of its fidelity that have changed since it was sampled.
     """
 
     points: int
@@ -88,7 +88,7 @@ class State:
 
     @property
     def finished(self) -> bool:
-        """Whether nothing is left to compute."""
+        """Whether all points are sampled."""
         return self.done == self.points
 
     def __str__(self) -> str:
@@ -101,22 +101,22 @@ class State:
 
 @dataclass(frozen=True)
 class FigureList:
-    """Hold the figures of the gallery, and how much of each lies in a folder of data."""
+    """The figures of the gallery, and how much of each is in a folder of data."""
 
     folder: Path
     figures: tuple[tuple[Figure, State], ...]
 
     @property
     def summary(self) -> list[dict[str, Any]]:
-        """Return for each figure its `id` and how much of it is there, as plain JSON."""
+        """Return the `id` and the state of each figure as plain JSON."""
         return [{"id": figure.id, **to_json(state)} for figure, state in self.figures]
 
 
 @dataclass(frozen=True)
 class FigurePart(abc.ABC):
-    """Something to make of a figure, in the gallery's data at `root`.
+    """A part of a figure, in the gallery's data at `root`.
 
-    What is `of_environment` is made once for all figures of an environment.
+    A part that is `of_environment` is made once for all figures of an environment.
     """
 
     of_environment: ClassVar[bool] = False
@@ -127,36 +127,36 @@ class FigurePart(abc.ABC):
 
     @property
     def folder(self) -> Path:
-        """Where the figure's data is."""
+        """The folder of the figure's data."""
         return self.root / self.figure.id
 
     @property
     def shared(self) -> str:
-        """What figures have in common that share what is made."""
+        """The name that is common to all figures that share this part."""
         return self.figure.env if self.of_environment else self.figure.id
 
     @abc.abstractmethod
     def label(self) -> str:
-        """Describe what is made, by its command where there is one."""
+        """Return the command that makes the part, or a description of it."""
 
     def there(self) -> bool:
-        """Say whether nothing is left to make."""
+        """Say whether the part is complete."""
         return self.count_left() == 0
 
     @abc.abstractmethod
     def count_left(self) -> int:
-        """Count what is left to make: points, episodes, films or runs."""
+        """Count the missing points, episodes, films or runs."""
 
     def seconds_each(self) -> float:
-        """Estimate what one of them takes, by default an episode without gradient."""
+        """Estimate the time of one of them, by default that of an episode without gradient."""
         return episode_cost(self.scene().make(), grad=False).forward
 
     @abc.abstractmethod
     def make(self, watch: Watch) -> str:
-        """Make what is left and say in a line what came out."""
+        """Make what is missing, and return the result as one line of text."""
 
     def scene(self, fidelity: str | None = None) -> SceneSpec:
-        """Return the scene at the figure's fidelity or another; at its default where it does not have that one."""
+        """Return the scene at the figure's fidelity or another, or at its default if it has no such fidelity."""
         scene = self.figure.scene(self.device, fidelity)
         known = scene.fidelity in environment_class(self.figure.env).fidelities
         return scene if known else replace(scene, fidelity=None)
@@ -166,16 +166,16 @@ class SlicePart(FigurePart):
     """The slice itself, at the figure's fidelity."""
 
     def label(self) -> str:
-        """Return the command that samples it."""
+        """Return the command that samples the slice."""
         return self.figure.command(self.device)
 
     def count_left(self) -> int:
-        """Count the points not sampled."""
+        """Count the missing points."""
         state = self.state()
         return state.points - (state.done or 0)
 
     def state(self) -> State:
-        """Look at the data without making an environment; who sampled it, and on what device, does not matter."""
+        """Read the state from the data, without making an environment; the device of the samples does not matter."""
         points, store = self.figure.resolution ** len(self.figure.dims), self.folder / files.STORE
         if not is_slice(store) and not has_lost_root(store):
             return State(points, 0)
@@ -185,7 +185,7 @@ class SlicePart(FigurePart):
         return State(points, int((stored.status() > 0).sum()) if same else None, changed)
 
     def seconds_each(self) -> float:
-        """Time a point."""
+        """Time one point."""
         cost = self._open().cost()
         return cost.seconds / max(cost.episodes, 1)
 
@@ -212,14 +212,14 @@ class SlicePart(FigurePart):
 
 
 class CompanionPart(FigurePart):
-    """The losses of the same cut through other points, at the figure's fidelity, and a picture on one scale."""
+    """Losses over the same parameters through other points, at the figure's fidelity, drawn on one scale."""
 
     def label(self) -> str:
-        """Say what is sampled."""
-        return f"the same dims through {' and '.join(points_beside(self.figure))}, losses"
+        """Describe the slices."""
+        return f"losses over the same dims through {' and '.join(points_beside(self.figure))}"
 
     def count_left(self) -> int:
-        """Count the episodes where there are no such slices of these settings, of this slice."""
+        """Count the episodes of the slices that are missing for these settings and this slice."""
         names, key = points_beside(self.figure), self._key()
         if not names or key is None:
             return 0
@@ -227,7 +227,7 @@ class CompanionPart(FigurePart):
         return 0 if there else len(names) * self._resolution ** len(self.figure.dims)
 
     def make(self, watch: Watch) -> str:
-        """Sample them, draw them next to the slice, and keep what they are."""
+        """Sample the slices, draw them next to the figure's, and write their record."""
         from ..landscapes.draw.figures.multiples import CompanionSlice, companions_figure
         from ..landscapes.draw.figures.page import save
         from ..landscapes.draw.film import lighten
@@ -257,7 +257,7 @@ class CompanionPart(FigurePart):
         return COMPANION_RESOLUTION if len(self.figure.dims) == 2 else self.figure.resolution
 
     def _key(self) -> dict[str, Any] | None:
-        """Return what decides these slices and their picture; None where the figure has no slice yet."""
+        """Return the key that decides these slices and their picture, or None if the figure has no slice yet."""
         store = self.folder / files.STORE
         if not is_slice(store):
             return None
@@ -266,10 +266,10 @@ class CompanionPart(FigurePart):
 
 
 class SweepPart(FigurePart):
-    """The slice as something else moves: a film, of slices that stay in the sweep's own folder under out/."""
+    """A film of the slice as another value changes; its slices stay in the sweep's folder under out/."""
 
     def label(self) -> str:
-        """Return the command that makes it."""
+        """Return the command that makes the film."""
         figure, size = self.figure, ["--frames", SWEEP_FRAMES, "--resolution", SWEEP_RESOLUTION]
         words = ["landscape", "sweep", figure.env, "--dims", *figure.dims, "--over", figure.over, *size]
         words += ["--fidelity", SWEEP_FIDELITY, "--through", figure.through]
@@ -277,18 +277,18 @@ class SweepPart(FigurePart):
         return shlex.join(map(str, [*words, *figure.set_options, "--device", self.device]))
 
     def count_left(self) -> int:
-        """Return 1 where there is no film of these settings yet."""
+        """Return 1 if there is no film with these settings yet, else 0."""
         if not self.figure.over or len(self.figure.dims) != 2:
             return 0
         record = read_if_sound(read_sweep, self.folder)
         return int(record is None or record != self._record(record.label, record.low, record.high, record.command))
 
     def seconds_each(self) -> float:
-        """Time the film by its last slice."""
+        """Estimate the time of the film from its last slice."""
         return self._open().cost().seconds
 
     def make(self, watch: Watch) -> str:
-        """Sample the sweep's slices and film them."""
+        """Sample the slices of the sweep and make the film."""
         from ..landscapes.draw.figures.sweep import save_films
 
         drawn = self._open().sample(watch)
@@ -316,20 +316,20 @@ class EpisodePart(FigurePart):
         return f"the episodes at {len(self._nodes)} nodes"
 
     def count_left(self) -> int:
-        """Count the nodes without a film, none in an environment that has no episodes to draw."""
+        """Count the nodes without a film; 0 if the environment cannot draw episodes."""
         drawn = environment_class(self.figure.env).episode is not Environment.episode
         return len(self._nodes) - len(self._find_films()) if drawn else 0
 
     def seconds_each(self) -> float:
-        """Time an episode, and assume what drawing it takes."""
+        """Time an episode, and add an assumed time for drawing it."""
         return super().seconds_each() + EPISODE_FRAMES * SECONDS_PER_FRAME
 
     def make(self, watch: Watch) -> str:
-        """Film every episode that is not there, and clear away those of other nodes."""
+        """Make the missing films, and remove those of other nodes."""
         env, plane, filmed = self.scene().make(), plane_of(self._dataset), self._find_films()
         for node in self._nodes:
             if node not in filmed:
-                with watch.busy(f"{self.figure.id}: the episode of {node.why}"):
+                with watch.busy(f"{self.figure.id}: episode, {node.why}"):
                     self._film(env, plane, node)
                 filmed.append(node)
                 write_nodes(self.folder / files.EPISODES, filmed)
@@ -354,7 +354,7 @@ class EpisodePart(FigurePart):
         return choose_nodes(self._dataset, point(make(self.figure.env, device="cpu"), self.figure.through))
 
     def _find_films(self) -> list[Node]:
-        """Return the nodes whose films are there."""
+        """Return the nodes that have a film."""
         listed = read_if_sound(read_nodes, self.folder / files.EPISODES) or []
         return [
             node for node in self._nodes
@@ -363,7 +363,7 @@ class EpisodePart(FigurePart):
 
 
 class SearchPart(FigurePart):
-    """A run of each method in the figure's environment at its fidelity, which its other figures share."""
+    """One run of each method in the figure's environment at its fidelity, shared by all its figures."""
 
     @property
     def shared(self) -> str:
@@ -371,23 +371,23 @@ class SearchPart(FigurePart):
         return self._where.name
 
     def label(self) -> str:
-        """Return the command that races them."""
+        """Return the command that runs the searches."""
         how = ["--methods", ",".join(METHODS), "--budget", str(BUDGET), "--seeds", "1"]
         how += ["--fidelity", self.figure.fidelity, *self.figure.set_options, "--device", self.device]
         return shlex.join(["landscape", "race", self.figure.env, *how])
 
     def count_left(self) -> int:
-        """Count the runs not made at this fidelity."""
+        """Count the missing runs at this fidelity."""
         return len(self._missing())
 
     def seconds_each(self) -> float:
-        """Share what simulating all of them in lockstep takes; what methods take themselves comes on top."""
+        """Estimate the simulation time of one run of a lockstep, without the time of the methods themselves."""
         asking = sum(optimizer_class(method).needs_grad for method in METHODS)
         counts = BUDGET * (len(METHODS) - asking), BUDGET * asking
         return simulation_seconds(self.scene().make(), *counts, len(METHODS)) / len(METHODS)
 
     def make(self, watch: Watch) -> str:
-        """Race the methods, in a folder under out/, and keep the runs that are missing."""
+        """Race the methods in a folder under out/, and store the missing runs."""
         job = RaceJob.of(self.scene().make(), METHODS, budget=BUDGET, seeds=1, command=self.label(), watch=watch)
         runs = replace(job, executor=self.executor).run(watch).runs
         for method in self._missing():
@@ -415,16 +415,16 @@ class SearchPart(FigurePart):
 
 
 class ReportPart(FigurePart):
-    """What the slice is like, next to it."""
+    """The report of the slice, next to it."""
 
     def label(self) -> str:
-        """Return the command that measures it elsewhere, which names no folder above this one: its record is kept."""
+        """Return the command that measures the slice elsewhere; it names no folder above this one."""
         folder, here = self.folder.resolve(), Path.cwd()
         said = folder.relative_to(here) if folder.is_relative_to(here) else self.folder
         return f"landscape report {said} --device {self.device}"
 
     def count_left(self) -> int:
-        """Return 1 where there is no report of this slice."""
+        """Return 1 if there is no report of this slice, else 0."""
         record, store = read_if_sound(read_json, self.folder / files.REPORT), self.folder / files.STORE
         if record is None or read_if_sound(read_json, self.folder / files.MEASURES) is None or not is_slice(store):
             return 1
@@ -432,14 +432,14 @@ class ReportPart(FigurePart):
         return int(not isinstance(key, dict) or key.get("slice") != digest_of(open_slice(store)))
 
     def seconds_each(self) -> float:
-        """Estimate a report by the first episodes."""
+        """Estimate the time of a report from the first episodes."""
         rank = len(self.figure.dims)
         env = self.scene().make()
         losses, gradients = effort(rank, REPORT_POINTS, (self.figure.resolution,) * rank, len(env.replicas()))
         return simulation_seconds(env, losses, gradients, losses + gradients)
 
     def make(self, watch: Watch) -> str:
-        """Measure the slice, and replace a report of another one."""
+        """Measure the slice, and replace the report of any other slice."""
         from ..landscapes.draw.film import lighten
 
         for name in (files.REPORT, files.MEASURES, files.QUALITY, files.QUALITY_ARRAYS):
@@ -452,26 +452,26 @@ class ReportPart(FigurePart):
 
 
 class FidelityPart(FigurePart):
-    """Accuracy against time of the figure's environment, which its other figures share."""
+    """Accuracy against time of the figure's environment, shared by all its figures."""
 
     of_environment = True
 
     def label(self) -> str:
-        """Return the command that measures it elsewhere."""
+        """Return the command that runs the study elsewhere."""
         return f"landscape study fidelity {self.figure.env} --device {self.device} --settings {','.join(CHANGED)}"
 
     def count_left(self) -> int:
-        """Return 1 where there is none, of an environment that has fidelities to compare."""
+        """Return 1 if the study is missing and the environment has fidelities to compare, else 0."""
         some = len(environment_class(self.figure.env).fidelities) > 1
         devices = files.DEVICES if self.device == "auto" else (self.device,)
         return int(some and not any(map(self._sound, devices)))
 
     def seconds_each(self) -> float:
-        """Estimate all variants by the work of their episodes."""
+        """Estimate the time of all variants from the work of their episodes."""
         return sum(self._open().seconds().values())
 
     def make(self, watch: Watch) -> str:
-        """Measure every variant; those that are measured stay in a folder of their own under out/ until the last is."""
+        """Measure all variants; finished ones stay in a folder under out/ until the last is done."""
         from ..landscapes.draw.film import lighten
 
         job = self._open()
@@ -484,7 +484,7 @@ class FidelityPart(FigurePart):
         return f"{len(found.table())} variants at {found.points} points"
 
     def _sound(self, device: str) -> bool:
-        """Whether there is one of a device."""
+        """Whether there is a study on a device."""
         placed = files.StudyFiles.of(self.root, self.figure.env, device, "fidelity")
         return bool(read_if_sound(read_json, placed.record)) and placed.picture.is_file()
 
@@ -505,9 +505,9 @@ def _same(figure: Figure, identity: Mapping[str, Any]) -> bool:
 
 
 def changes_since(identity: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
-    """Return the settings of a slice's fidelity that are others now than when it was sampled: both values.
+    """Return the settings of a slice's fidelity that have changed since it was sampled, with both values.
 
-    There are none that are known of a scene that is not registered here, or of a fidelity that it has no more.
+    The result is empty if the scene is not registered here, or no longer has this fidelity.
     """
     if (name := identity["objective"]) not in entries():
         return {}
@@ -516,20 +516,20 @@ def changes_since(identity: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
 
 
 def _through(provenance: Mapping[str, Any]) -> str:
-    """Return the point that a slice's command names, which no environment has to be made for."""
+    """Return the point that a slice's command names, without making an environment."""
     words = shlex.split(provenance["command"])
     return words[words.index("--through") + 1] if "--through" in words else "center"
 
 
 def kept_key(path: Path) -> Any:
-    """Return the `key` of a record, what it was made of; None where there is no sound record or it has none."""
+    """Return the `key` of a record, which says what it was made from; None without a sound record or a key."""
     return (read_if_sound(read_json, path) or {}).get("key")
 
 
 def points_beside(figure: Figure) -> list[str]:
-    """Return the points that a figure's dimensions are also cut through: the centre and the scene's first example.
+    """Return the other base points of a figure's companions: the centre and the scene's first example.
 
-    A figure that varies all parameters has the same slice everywhere, so there are none.
+    A figure that varies all parameters has the same slice through every point, so it has none.
     """
     kind = environment_class(figure.env)
     space = getattr(kind, "space", None) or SceneSpec(figure.env, device="cpu", options=figure.options).make().space
@@ -540,7 +540,7 @@ def points_beside(figure: Figure) -> list[str]:
 
 
 def _sample_losses(env: Environment, plane: Plane) -> NDArray[np.float32]:
-    """Return the losses on a plane or a line, indexed (v, u) or (u), NaN where an episode failed."""
+    """Return the losses on a plane or a line, shape (v, u) or (u,), NaN where an episode failed."""
     grid = plane.grid()
     batches = torch.split(grid.reshape(-1, plane.dim), env.preferred_batch)
     found = Evaluation.join((evaluate(env, x, grad=False) for x in batches), dim=plane.dim, grad=False)
@@ -548,9 +548,9 @@ def _sample_losses(env: Environment, plane: Plane) -> NDArray[np.float32]:
 
 
 def choose_nodes(dataset: xr.Dataset, through: Float[Tensor, " dim"]) -> list[Node]:
-    """Choose the nodes of least, median and largest loss, and the one nearest the point the slice goes through.
+    """Choose the nodes with the lowest, median and highest loss, and the one nearest to the slice's point.
 
-    Of a node that is chosen twice the first reason counts; the nodes of a line are in row 0.
+    A node that is chosen twice keeps the first reason. The nodes of a line are in row 0.
     """
     loss, status = np.atleast_2d(dataset["loss"].to_numpy()), np.atleast_2d(dataset["status"].to_numpy())
     finite = np.argsort(loss, axis=None, kind="stable")[: int(np.isfinite(loss).sum())]

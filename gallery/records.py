@@ -1,4 +1,4 @@
-"""The records that are computed for a figure and shown on its page, and the searches laid over its slice."""
+"""The records that a figure's page shows, and the searches drawn over its slice."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class SweepRecord:
-    """Say what a sweep's film shows, as `sweep.json` next to it has it: how it was sampled, and what moves."""
+    """The record `sweep.json` of a sweep's film: how it was sampled, and which value changes."""
 
     over: str
     fidelity: str
@@ -44,7 +44,7 @@ class SweepRecord:
 
 
 def read_sweep(folder: Path) -> SweepRecord | None:
-    """Return what the film of a sweep shows, None where there is no film or nothing is said of it."""
+    """Return the record of a sweep's film, or None if the film or the record is missing."""
     path = folder / SWEEP_RECORD
     if not path.exists() or not (folder / SWEEP_FILM).exists():
         return None
@@ -54,9 +54,9 @@ def read_sweep(folder: Path) -> SweepRecord | None:
 
 @dataclass(frozen=True)
 class Companion:
-    """A slice next to a figure's: the point it goes through, the ends of its losses, the share of episodes that failed.
+    """A companion of a figure's slice: its base point, the range of its losses, and the share of failed episodes.
 
-    The ends are None where all failed.
+    The ends of the range are None if all episodes failed.
     """
 
     through: str
@@ -66,7 +66,7 @@ class Companion:
 
 
 def read_companions(folder: Path) -> list[Companion]:
-    """Return the slices next to a figure's, none where none are made."""
+    """Return the companions of a figure's slice; the list is empty if none were made."""
     path = folder / COMPANIONS
     if not path.exists() or not (folder / COMPANION_PICTURE).exists():
         return []
@@ -86,24 +86,24 @@ class Node:
 
     def __post_init__(self) -> None:
         if min(self.row, self.column) < 0:
-            raise ValueError(f"a place is counted from 0; got {min(self.row, self.column)}")
+            raise ValueError(f"row and column count from 0; got {min(self.row, self.column)}")
         Status[self.status]  # a KeyError where there is no such status
 
     @property
     def name(self) -> str:
-        """The name of its files, without their ending."""
+        """The name of its files, without the ending."""
         return episode_name(self.row, self.column)
 
 
 def write_nodes(path: Path, nodes: Sequence[Node]) -> None:
-    """Write which nodes' episodes are shown."""
+    """Write the nodes whose episodes are shown."""
     write_json(path, [sign(to_json(node)) for node in nodes])
 
 
 def read_nodes(path: Path) -> list[Node]:
-    """Read which nodes' episodes are shown.
+    """Read the nodes whose episodes are shown.
 
-    Raises ValueError, naming the file, where it is not what `write_nodes` wrote.
+    Raises ValueError, naming the file, if it is not one of `write_nodes`.
     """
     with reading(path, REMAKE.format("episodes")):
         return [from_json(Node, verify(one)) for one in json.loads(path.read_text())]
@@ -119,11 +119,11 @@ def save_run(table: xr.Dataset, path: Path) -> None:
 
 
 def open_run(path: Path) -> xr.Dataset:
-    """Read a run's table. Raises ValueError, naming the file, where it is not what `save_run` wrote."""
+    """Read a run's table. Raises ValueError, naming the file, if it is not one of `save_run`."""
     with reading(path, REMAKE.format("searches")):
         with ZipFile(path) as packed:
             if torn := packed.testzip():  # a chunk that is not found would be one of nothing but its fill value
-                raise ValueError(f"{torn} in it is torn")
+                raise ValueError(f"its part {torn} is damaged")
         with ZipStore(path, mode="r") as store:
             how: Any = {"mask_and_scale": False, "decode_times": False}
             table: xr.Dataset = xr.open_zarr(store, zarr_format=3, consolidated=False, **how).load()
@@ -133,9 +133,9 @@ def open_run(path: Path) -> xr.Dataset:
 
 
 def searched(run: Mapping[str, Any], slice_: Mapping[str, Any]) -> bool:
-    """Whether a run searched a slice's scene, of the same model.
+    """Whether a run searched the scene of a slice, with the same model version.
 
-    An option that one of them was made without does not tell them apart.
+    Only options that both of them record are compared.
     """
     ours, theirs = run.get("options", {}), slice_.get("options", {})
     shared = set(ours) & set(theirs)
@@ -146,7 +146,7 @@ def searched(run: Mapping[str, Any], slice_: Mapping[str, Any]) -> bool:
 
 
 def read_if_sound(read: Callable[[Path], T], path: Path) -> T | None:
-    """Return what a function reads of a file, None where the file is not there or damaged."""
+    """Read a file with a function, or return None if the file is missing or damaged."""
     try:
         return read(path)
     except (OSError, TypeError, ValueError):

@@ -1,1 +1,1 @@
-"""Work in a folder on disk that can be stopped and continues: progress by callback, nothing printed."""
+"""Jobs that work in a folder, can be stopped and continued, report progress by callback, and print nothing."""

@@ -1,4 +1,4 @@
-"""Advice on how to begin a search: measures of the landscape, and what helped where landscapes were alike."""
+"""Advice on how to begin a search: measures of the landscape, and the methods that helped in similar landscapes."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ FILE = ADVICE.files[0]
 
 @dataclass(frozen=True)
 class Advice:
-    """Say how to begin a search of `budget` episodes, `evaluations` of which were spent on finding out.
+    """Record how to begin a search of `budget` episodes, of which `evaluations` were spent on measuring.
 
-    `choice` is the method with its evidence, `unable` says why methods cannot search it. `fidelity_advice` and
-    `remedy_advice` say in words what is measured of these, or what measures it. `gradient_cost` is about what an
-    episode with gradient costs in episodes without, NaN where that is not known. `best` is the best point of those that
-    were evaluated.
+    `choice` is the method with its evidence. `unable` gives the reason for each method that cannot run here.
+    `fidelity_advice` and `remedy_advice` say in words what was measured of these, or which command measures it.
+    `gradient_cost` is about the cost of an episode with gradient, in episodes without, NaN if unknown. `best` is the
+    best evaluated point.
     """
 
     env: str
@@ -122,7 +122,9 @@ class AdviseJob(Job[Advice]):
         env, count = self.env, self.evaluations
         with watch.busy(f"{env.name}: {PREPARING}"):
             env.prepare()
-        watch.note(f"{env.name} · {env.fidelity.name} · {env.device}: {count} of {self.budget} episodes to find out")
+        watch.note(
+            f"{env.name} · {env.fidelity.name} · {env.device}: measuring takes {count} of {self.budget} episodes"
+        )
         with watch.busy(f"{env.name}: measuring the landscape"):
             try:
                 found, sloped = measure_character(env, evaluations=count, seed=self.seed), True
@@ -150,7 +152,7 @@ class AdviseJob(Job[Advice]):
 
     def holding(self, watch: Watch) -> AbstractContextManager[None]:
         """Let a full disk end it; what is stopped begins again."""
-        return until_full(lambda: "nothing of the advice is kept")
+        return until_full(lambda: "the advice is not saved")
 
     def record(self, found: Advice) -> Any:
         """Return what is written of it, with what was measured."""
@@ -173,17 +175,17 @@ def advise_fidelity(env: Environment) -> str:
     """Say which fidelity to begin with: the quickest whose measured errors are small, else the cheapest."""
     names = list(env.fidelities)
     if len(names) == 1:
-        return f"{names[0]}: there is no other"
+        return f"{names[0]}, the only one"
     known = find_fidelity(env, env.device)
     if known is None:
         return f"{names[0]}, the cheapest; `landscape study fidelity {env.name}` measures its errors"
     named = [one for one in known[0].by_time if one.name in names]
     good = [one for one in named if (off := one.p95(relative=True)) is not None and off <= TOLERANCE]
     if not good:
-        return f"none but {known[0].reference} is within {TOLERANCE:.0%} of the spread of losses ({known[1].name})"
+        return f"{known[0].reference}: no other is within {TOLERANCE:.0%} of the spread of losses ({known[1].name})"
     one = good[0]
     error, seconds = one.p95(relative=True) or 0.0, duration(one.seconds)
     return (
-        f"{one.name}: 95 % of its losses are within {error:.1%} of the spread, {seconds} with gradient on "
-        f"{known[0].device} ({known[1].name})"
+        f"{one.name}: 95 % of its losses are within {error:.1%} of the spread, and an episode with gradient takes "
+        f"{seconds} on {known[0].device} ({known[1].name})"
     )

@@ -39,10 +39,10 @@ SMALL = 64  # points along each axis of the sampler's slice, at most
 
 @dataclass(frozen=True)
 class Start:
-    """Say how an engine began: `seconds` until its first gradient was there, Warp modules `compiled` on the way.
+    """Record how an engine started: `seconds` until its first gradient, and Warp modules `compiled` for it.
 
-    What was not compiled came from the cache; Taichi does not say. `bytes_per_episode` is what its CUDA device says was
-    taken, by rows that a full batch has.
+    Other modules came from the cache. `compiled` is None for engines that do not report it, such as Taichi.
+    `bytes_per_episode` is the memory that a full batch takes on a CUDA device, per row, None elsewhere.
     """
 
     seconds: float
@@ -52,7 +52,7 @@ class Start:
 
 @dataclass(frozen=True)
 class Rate:
-    """Hold the median of some repetitions: `seconds` for a whole batch, and what that is per second."""
+    """Record the median of some repetitions: `seconds` for a whole batch, and the rates per second."""
 
     seconds: float
     episodes_per_second: float
@@ -66,10 +66,10 @@ class Rate:
 
 @dataclass(frozen=True)
 class BatchRate:
-    """Hold the rates of an engine in batches of one size, `failed` episodes among them.
+    """Record the rates of an engine for one batch size, in which `failed` episodes failed.
 
-    `gradient_costs` is the time of an episode with gradient in those of one without. Ratios say how many times as fast
-    as the other engine this one is; None without another, and of the other itself.
+    `gradient_costs` is the time of an episode with gradient, divided by that of one without. Ratios are the speed
+    relative to the second engine, None without one, and None for the second engine itself.
     """
 
     engine: str
@@ -89,7 +89,7 @@ class BatchRate:
 
 @dataclass(frozen=True)
 class MemoryUse:
-    """Hold what an episode takes [bytes]: as the scene estimates it, and as measured on CUDA, None elsewhere."""
+    """Record the memory of an episode [bytes]: as the scene estimates it, and as measured on CUDA, None elsewhere."""
 
     estimated: int
     measured: int | None
@@ -97,7 +97,7 @@ class MemoryUse:
 
 @dataclass(frozen=True)
 class SamplerShare:
-    """Say what share of the seconds of sampling so many points to disk is not simulation."""
+    """Record the share of the time for sampling so many `points` to disk that is not simulation."""
 
     points: int
     seconds: float
@@ -106,10 +106,10 @@ class SamplerShare:
 
 @dataclass(frozen=True)
 class AdapterShare:
-    """Say what share of a batch's time is not the compiled program of the engine, which others wrote.
+    """Record the share of a batch's time that is spent outside the compiled program of a third-party engine.
 
-    The program with gradient gives loss and gradient; that ours also gives the loss alone, so that it does not depend
-    on the gradient to the last bit, is part of the share.
+    The engine's program with gradient returns loss and gradient. gradscape also computes the loss alone, so the loss
+    does not depend on the gradient to the last bit. This is part of the share.
     """
 
     batch: int
@@ -119,7 +119,7 @@ class AdapterShare:
 
 @dataclass(frozen=True)
 class KernelSeconds:
-    """Say how often a kernel was launched, the seconds it took altogether, and their share of the time that passed."""
+    """Record the launches of a kernel, its total seconds, and their share of the elapsed time."""
 
     name: str
     calls: int
@@ -129,7 +129,7 @@ class KernelSeconds:
 
 @dataclass(frozen=True)
 class KernelTable:
-    """Hold the kernels of one batch, slowest first, which took so many `seconds` altogether."""
+    """Record the kernels of one batch, slowest first, and the `seconds` of the whole batch."""
 
     batch: int
     seconds: float
@@ -138,11 +138,11 @@ class KernelTable:
 
 @dataclass(frozen=True)
 class Bench:
-    """Hold what was measured of an environment; fields are called as `landscape bench --json` has them.
+    """Record the measurements of an environment, with the field names of `landscape bench --json`.
 
-    `start` is by engine, `kernels` by way (forward, with_gradient), None of other engines than Warp. Ratios are of the
-    largest batch, None without another engine. `adapter` is None of engines whose programs are our own. Each repetition
-    evaluated points of its own, unless they were the `same_points`.
+    `start` is by engine. `kernels` is by way (forward, with_gradient), None for engines other than Warp. Ratios are
+    those of the largest batch, None without a second engine. `adapter` is None for engines whose programs are our own.
+    Each repetition evaluated new points, unless `same_points` is true.
     """
 
     env: str
@@ -174,8 +174,8 @@ class BenchJob:
     """An environment to measure on an engine, in turn with another one if `against` names it.
 
     `make` returns the environment for an engine. Each of `batches` (1 and the preferred one by default) is timed for
-    about so many `seconds`, at other points in each repetition: nobody evaluates the same ones twice, and some engines
-    prepare for where bodies are. With the `same_points` kernels alone are compared.
+    about so many `seconds`, at new points in each repetition: a search never evaluates a point twice, and some engines
+    prepare for the positions of bodies. With `same_points` only kernels are compared.
     """
 
     make: Callable[[str], Environment]
@@ -196,9 +196,9 @@ class BenchJob:
         return cls(make, scene.engine or scene.kind.engines[0], **how)
 
     def run(self, watch: Watch | None = None) -> Bench:
-        """Measure it, and return what was found.
+        """Measure it, and return the record.
 
-        Raises ValueError for an engine that the scene does not have, TooLargeError for a batch that does not fit.
+        Raises ValueError if the scene does not have an engine, TooLargeError if a batch does not fit in memory.
         """
         watch = watch or Watch()
         with watch.busy("preparing") as say:
@@ -206,7 +206,7 @@ class BenchJob:
             env = envs[self.engine]
             for batch in self.batches:
                 require("batch", batch, partial(_need, env))
-            watch.note(f"{env.name}: each rate takes {duration(self.seconds)} or more, without and with gradients")
+            watch.note(f"{env.name}: timing each batch size takes {duration(self.seconds)} or more")
             rates = list[BatchRate]()
             for batch in self.batches or sorted({1, env.preferred_batch}):
                 say(f"timing batches of {batch}")
@@ -251,7 +251,7 @@ def _start_engines(
 ) -> tuple[dict[str, Environment], dict[str, Start]]:
     """Return environments by engine, each made when the one before has taken what it takes of a GPU."""
     if engine == against:
-        raise ValueError(f"two engines are compared; got {engine} against {against}")
+        raise ValueError(f"bench compares two different engines; got {engine} twice")
     envs, starts = {engine: make(engine)}, {}
     if against is not None:
         envs[engine].check_engine(against)

@@ -47,7 +47,7 @@ SPEEDS = ("velocity x", "velocity y")
 
 @dataclass(frozen=True)
 class Entrant:
-    """Say which environment stands for an engine in a scene of the card, and along which parameters it is cut."""
+    """Record the environment that represents an engine in a scene of the card, and the parameters of its slice."""
 
     scene: str
     engine: str
@@ -162,12 +162,12 @@ class CardJob(CheckpointedJob[Card]):
 
     def kept(self) -> str:
         """Say how much of it is on disk."""
-        return f"{self.checkpoint.count()} of {len(self.entrants)} engines in scenes are kept in {self.folder}"
+        return f"{self.checkpoint.count()} of {len(self.entrants)} engine checks are kept in {self.folder}"
 
     def compute(self, watch: Watch) -> Card:
         """Check and cut what is missing, and return the card."""
         grades, slices, device = list[Grade](), dict[int, CardSlice](), self.device
-        with watch.progress(len(self.entrants), "engines in scenes") as advance:
+        with watch.progress(len(self.entrants), "engine checks") as advance:
             for number, one in enumerate(self.entrants):
                 advance(number, f"{one.scene}: {one.engine}")
                 if missing := installs(entries()[one.env]):

@@ -43,7 +43,7 @@ COPIES = 4  # of the losses and gradients of a slice
 
 @dataclass(frozen=True)
 class Task:
-    """Hold a slice to survey: the name of its piece, its number in the design, and of which environment it is."""
+    """Record a slice to survey: the name of its piece, its number in the design, and its environment."""
 
     piece: str
     number: int
@@ -95,12 +95,12 @@ class CensusJob(CheckpointedJob["Census"]):
         env = scene.make()
         if resolution < 6:
             raise ValueError(
-                f"a census measures every second sample, too, so it takes 6 along an axis; got {resolution}"
+                f"census also measures every second sample, so it takes --resolution of at least 6; got {resolution}"
             )
         if gradients < 1 or gradients > resolution // 3:
             raise ValueError(
-                "a census takes gradients at every sample, 1, or every so many along each axis, up to a third of the "
-                f"resolution, {resolution // 3}; got {gradients}"
+                f"census takes --gradients from 1 (every sample) to a third of the resolution, {resolution // 3}; got "
+                f"{gradients}"
             )
         require("resolution", resolution, lambda side: Need(8.0 * COPIES * (1 + env.space.dim) * side**2))
         require("slices", slices, lambda count: Need(8.0 * count * resolution**2, 8.0 * count * resolution**2))
@@ -194,7 +194,7 @@ class CensusJob(CheckpointedJob["Census"]):
         from ..landscapes.measures.verdict import measure_range
 
         def measure() -> dict[str, float]:
-            with watch.busy(f"{self.env.name}: {PREPARING}, then its noise"):
+            with watch.busy(f"{self.env.name}: {PREPARING}, then measuring noise"):
                 self.env.prepare()
                 x = self.env.space.uniform(NOISE_POINTS, seed=self.seed)
                 rounding = LAST_PLACE[self.env.fidelity.precision]
@@ -212,7 +212,7 @@ class CensusJob(CheckpointedJob["Census"]):
             return {}
         names = [OWN, *replicas]
         if (kept := self.checkpoint.load("floor")) is None or kept["names"].tolist() != names:
-            with watch.busy(f"{self.env.name}: its numerical floor"):
+            with watch.busy(f"{self.env.name}: measuring the numerical floor"):
                 x = self.env.space.uniform(NOISE_POINTS, seed=self.seed)
                 own = evaluate(self.env, x, grad=True)
                 found = [own, *evaluate_replicas(self.env, x, replicas, grad=True).values()]
@@ -239,14 +239,14 @@ class CensusJob(CheckpointedJob["Census"]):
             f"{len(self.design.places)} slices through {bases} base points along {cuts} cuts, {samples} samples each"
             f"{f', {having} of them with gradients' if without else ''}"
         )
-        kept = f"; {len(self.tasks) - len(left)} are there already" if len(left) < len(self.tasks) else ""
+        kept = f"; {len(self.tasks) - len(left)} are done already" if len(left) < len(self.tasks) else ""
         watch.note(f"{what}{kept}")
         if left:
             losses, slopes = self._effort()
             each = simulation_seconds(self.env, losses, slopes, losses + slopes)
             lower = "--slices, --resolution and --gradients"
             seconds = len(left) * (each + MEASURING_SECONDS) + PICTURE_SECONDS
-            watch.announce(f"about {duration(seconds)} here; {lower} change it", seconds)
+            watch.announce(f"about {duration(seconds)} here; {lower} change this", seconds)
 
     def _survey(self, judge: Survey, watch: Watch) -> dict[str, SurveyedSlice]:
         from ..landscapes.measures.census import SurveyedSlice
@@ -262,7 +262,7 @@ class CensusJob(CheckpointedJob["Census"]):
         return {name: SurveyedSlice.of_arrays(arrays) for name, arrays in pieces.items() if arrays is not None}
 
     def _do(self, tasks: Sequence[Task], judge: Survey) -> Iterator[tuple[str, Mapping[str, Any]]]:
-        """Survey slices, here or by workers, so many abreast as fill a batch, and yield what each one's piece holds."""
+        """Survey slices, here or by workers, enough at once to fill a batch, and yield the arrays of each piece."""
         workers = workers_of(self.executor) if self.executor else 1
         for other in (False, True):
             env = self.other if other else self.env

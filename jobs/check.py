@@ -1,4 +1,4 @@
-"""The checks of an environment: what every objective owes, and the variants that its own options and settings allow."""
+"""The checks of an environment: those of every objective, and variants by its own options and settings."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def _materials(job: CheckJob) -> list[ExtremeCase]:
     space = job.env.space
     stiff = [space.names.index(name) for name in job.env.stiffness_parameters]
     if not stiff:
-        return [ExtremeCase("softest and stiffest", why="it offers no stiffness to set")]
+        return [ExtremeCase("softest and stiffest", why="it has no stiffness to set")]
     found = []
     for name, bound in (("softest", space.lower), ("stiffest", space.upper)):
         x = space.center[None].clone()
@@ -67,9 +67,9 @@ def _materials(job: CheckJob) -> list[ExtremeCase]:
 
 @dataclass(frozen=True)
 class CheckReport:
-    """Hold what was found of an environment; fields are called as `landscape check --json` has them.
+    """Record the findings of a check, with the field names of `landscape check --json`.
 
-    `kinds` counts the random points by how their gradients compare with differences, those alone that occur.
+    `kinds` counts the random points by how their gradients compare with finite differences, without empty kinds.
     """
 
     env: str
@@ -90,19 +90,19 @@ class CheckReport:
     kinds: dict[Kind, int] = field(default_factory=dict)
 
     def record(self) -> dict[str, Any]:
-        """Return it as plain JSON, which knows no infinity; findings are its `checks`."""
+        """Return it as plain JSON, which has no infinity; the findings are its `checks`."""
         found: dict[str, Any] = to_json(vars(self))
         return found | {"checks": [one | {"numbers": one["numbers"] or {}} for one in found.pop("findings")]}
 
     def table(self) -> pd.DataFrame:
-        """Return a row for each check, indexed by `check`: its `outcome`, its `figure` and `why`."""
+        """Return a table with a row for each check, indexed by `check`: its `outcome`, its `figure` and `why`."""
         import pandas as pd
 
         rows = [(one.check, one.outcome, one.figure, one.why) for one in self.findings]
         return pd.DataFrame(rows, columns=["check", "outcome", "figure", "why"]).set_index("check")
 
     def parameter_table(self) -> pd.DataFrame:
-        """Return a row for each parameter: `zero`, `ratio` to the slope over a hundredth of the box, `verdict`."""
+        """Return a table of parameters: `zero`, `ratio` to the slope over a hundredth of the box, `verdict`."""
         import pandas as pd
 
         rows = [asdict(row) for row in self.parameters]
@@ -114,7 +114,7 @@ class CheckReport:
         return str(self.table().to_html())
 
     def plot(self, width: float | None = None) -> Picture:
-        """Draw over which steps gradients say how the loss changes; `width` is that of a page for print [mm]."""
+        """Draw over which steps gradients predict the change of the loss; `width` is for print [mm]."""
         from ..landscapes.draw.figure import figure_of
 
         return figure_of(self, width)
@@ -172,7 +172,7 @@ class CheckJob:
                 count += 1
                 yield finding
         except KeyboardInterrupt as error:
-            raise Stopped(f"{count} checks are done, and nothing is kept of them", kept=False) from error
+            raise Stopped(f"{count} checks were done, but nothing is kept", kept=False) from error
 
     def run(self, watch: Watch | None = None) -> CheckReport:
         """Check it and return all that was found. Raises Stopped where it is interrupted."""
@@ -266,7 +266,7 @@ class CheckJob:
         subject = f"{env.name} · {env.fidelity.name} · {env.device} · {env.engine} · {points_for(self.power)} points"
         if env.precision != env.fidelity.precision:
             subject += f" · its losses are {env.precision}"
-        whole = f"{subject}: some {plain} episodes and {sloped} with gradients, about {duration(seconds)}"
+        whole = f"{subject}: about {plain} episodes and {sloped} with gradients, in about {duration(seconds)}"
         return whole + (f", {duration(compiling)} of it to compile variants" if compiling else ""), seconds
 
     def _compiling_seconds(self) -> float:
@@ -297,7 +297,7 @@ class CheckFolder(Job[CheckReport]):
 
     def holding(self, watch: Watch) -> AbstractContextManager[None]:
         """Let a full disk end it; a check that is stopped begins again."""
-        return until_full(lambda: "nothing of the check is kept")
+        return until_full(lambda: "the check is not saved")
 
     def record(self, found: CheckReport) -> Any:
         """Return what is written of it, with what was checked."""
@@ -337,7 +337,7 @@ def _time_steps(job: CheckJob) -> list[ExtremeCase]:
     for factor in FACTORS:
         dt = job.env.nearest_dt(factor * job.env.fidelity.dt)
         if dt in taken:
-            why = f"the nearest step that fits into a control step is that of dt {taken[dt]}x"
+            why = f"the nearest step that fits into a control step is the same as for dt {taken[dt]}x"
             found.append(ExtremeCase(f"dt {factor}x", why=why))
         else:
             found.append(_time_step(job, factor, dt))
@@ -392,7 +392,7 @@ def _horizons(job: CheckJob) -> list[ExtremeCase]:
     from ..landscapes.checks.extremes import ExtremeCase
 
     if not job.longer:
-        return [ExtremeCase("horizon 1x to 8x", why="no setting says how long an episode is")]
+        return [ExtremeCase("horizon 1x to 8x", why="no setting controls how long an episode is")]
     return [ExtremeCase(f"horizon {factor}x", make) for factor, make in job.longer.items()]
 
 
@@ -418,4 +418,4 @@ def _other_mode(job: CheckJob) -> Callable[[], Environment] | None:
 
 
 def _refuse_forward(dim: int) -> Environment:
-    raise ValueError(f"forward differentiation takes as many tangents as parameters; {dim} are too many to try")
+    raise ValueError(f"forward differentiation takes one tangent per parameter; {dim} are too many to try")

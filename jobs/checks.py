@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class CheckReports:
-    """Hold the reports of several environments, in their order, and by name why others could not be checked."""
+    """Record the reports of several environments, in order, and the reasons why others could not be checked."""
 
     derived: ClassVar = ("passed",)
 
@@ -40,7 +40,7 @@ class CheckReports:
         return not self.failed and all(report.passed for report in self.reports)
 
     def table(self) -> pd.DataFrame:
-        """Return a row for each environment, indexed by `env`: `passed`, and `said`, the first of what is wrong."""
+        """Return a table with a row for each environment, indexed by `env`: `passed`, and `said`, the first problem."""
         import pandas as pd
 
         rows = [(one.env, one.passed, sum_up(one)) for one in self.reports]
@@ -86,7 +86,7 @@ class ChecksJob:
         except KeyboardInterrupt as stop:
             done = len(found) + len(failed)
             raise Stopped(
-                f"{done} of {len(self.specs)} environments are checked, and nothing is kept of them", kept=False
+                f"{done} of {len(self.specs)} environments were checked, but nothing is kept", kept=False
             ) from stop
         names = {number: _name(self.specs[number]) for number in sorted(failed)}
         return CheckReports(

@@ -1,4 +1,4 @@
-"""Two slices of one plane to compare, of which the second may have to be sampled first."""
+"""Two slices of one plane to compare; the second is sampled first if it does not exist."""
 
 from __future__ import annotations
 

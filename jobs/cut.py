@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from ..landscapes.space import ParameterSpace
     from ..landscapes.training import Training
 
-ONE_OF = "a slice takes --dims, one or two parameters, or --along, directions; give one of them"
+ONE_OF = "a slice takes either --dims (one or two parameters) or --along (directions); give one of them"
 PCA = "pca"
 WORDS = ("center", "example", "random", "best")  # that names of points begin with
 REACH, MIN_WIDTH = 0.5, 1e-3  # of a width of the box: how far a slice reaches, and what is no width for one
@@ -28,15 +28,15 @@ REACH_PER_ROOT = 1 / 8  # the same by the root of how many parameters there are:
 
 @dataclass(frozen=True)
 class PlaneSpec:
-    """Say where a landscape is cut: along one or two parameters, `dims`, or `along` directions that are named.
+    """Record where a landscape is cut: along one or two parameters, `dims`, or `along` named directions.
 
     Directions are random:SEED, gradient, hessian, pca:RUN, A:B or A:B:C, in widths of the box; filters:SEED, in norms
-    of the point's filters; or training:FOLDER. Points of a line or a plane are named as those it goes `through`. By
-    default a cut along parameters covers the box; one along directions reaches half a width to each side of the point,
-    and farther where there are more than sixteen parameters; one along filters reaches one norm. Where there are no
-    more than two parameters and neither is given, it varies all.
+    of the point's filters; or training:FOLDER. The points A, B and C are named like the point it goes `through`. By
+    default a cut along parameters covers the box. A cut along directions reaches half a width to each side of the
+    point, and farther with more than sixteen parameters. A cut along filters reaches one norm. With at most two
+    parameters and neither option, it varies all.
 
-    Raises ValueError for parameters beside directions, and for a word that names no directions.
+    Raises ValueError for parameters together with directions, and for a word that does not name directions.
     """
 
     dims: Sequence[int | str] | None
@@ -87,9 +87,7 @@ class PlaneSpec:
         """
         through, window = self.through, self.window
         if not isinstance(through, str) and any(isinstance(one, str) for one in through):
-            raise ValueError(
-                f"a slice goes through one point here; got {len(through)} names, so ask for each by itself"
-            )
+            raise ValueError(f"a slice goes through one point here; got {len(through)} names, so make a slice for each")
         chosen = list(self.dims) if self.dims is not None else []
         if not chosen and self.along is None and objective.space.dim <= 2:
             chosen = list(range(objective.space.dim))
@@ -99,7 +97,7 @@ class PlaneSpec:
             return plane_through(objective, chosen, through=through, window=window, resolution=self.resolution)
         if not isinstance(self.resolution, int):
             raise ValueError(
-                f"a slice along {self.along} takes one resolution for its axes; got {list(self.resolution)}"
+                f"a slice along {self.along} takes one resolution for all axes; got {list(self.resolution)}"
             )
         if kept is not None and self.cut is not None:
             from .slice import kept_plane
@@ -126,7 +124,7 @@ def _plane_along(
     kind, value = ("", "") if names else _check_directions(along)
     elsewhere = window is not None or not isinstance(through, str) or through != "center"
     if (names or kind in (PCA, TRAINED)) and elsewhere:
-        raise ValueError(f"--along {along} says where it goes; leave out --through and --window")
+        raise ValueError(f"--along {along} fixes the plane; leave out --through and --window")
     if names:
         return find.joining(space, [named_point(objective, name) for name in names], names, resolution)
     if kind == PCA:
@@ -159,7 +157,7 @@ def _check_directions(along: str) -> tuple[str, str]:
     if kind == PCA and not value:
         raise ValueError("--along pca:RUN takes the folder of a run or of a race; got no folder")
     if kind == TRAINED and not Path(value or "none").is_dir():
-        raise ValueError(f"--along training:FOLDER takes the folder of a training's checkpoints; got {value!r}")
+        raise ValueError(f"--along training:FOLDER takes a folder with checkpoints of a training; got {value!r}")
     seeded = kind in ("random", FILTERS) and value.isdecimal()
     if not (along in ("gradient", "hessian") or kind in (PCA, TRAINED) or seeded):
         raise ValueError(

@@ -32,7 +32,7 @@ SMALL_LOSS = 28  # of a small film: x264's constant rate factor
 
 @dataclass(frozen=True)
 class EpisodeRecord:
-    """Say what was drawn and how it came about, as `episode.json` has it; `loss` is None where the episode failed."""
+    """Record the drawn episode and its origin, as in `episode.json`; `loss` is None if the episode failed."""
 
     identity: dict[str, Any]
     provenance: dict[str, Any]
@@ -43,7 +43,7 @@ class EpisodeRecord:
 
 @dataclass(frozen=True)
 class EpisodeSummary:
-    """Say what was drawn, what came out, and which files there are."""
+    """Record the drawn episode, its outcome, and the files."""
 
     title: str
     outcome: str
@@ -93,12 +93,12 @@ class EpisodeJob(Job[EpisodeSummary]):
 
         Raises ValueError where the environment has no episodes to draw.
         """
-        with watch.busy(f"{self.env.name}: simulating (kernels are compiled once, then kept)"):
+        with watch.busy(f"{self.env.name}: simulating (kernels are compiled once, then cached)"):
             episode = self.env.episode(self.x)
             result = self.env.evaluate(self.x[None], grad=False)
         loss, status = float(result.loss[0]), Status(int(result.status[0]))
         caption = self._caption(loss, status)
-        watch.note(f"{caption.title}: {len(episode.time)} instants to draw{', and to film' if self.film else ''}")
+        watch.note(f"{caption.title}: {len(episode.time)} frames to draw{' and film' if self.film else ''}")
         with watch.busy(f"{self.env.name}: drawing"):
             files = self._draw_episode(episode, caption)
         return EpisodeSummary(caption.title, caption.outcome, self._describe(loss, status), [*files, RECORD])

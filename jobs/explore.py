@@ -1,4 +1,4 @@
-"""Explore a landscape: a plane that is sampled while somebody looks at it, episodes and descents at its points."""
+"""Explore a landscape: a plane that is sampled while the user looks at it, with episodes and descents at its points."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class _SpentError(Exception):
 
 @dataclass(frozen=True)
 class Look:
-    """Say where somebody looks: the parameters that vary, by number, and the point in the unit cube."""
+    """Record what the user looks at: the parameters that vary, by number, and the point in the unit cube."""
 
     dims: tuple[int, int]
     at: tuple[float, ...]
@@ -60,11 +60,12 @@ class Look:
 
 @dataclass(frozen=True)
 class Seen:
-    """Hold what is to be seen of a look: the picture so far, by its number, and how many points are sampled.
+    """Record the state of a `look`: the picture so far, by its number, and how many points are sampled.
 
-    `slice` is None before the first picture. No finer picture follows a `complete` one; `error` says what raised.
+    `slice` is None before the first picture. A `complete` picture is the finest. `error` is the message of an error.
     """
 
+    look: Look
     number: int
     done: int
     total: int
@@ -75,9 +76,9 @@ class Seen:
 
 @dataclass(frozen=True)
 class Film:
-    """Hold what an episode was like: its loss and status, and links that hold a film and a picture of its end.
+    """Record an episode: its loss and status, and data links with a film and a picture of its end.
 
-    Where it has none, they are None, and `said` says so.
+    Without episodes to draw, the links are None, and `said` says so.
     """
 
     loss: float
@@ -89,7 +90,7 @@ class Film:
 
 @dataclass(frozen=True)
 class Descent:
-    """Hold a descent as the map draws it, its end in the unit cube, and its loss there, None where it has none."""
+    """Record a descent as the map draws it, its end in the unit cube, and the loss there, None if it has none."""
 
     run: Trajectory
     end: list[float] | None
@@ -98,7 +99,7 @@ class Descent:
 
 @dataclass(frozen=True)
 class KeptSlice:
-    """Say where a plane is kept as a slice, in which files, and which command makes it again."""
+    """Record the folder and the files of a saved slice, and the command that makes it again."""
 
     folder: str
     files: list[str]
@@ -106,7 +107,7 @@ class KeptSlice:
 
 
 class Exploration:
-    """Sample the plane that is looked at, coarse to fine, in a thread of its own, which does all else between tiles.
+    """Sample the current plane, coarse to fine, in a separate thread, which does other tasks between tiles.
 
     `command` made it; `root` is the folder in which slices are kept.
     """
@@ -114,13 +115,13 @@ class Exploration:
     def __init__(self, env: Environment, dims: Sequence[int | str], command: str, root: Path) -> None:
         """Begin to look along two parameters through the centre of the box. Raises ValueError where there are none."""
         if env.space.dim < 2:
-            raise ValueError(f"an exploration takes two parameters and more; {env.name} has one")
+            raise ValueError(f"explore takes an environment with at least two parameters; {env.name} has one")
         numbers = tuple(env.space.index(one) for one in dims)
         if len(numbers) != 2 or numbers[0] == numbers[1]:
-            raise ValueError(f"an exploration varies two different parameters; got {', '.join(map(str, dims))}")
+            raise ValueError(f"explore varies two different parameters; got {', '.join(map(str, dims))}")
         self.env, self.command, self.root = env, command, root
         self.look = Look(numbers, tuple([0.5] * env.space.dim))
-        self.seen = Seen(0, 0, SIDE**2)
+        self.seen = Seen(self.look, 0, 0, SIDE**2)
         self._tasks = SimpleQueue[tuple[Callable[[], Any], Future[Any]]]()
         self._changed, self._closed, self._descents = Condition(), False, 0
         self._sampled: Look | None = None  # or being sampled
@@ -140,11 +141,11 @@ class Exploration:
         if len(look.at) != len(numbers) or not all(0 <= one <= 1 for one in look.at):
             raise ValueError(f"a point has {len(numbers)} numbers from 0 to 1; got {list(look.at)[:8]}")
         if not all(one in numbers for one in look.dims) or look.dims[0] == look.dims[1]:
-            raise ValueError(f"two different parameters vary, of {len(numbers)}; got {list(look.dims)}")
+            raise ValueError(f"explore varies two different parameters of {len(numbers)}; got {list(look.dims)}")
         with self._changed:
             if look != self.look:
                 self.look = look
-                self.seen = Seen(self.seen.number + 1, 0, SIDE**2)
+                self.seen = Seen(look, self.seen.number + 1, 0, SIDE**2)
                 self._changed.notify_all()
 
     def wait(self, number: int) -> Seen:
@@ -234,7 +235,7 @@ class Exploration:
                 return
             number = self.seen.number + (picture is not None or complete)
             shown = self.seen.slice if picture is None else picture
-            self.seen = Seen(number, done, SIDE**2, shown, complete, error)
+            self.seen = Seen(look, number, done, SIDE**2, shown, complete, error)
             self._changed.notify_all()
 
     def plane(self, look: Look) -> Plane:

@@ -28,9 +28,9 @@ POLICY = "; ".join(  # of the page: it holds its scripts, and asks nobody but th
 
 
 class Explorer:
-    """A page of this machine that samples a landscape as one looks at it; `address` is where a browser finds it.
+    """A local page that samples a landscape while you look at it; `address` is its address for a browser.
 
-    A notebook shows the page. `close` ends it, and so does the end of the program.
+    A notebook shows the page. `close` ends it, and it also ends with the program.
     """
 
     def __init__(self, exploration: Exploration, port: int) -> None:
@@ -43,14 +43,14 @@ class Explorer:
         self._thread.start()
 
     def close(self) -> None:
-        """Serve the page no longer."""
+        """Stop serving the page."""
         self.exploration.close()
         if self._thread.is_alive():
             self._server.shutdown()
         self._server.server_close()
 
     def wait(self) -> None:
-        """Wait until the page is served no longer."""
+        """Wait until the page is no longer served."""
         while self._thread.is_alive():
             self._thread.join(1.0)
 
@@ -70,7 +70,7 @@ class Explorer:
     def answer(self, question: str, asked: Mapping[str, Any]) -> Any:
         """Answer the page, in plain JSON.
 
-        Raises ValueError for what it cannot ask, and KeyError for a question that there is not.
+        Raises ValueError for an invalid request, and KeyError for an unknown one.
         """
         exploration = self.exploration
         if question == "look":
@@ -93,7 +93,7 @@ class Explorer:
 
 
 class ExplorerHandler(LoopbackHandler):
-    """Answer whoever knows the token: the page by GET, what it asks by POST."""
+    """Answer clients that know the token: GET returns the page, POST answers its requests."""
 
     def __init__(self, *given: Any, explorer: Explorer) -> None:
         """Answer a request to an explorer."""
@@ -123,7 +123,7 @@ class ExplorerHandler(LoopbackHandler):
             asked = json.loads(self.rfile.read(int(length)))
             found, status = self.explorer.answer(self.path.strip("/"), asked), HTTPStatus.OK
         except (KeyError, TypeError, IndexError):
-            found, status = {"error": f"the explorer has no such question: {self.path}"}, HTTPStatus.BAD_REQUEST
+            found, status = {"error": f"the explorer has no such request: {self.path}"}, HTTPStatus.BAD_REQUEST
         except Exception as error:  # of a simulator, which may raise anything: the page says it
             found, status = {"error": f"{type(error).__name__}: {error}"}, HTTPStatus.BAD_REQUEST
         self._send(status, json.dumps(found).encode(), "application/json")

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Export:
-    """Say what was written where: so many `rows` of a `kind`, of which some may be `missing` so far."""
+    """Record the file that was written: `rows` of a `kind`, of which `missing` are not sampled yet."""
 
     path: Path
     kind: str
@@ -61,4 +61,6 @@ def open_results(path: Path) -> tuple[xr.Dataset, Path]:
         return open_slice(slice_), finished_path(slice_)
     if is_run(run) or run != path:
         return RunStore.open(run).dataset(), run
-    raise ValueError(f"{path} is no slice and no run; give the folder that `landscape slice` or `optimize` left")
+    raise ValueError(
+        f"{path} is neither a slice nor a run; give the folder that `landscape slice` or `landscape optimize` wrote"
+    )

@@ -34,7 +34,7 @@ def features_of(env: Environment, seed: int, watch: Watch) -> Features:
     memory = peak_memory() + need_of(dim).memory + env.memory() * env.preferred_batch
     watch.announce(
         f"{env.name} · features over all {dim} parameters: {losses} episodes and {gradients} with gradients: "
-        f"about {duration(seconds)}, and {duration(own_seconds(dim))} to measure them; {size(memory)} of memory",
+        f"about {duration(seconds)}, plus {duration(own_seconds(dim))} to measure them; {size(memory)} of memory",
         seconds + own_seconds(dim),
     )
     with watch.progress(losses + gradients, "episodes of features") as advance:

@@ -25,10 +25,10 @@ ROOT = Path("out")  # where results go that are given no folder
 
 @dataclass(frozen=True)
 class Results:
-    """Say what a kind of result is called, and which files it leaves in its folder.
+    """Record the name of a kind of result, and the files that it leaves in its folder.
 
-    `store` is what others read of it, without which a folder of other files is none of it. `picture` is the one that is
-    also drawn for print, in files named after it.
+    `store` holds the data: a folder with other files but without the store is not of this kind. `picture` is also drawn
+    for print, in files named after it.
     """
 
     kind: str
@@ -86,7 +86,7 @@ CENSUS = Results("census", ("census.json", "census.npz", "census.png"), "census.
 
 
 def folder_named(parts: Iterable[object], settings: Any, root: Path = ROOT) -> Path:
-    """Return a folder of its own for all different settings, the same for the same ones, named after `parts`."""
+    """Return a folder named after `parts`, unique for these settings and always the same for them."""
     return root / "-".join([*(plain_name(str(part)) for part in parts), digest(settings)])
 
 
@@ -109,5 +109,5 @@ def run_tables(paths: Sequence[str]) -> list[xr.Dataset]:
             found = members
         tables += [RunStore.open(store).dataset() for store in found]
     if not any(table.sizes["evaluation"] for table in tables):
-        raise ValueError(f"{', '.join(paths)}: there are no episodes yet; `landscape optimize` evaluates them")
+        raise ValueError(f"{', '.join(paths)}: the runs have no episodes yet; `landscape optimize` evaluates them")
     return [table for table in tables if table.sizes["evaluation"]]

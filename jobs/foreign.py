@@ -1,4 +1,4 @@
-"""What is laid over a slice: runs and races on disk, runs in memory, and points that other programs evaluated."""
+"""Points to lay over a slice: runs and races on disk, runs in memory, and points that other programs evaluated."""
 
 from __future__ import annotations
 
@@ -39,8 +39,8 @@ def tables_over(slice: Slice, given: Sequence[Any], watch: Watch | None = None) 
     for one in runs:
         if not isinstance(getattr(one, "data", None), xr.Dataset):
             raise ValueError(
-                "what is laid over a slice are runs, their folders, CSV and Parquet files, pandas tables, Optuna's "
-                f"studies and Ax's experiments; got {one!r}"
+                "overlay takes runs, their folders, CSV and Parquet files, pandas tables, Optuna studies and Ax "
+                f"experiments; got {one!r}"
             )
     found = [*(run_tables(paths) if paths else []), *(run.data for run in runs if run.data.sizes["evaluation"])]
     if tables:
@@ -49,7 +49,7 @@ def tables_over(slice: Slice, given: Sequence[Any], watch: Watch | None = None) 
             frame, name = _frame(one, note := (watch or Watch()).note)
             found.append(points_table(frame, slice.data, space, name, note=note))
     if not found:
-        raise ValueError("there are no episodes yet in these runs; `gradscape.optimize` evaluates them")
+        raise ValueError("these runs have no episodes yet; `gradscape.optimize` evaluates them")
     return found
 
 

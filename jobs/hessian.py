@@ -162,7 +162,7 @@ class HessianJob(CheckpointedJob[Hessian]):
             each = simulation_seconds(env, work.losses, work.gradients, env.preferred_batch)
         dim, seconds = env.space.dim, each + PICTURE_SECONDS
         how = "the whole matrix" if not self.has_gradients or dim <= MATRIX else "products with the matrix"
-        lower = "" if dim <= MATRIX else "; --probes and --eigenpairs lower it"
+        lower = "" if dim <= MATRIX else "; --probes and --eigenpairs lower this"
         watch.announce(
             f"{how} of {dim} parameters: at most {work.losses + work.gradients} episodes, {work.gradients} with "
             f"gradients, about {duration(seconds)}{lower}",

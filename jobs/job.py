@@ -1,4 +1,4 @@
-"""What every job that leaves results in a folder does: it can be stopped, continued, watched and written down."""
+"""The base of every job with results in a folder: it can be stopped, continued and watched, and writes its results."""
 
 from __future__ import annotations
 
@@ -46,8 +46,8 @@ class Job(abc.ABC, Generic[Found]):
         """Say what is left and what it costs, compute it and return what was found."""
 
     def kept(self) -> str:
-        """Say how much of it is on disk, by default that no file is half written."""
-        return f"each file in {self.folder} is whole"
+        """Say how much of it is on disk; the default says that no file is half written."""
+        return f"every file in {self.folder} is complete"
 
     def work(self) -> Iterable[Work]:
         """Return what it has to simulate."""
@@ -134,7 +134,7 @@ class CheckpointedJob(Job[Found]):
         return f"{self.checkpoint.count()} batches are kept in {self.folder}"
 
     def holding(self, watch: Watch) -> AbstractContextManager[None]:
-        """Hold the folder, and verify what simulates against what the checkpoint began with."""
+        """Lock the folder, and verify that the simulator still gives the numbers in the checkpoint."""
         return self._going_on(watch)
 
     @contextmanager
@@ -161,7 +161,7 @@ def filling(
     watch: Watch,
     leave: Callable[[], object] = lambda: None,
 ) -> Iterator[None]:
-    """Hold a folder of runs, after another process that fills it, verify the runs, and let torch use one core.
+    """Lock a folder of runs, waiting for another process that fills it, verify the runs, and let torch use one core.
 
     Three points of a single run are evaluated again, one of each of several, in one batch. Raises StoreMismatchError
     where the objective gives other numbers than they hold, and as `resumable` does.

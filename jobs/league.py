@@ -55,10 +55,10 @@ class LeagueScene:
         name, known = _known_fidelities(scene)
         fidelity = scene.fidelity or next(iter(known), "")
         if not isinstance(fidelity, str):
-            raise ValueError(f"a league takes fidelities by their names; got {fidelity!r} for {name}")
+            raise ValueError(f"league takes fidelities by name; got {fidelity!r} for {name}")
         if known and fidelity not in known:
             raise ValueError(
-                f"{name} has fidelities {', '.join(known)}; got {fidelity!r}, so ask for {name}{AT}{known[0]}"
+                f"{name} has fidelities {', '.join(known)}; got {fidelity!r}, so use for example {name}{AT}{known[0]}"
             )
         chosen = replace(scene, fidelity=fidelity or None)
         return cls(chosen, name, fidelity, league / "-".join([name, fidelity] if fidelity else [name]))
@@ -78,8 +78,8 @@ class LeagueScene:
 class LeagueJob(Job[League]):
     """A league to run: the same `methods`, `seeds` and `budget` in every one of the `scenes`.
 
-    Methods compute in so many processes, `workers`; with an `executor` its workers search instead. `claims` are held
-    against the races, by scene.
+    Methods compute in so many processes, `workers`; with an `executor` its workers search instead. `claims` are the
+    paper's, by scene, to compare with the races.
     """
 
     results = LEAGUE
@@ -118,7 +118,8 @@ class LeagueJob(Job[League]):
         raced = [LeagueScene.of(scene, folder) for scene in scenes]
         names = [one.name for one in raced]
         if not raced or (twice := {name for name in names if names.count(name) > 1}):
-            raise ValueError(f"a league has scenes, each once; got {', '.join(sorted(twice)) if raced else 'none'}")
+            got = f"{', '.join(sorted(twice))} more than once" if raced else "none"
+            raise ValueError(f"league takes at least one scene, and each only once; got {got}")
         refuse_other_folder(folder, LEAGUE.kind, RECORD, f"*/*-*/{RUN_STORE}")
         named = check_methods(methods) or list(all_methods())
         require_runs(1, budget, seeds, folder, abreast=len(named))  # what the smallest scene takes, before any is made
@@ -172,7 +173,7 @@ class LeagueJob(Job[League]):
         env = scene.scene.make(watch)
         able, unable = divide_methods(env, self.methods, budget=self.budget)
         if not able:
-            raise ValueError(f"no method can search it here: {'; '.join(unable.values())}")
+            raise ValueError(f"no method can search {scene} here: {'; '.join(unable.values())}")
         job = RaceJob.of(
             env, able, budget=self.budget, seeds=self.seeds, command=self.command, out=scene.folder,
             claims=self.claims.get(env.name), workers=self.workers, force=self.force, prints=self.prints, watch=watch,
@@ -186,7 +187,7 @@ class LeagueJob(Job[League]):
         return f"{kept} of {whole} episodes are kept in {self.folder}"
 
     def forecast(self, scene: LeagueScene, watch: Watch) -> float:
-        """Say what is there of a scene and what is left, and return the seconds that it takes to simulate."""
+        """Say how many episodes of a scene are done, and return the seconds that the rest takes to simulate."""
         env = scene.scene.make(watch)
         able, unable = divide_methods(env, self.methods, budget=self.budget)
         kept = dict.fromkeys(able, 0) if self.force else scene.count_kept(able, self.seeds, self.budget)
@@ -194,8 +195,8 @@ class LeagueJob(Job[League]):
         left = {way: 0 for way in (0, 1)}
         for method in able:
             left[optimizer_class(method).needs_grad] += whole - kept[method]
-        without = "".join(f"\n  without {method}: {why}" for method, why in unable.items())
-        said = f"{scene} · {env.device}: {sum(kept.values())} of {whole * len(able)} episodes are there"
+        without = "".join(f"\n  {method} cannot run here: {why}" for method, why in unable.items())
+        said = f"{scene} · {env.device}: {sum(kept.values())} of {whole * len(able)} episodes are done"
         if not sum(left.values()):
             watch.note(said + without)
             return 0.0
@@ -203,11 +204,11 @@ class LeagueJob(Job[League]):
             episode_cost(env, grad=left[1] > 0)  # compiles, which is not to count
             runs = sum(count < whole for count in kept.values()) * self.seeds
             seconds = simulation_seconds(env, left[0], left[1], runs)
-        watch.note(f"{said}, the others take {duration(seconds)} to simulate{without}")
+        watch.note(f"{said}, the rest takes {duration(seconds)} to simulate{without}")
         return seconds
 
     def _announce(self, failed: dict[str, str], watch: Watch) -> None:
-        """Say of each scene how many episodes are there and what the others take to simulate, and the sum."""
+        """Say for each scene how many episodes are done and how long the rest takes, and the sum."""
         total = 0.0
         for scene in self.scenes:
             with self._leaving_out(scene, failed, watch):
@@ -215,7 +216,7 @@ class LeagueJob(Job[League]):
         racers = f"{len(self.methods)} methods, {self.seeds} seeds, {self.budget} episodes each"
         watch.note(
             f"{self.folder}: {len(self.scenes) - len(failed)} of {len(self.scenes)} scenes, {racers}: "
-            f"{duration(total)} of simulation are left, and what the methods take"
+            f"{duration(total)} of simulation left, plus the time of the methods"
         )
 
     @contextmanager

@@ -58,7 +58,7 @@ class OverlayPlane:
             raise ValueError(f"--plane takes pca, the runs' principal plane; got {plane!r}")
         if not (through or plane):
             if resolution:
-                raise ValueError("--resolution is that of a new slice; give --through or --plane too")
+                raise ValueError("--resolution is for a new slice; give --through or --plane, too")
             return None
         return cls(through, plane is not None, resolution)
 
@@ -92,7 +92,7 @@ class OverlayPlane:
 
 @dataclass(frozen=True)
 class OverlaySummary:
-    """Say what an overlay shows; `farthest` is how far a point lies off the plane at most [half-widths of the box]."""
+    """Record the content of an overlay; `farthest` is the largest distance from the plane [half-widths of the box]."""
 
     runs: int
     points: int
@@ -106,15 +106,15 @@ class OverlaySummary:
         """Say it in a line."""
         counted = f"{self.runs} run{'s' if self.runs > 1 else ''}, {self.points} points"
         skipped = f", {self.skipped} row{'s' if self.skipped > 1 else ''} skipped" if self.skipped else ""
-        where = f"{self.outside} beyond the map, {self.failed} failed{skipped}"
-        return f"{counted}: {where}; the farthest is {self.farthest:.2g} half-widths of the box off the plane"
+        where = f"{self.outside} outside the map, {self.failed} failed{skipped}"
+        return f"{counted}: {where}; the farthest point is {self.farthest:.2g} half-widths of the box from the plane"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Overlay:
-    """Hold runs laid over a slice: `runs` are their data with where each point lies, as `landscapes.overlay` adds it.
+    """Record runs over a slice: `runs` are their data, to which `landscapes.overlay` adds the position of each point.
 
-    `slice` is the one they lie over, which is a new one where one was cut for them; `files` lie in `folder`.
+    `slice` is the slice under them, or the new one that was sampled for them. `files` are in `folder`.
     """
 
     slice: Slice
@@ -124,7 +124,7 @@ class Overlay:
 
     @cached_property
     def summary(self) -> OverlaySummary:
-        """What the overlay shows, counted."""
+        """The numbers of runs and points in the overlay."""
         return OverlaySummary(
             runs=len(self.runs),
             points=sum(run.sizes["evaluation"] for run in self.runs),
@@ -136,7 +136,7 @@ class Overlay:
         )
 
     def plot(self, *, width: float | None = None) -> Picture:
-        """Draw the runs over the slice; the picture is matplotlib's figure, `width` is that of a page [mm]."""
+        """Draw the runs over the slice as a matplotlib figure; `width` is for print [mm]."""
         from ..landscapes.draw.figures.overlay import overlay_figure
 
         return overlay_figure(self.slice.data, self.runs, width=width)
@@ -236,7 +236,8 @@ def check_run(dataset: xr.Dataset, run: xr.Dataset, watch: Watch) -> None:
     refuse_other_landscape(dataset, run)
     ours, theirs, name = stored_identity(dataset), stored_identity(run), _name(run)
     if differ := [one for one in SHOULD if ours.get(one) != theirs.get(one)]:
-        settings = (f"{one} {ours.get(one)!r} there, {theirs.get(one)!r} here" for one in differ if one != "settings")
+        shown = [one for one in differ if one != "settings"]
+        settings = (f"{one} {ours.get(one)!r} of the slice, {theirs.get(one)!r} of the run" for one in shown)
         watch.note(
             f"warning: slice and run ({name}) are simulated differently ({'; '.join(settings)}), so losses differ"
         )
@@ -249,7 +250,7 @@ def refuse_other_landscape(dataset: xr.Dataset, run: xr.Dataset) -> None:
         if ours.get(setting) != theirs.get(setting):
             raise ValueError(
                 f"the slice and the run ({_name(run)}) are of different landscapes: {setting} is {ours.get(setting)!r} "
-                f"there and {theirs.get(setting)!r} here; lay runs over a slice of their own"
+                f"for the slice and {theirs.get(setting)!r} for the run; use a slice of the run's own landscape"
             )
 
 

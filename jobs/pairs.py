@@ -1,4 +1,4 @@
-"""The pairs of a scene's parameters, ranked by what a slice over them would show."""
+"""The pairs of a scene's parameters, ranked by how much a slice over them would show."""
 
 from __future__ import annotations
 
@@ -26,10 +26,11 @@ NUMBERS = 60  # that are held for each parameter of a base point, copies include
 
 @dataclass(frozen=True)
 class PairRanking:
-    """Hold the pairs of a scene's parameters, those with the largest score first.
+    """Record the pairs of a scene's parameters, with the largest score first.
 
-    `identity` decides the numbers, `options` are those that were given; `spread` is the standard deviation of the
-    losses, `total` each parameter's total sensitivity index, and `failed` how many of the `episodes` failed.
+    `identity` contains everything that decides the numbers, and `options` are those that were given. `spread` is the
+    standard deviation of the losses, `total` the total sensitivity index of each parameter, and `failed` the number of
+    `episodes` that failed.
     """
 
     identity: dict[str, Any]
@@ -68,7 +69,7 @@ class PairRanking:
         return " \N{MULTIPLICATION SIGN} ".join(self.parameters[axis] for axis in pair.dims)
 
     def table(self) -> pd.DataFrame:
-        """Return a row for each pair, the largest score first, with the pair's name and its measures."""
+        """Return a table of all pairs, the largest score first, with their names and measures."""
         import pandas as pd
 
         return pd.DataFrame([{"pair": self.name(pair), **asdict(pair)} for pair in self.pairs])
@@ -107,7 +108,7 @@ class PairsJob(CheckpointedJob[PairRanking]):
         env = scene.make()
         dim = env.space.dim
         if dim < 2:
-            raise ValueError(f"{env.name} has one parameter; a pair takes two")
+            raise ValueError(f"pairs takes an environment with at least two parameters; {env.name} has one")
         samples = samples or default_samples(dim)
         require("samples", samples, lambda count: Need(8.0 * NUMBERS * dim * count))
         identity = {**env.identity(), "samples": samples, "seed": seed}
@@ -155,6 +156,6 @@ class PairsJob(CheckpointedJob[PairRanking]):
         seconds = design.episodes * each
         watch.announce(
             f"{design.episodes} episodes, {samples} with gradients, for {dim} parameters and {dim * (dim - 1) // 2} "
-            f"pairs: at most about {duration(seconds)}; --samples lowers it",
+            f"pairs: at most about {duration(seconds)}; --samples lowers this",
             seconds,
         )

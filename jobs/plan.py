@@ -1,4 +1,4 @@
-"""What a job takes, by arithmetic: its episodes times what one takes here, and what its files take."""
+"""The cost of a job, by arithmetic: its episodes times the time of one, and the size of its files."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from .watch import PREPARING, Watch, Work
 if TYPE_CHECKING:
     from ..landscapes.objective import Objective
 
-MEASURED = "measured here, now"
+MEASURED = "measured now on this machine"
 
 
 @dataclass(frozen=True)
 class PlannedWork:
-    """Say what one objective's share of a job takes: seconds of an episode by kind, in all, and bytes.
+    """Record the cost of one objective's part of a job: seconds per episode of each kind, and bytes.
 
-    `rate` says where the seconds are from; `compiling` is what comes before the first episode [s], and `repeating` what
-    is done again to be timed [s].
+    `rate` says where the seconds come from. `compiling` is the time before the first episode [s], and `repeating` the
+    time of repetitions for timing [s].
     """
 
     env: str
@@ -41,16 +41,16 @@ class PlannedWork:
 
     @property
     def seconds(self) -> float:
-        """What all of it takes to compile and to simulate [s]."""
+        """The time to compile and simulate all of it [s]."""
         episodes = self.losses * self.seconds_per_loss + self.gradients * self.seconds_per_gradient
         return self.compiling + episodes + self.repeating
 
 
 @dataclass(frozen=True)
 class Plan:
-    """Say what a job takes on one device: episodes, seconds of simulation, bytes of memory and of disk.
+    """Record the cost of a job on one device: episodes, seconds of simulation, bytes of memory and of disk.
 
-    What search methods and pictures take themselves is not in it.
+    The time of search methods and pictures themselves is not included.
     """
 
     command: str
@@ -120,7 +120,7 @@ def _plan_part(work: Work, device: str | None) -> PlannedWork:
 
         variant, path = find_variant(as_environment(objective), device)
         kept = variant.comparison.seconds
-        each, rate = {False: kept.forward, True: kept.with_gradient}, f"kept in {path}"
+        each, rate = {False: kept.forward, True: kept.with_gradient}, f"stored in {path}"
     else:
         compiling = _compiling_seconds(objective, work)
         each = {grad: _seconds(objective, count, grad=grad) for grad, count in counts.items()}

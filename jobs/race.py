@@ -42,7 +42,7 @@ Options = Mapping[str, Mapping[str, Any]]  # method -> name -> value, which may 
 
 @dataclass(frozen=True, kw_only=True)
 class RaceJob(Job[Race]):
-    """A race to run, and to hold claims against; methods compute in so many processes, `workers`.
+    """A race to run and to compare with `claims`; methods compute in so many processes, `workers`.
 
     Its runs advance in lockstep, their proposals evaluated in one batch. With an `executor` its workers search instead,
     a share of the runs each. `best_known` is the least loss that is known from elsewhere, down to which targets go.
@@ -87,7 +87,7 @@ class RaceJob(Job[Race]):
         if not (methods := check_methods(methods)):
             methods, unable = divide_methods(env, budget=budget)
             for method, why in unable.items():
-                watch.note(f"without {method}: {why}")
+                watch.note(f"{method} cannot run here: {why}")
         # More methods, seeds or episodes continue in the same folder.
         texts = {method: {name: str(value) for name, value in chosen.items()} for method, chosen in options.items()}
         folder = out or folder_named(["race", env.name, env.fidelity.name], [env.identity(), texts])
@@ -110,7 +110,7 @@ class RaceJob(Job[Race]):
         if force:
             clear(folder, RACE.files, RACE.picture)
         if best_known is not None and not math.isfinite(best_known):
-            raise ValueError(f"the best known loss is a finite number; got {best_known}")
+            raise ValueError(f"--best-known takes a finite number; got {best_known}")
         return cls(
             env=env, competitors=competitors, budget=budget, options=options, claims=claims or Claims(),
             workers=workers, best_known=best_known, folder=folder, command=command, prints=prints,
@@ -223,12 +223,12 @@ class RaceJob(Job[Race]):
         whole = self.budget * len(self.competitors)
         racers = f"{', '.join(self.methods)}, {name_seeds(self.seeds)} each"
         if not any(left.values()):
-            watch.note(f"{racers}: all {whole} episodes are there already")
+            watch.note(f"{racers}: all {whole} episodes are done already")
             return None
         with watch.busy(f"{env.name}: {PREPARING}"):
             cost, seconds = self._cost(left)
         known = [one.run.gradient_cost for one in self.competitors if one.run.gradient_cost]
-        kept = f", {whole - sum(left.values())} are there already" if sum(left.values()) < whole else ""
+        kept = f", {whole - sum(left.values())} are done already" if sum(left.values()) < whole else ""
         watch.note(f"{racers}: {sum(left.values())} episodes to compute{kept}: {seconds}")
         return (known[0] if known else cost.ratio) if any(needs.values()) else None
 
@@ -242,10 +242,10 @@ class RaceJob(Job[Race]):
             (alone,) = run_tasks(self.executor, _cost_there, [(self._sent, grad)])
             whole = left[0] * alone.forward + (left[1] * alone.gradient if grad else 0.0)
             by = workers_of(self.executor)
-            return alone, f"{duration(whole)} one by one, by {by} workers, and what the methods take"
+            return alone, f"{duration(whole)} one by one, shared by {by} workers, plus the time of the methods"
         concurrent = sum(self._count_left(one) > 0 for one in self.competitors)
         seconds = simulation_seconds(self.env, left[0], left[1], concurrent)
-        return episode_cost(self.env, grad=grad), f"{duration(seconds)} to simulate, and what the methods take"
+        return episode_cost(self.env, grad=grad), f"{duration(seconds)} to simulate, plus the time of the methods"
 
     @cached_property
     def _needs_grad(self) -> dict[str, bool]:

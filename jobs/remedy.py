@@ -162,8 +162,8 @@ class RemedyJob(CheckpointedJob[RemedyStudy]):
             each = simulation_seconds(env, work.losses, work.gradients, env.preferred_batch)
         seconds = each + PICTURE_SECONDS
         watch.announce(
-            f"{len(self.names) - 1} remedies and none, {self.starts} descents each at the cost of {self.budget} "
-            f"gradients: at most {duration(seconds)}; --starts and --budget lower it",
+            f"{len(self.names) - 1} remedies and no remedy, {self.starts} descents each at the cost of {self.budget} "
+            f"gradients: at most {duration(seconds)}; --starts and --budget lower this",
             seconds,
         )
 

@@ -1,4 +1,4 @@
-"""What slices are like, in numbers and in words: a folder with a report of each, measured once and read again."""
+"""Reports of slices in numbers and in words: a folder for each, measured once and read again."""
 
 from __future__ import annotations
 
@@ -328,11 +328,11 @@ def _announce(env: Environment, dataset: xr.Dataset, points: int, watch: Watch) 
     with watch.busy(f"{env.name}: {PREPARING}"):
         seconds = simulation_seconds(env, losses, gradients, losses + gradients)
     episodes = env.memory() * env.preferred_batch
-    device = f", {size(episodes)} of the GPU's" if env.device == "cuda" else ""
+    device = f", {size(episodes)} of GPU memory" if env.device == "cuda" else ""
     memory = peak_memory() + own_bytes + need_of(rank, env.space.dim, points).memory + (0 if device else episodes)
     watch.announce(
         f"{env.name} · {env.fidelity.name} · {env.device}: up to {losses} episodes and {gradients} with gradients: "
-        f"about {duration(seconds)}, and {duration(own_seconds)} to measure {dataset['loss'].size} samples; "
+        f"about {duration(seconds)}, plus {duration(own_seconds)} to measure {dataset['loss'].size} samples; "
         f"{size(memory)} of memory{device}",
         seconds + own_seconds,
     )
@@ -348,12 +348,15 @@ def _open(subject: ReportedSlice) -> xr.Dataset:
     dataset = open_slice(subject.store)
     dataset = with_map(dataset, open_floor_map(subject.store, dataset))
     if "grad" not in dataset or min(dataset["loss"].shape) < 3:
-        raise ValueError(f"{subject.name}: report needs a slice with gradients and three samples per axis; got another")
+        got = " x ".join(map(str, dataset["loss"].shape)) + " samples" + " without gradients" * ("grad" not in dataset)
+        raise ValueError(
+            f"report takes a slice with gradients and at least three samples per axis; {subject.name} has {got}"
+        )
     missing = int((dataset["status"] == 0).sum())
     if missing or not is_finished(subject.store):
         raise ValueError(
             f"{subject.store} is not finished: {missing} of {dataset['status'].size} samples are missing or damaged; "
-            "run the command that samples the slice again first"
+            "first run the command again that samples the slice"
         )
     return sampled_lattice(dataset)
 
@@ -362,8 +365,8 @@ def _warn(subject: ReportedSlice, dataset: xr.Dataset, env: Environment, watch: 
     theirs, ours = stored_identity(dataset), env.identity()
     differ = [name for name in (MODEL_VERSION, "device") if theirs.get(name) != ours[name]]
     if differ:
-        said = "; ".join(f"{name} {theirs.get(name)} there, {ours[name]} here" for name in differ)
-        watch.note(f"warning: {subject.name} was sampled otherwise ({said}), so losses may differ")
+        said = "; ".join(f"{name} {theirs.get(name)} then, {ours[name]} now" for name in differ)
+        watch.note(f"warning: {subject.name} was sampled differently ({said}), so losses may differ")
 
 
 def growth_effort(env: Environment) -> int:
@@ -442,20 +445,20 @@ def _fetch(source: Path, folder: Path, key: ReportKey, watch: Watch) -> None:
         for file in [*files, *source.glob(ARRAYS)]:
             with replacing(folder / file.name) as partial:
                 shutil.copyfile(file, partial)
-        watch.note(f"{folder} is copied from {source}")
+        watch.note(f"{folder}: the report is copied from {source}")
 
 
 def _keep(folder: Path, key: ReportKey, device: str, watch: Watch) -> Report:
     """Return the report that is there, on whatever device it was measured; raise ValueError where it is another."""
     kept = Report.read(folder / RECORD)
     if differences := _differences(kept.key, key):
-        raise ValueError(f"{folder} holds another report ({differences}); write elsewhere with --out, or delete it")
+        raise ValueError(f"{folder} contains another report ({differences}); write elsewhere with --out, or delete it")
     _leave_measures(folder, kept)
     elsewhere = f", measured on {kept.device}" if kept.device != device else ""
-    watch.note(f"{folder} is there already{elsewhere}")
+    watch.note(f"{folder}: the report exists already{elsewhere}")
     if (theirs := kept.key.model_version) != (ours := key.model_version):
         said = f"{kept.env} model {theirs}; this is model {ours}"
-        watch.note(f"warning: it was measured by {said}. Delete the folder to measure it again")
+        watch.note(f"warning: the report was measured by {said}. Delete the folder to measure it again")
     return kept
 
 
@@ -464,7 +467,7 @@ def _differences(theirs: ReportKey, ours: ReportKey) -> str:
     differ = {name: (getattr(theirs, name), one) for name, one in vars(ours).items() if getattr(theirs, name) != one}
     if set(differ) <= {MODEL_VERSION}:
         return ""
-    return ", ".join(f"{name} {there} there, {here} here" for name, (there, here) in differ.items())
+    return ", ".join(f"{name} {there} there, {here} now" for name, (there, here) in differ.items())
 
 
 def _check(folder: Path, single: bool) -> None:
@@ -487,13 +490,13 @@ def _check_summary(folder: Path) -> None:
         ours = False
     if not ours:
         raise ValueError(
-            f"{path} is not there, damaged or of something else than several slices, so that it and {TABLE} are not "
-            "replaced; move both away, or give --out a new or an empty folder"
+            f"{path} is missing, damaged or not a summary of several slices, so report does not replace it or {TABLE}; "
+            "move both away, or give --out a new or an empty folder"
         )
 
 
 class Quoted(Protocol):
-    """What the paper says of an environment's landscape: words of `verdict.WORDS`, and where it says them."""
+    """The paper's words for an environment's landscape, from `verdict.WORDS`, and where the paper uses them."""
 
     @property
     def words(self) -> tuple[str, ...]: ...  # noqa: D102
@@ -504,7 +507,7 @@ class Quoted(Protocol):
 
 @dataclass(frozen=True)
 class PaperWords:
-    """The paper's words for a landscape, and where it says them."""
+    """The paper's words for a landscape, and where the paper uses them."""
 
     words: tuple[QuotedWord, ...]
     where: str
@@ -522,11 +525,11 @@ class ReportKey:
 
 @dataclass(frozen=True)
 class Report:
-    """Hold what was measured of a slice, as `report.json` has it.
+    """Record the measures of a slice, as in `report.json`.
 
-    `paper` has the words that the paper has for the scene, None where it has none, and `seconds` is what the measuring
-    took. `features` are those over all parameters, None where nobody asked for them. `folder` is where its files are,
-    and `store` the slice's.
+    `paper` contains the paper's words for the scene, None if it has none. `seconds` is the time of the measurement.
+    `features` are those over all parameters, None unless requested. `folder` contains the report's files, and `store`
+    is the slice's store.
     """
 
     name: str
@@ -545,10 +548,10 @@ class Report:
 
     @classmethod
     def read(cls, path: Path) -> Report:
-        """Read `report.json`, or that of a folder.
+        """Read `report.json`, by its path or its folder.
 
-        Raises DamagedError, which names the file and says what to do, where not all of it can be shown, and
-        FileNotFoundError.
+        Raises DamagedError, which names the file and says what to do, if it cannot be read completely, and
+        FileNotFoundError if there is none.
         """
         path = path / RECORD if path.is_dir() else path
         with reading(path, "delete it, and the same command measures the slice again"):
@@ -561,11 +564,11 @@ class Report:
 
     @property
     def measures(self) -> dict[str, str]:
-        """The chief numbers by short names, with 95 % intervals, as a page shows them."""
+        """The main numbers by short names, with 95 % intervals, as a page shows them."""
         return self.profile.measures
 
     def verdict_lines(self) -> list[str]:
-        """Return each word with its reason, what is not resolved, and whether the paper has the words, a line each."""
+        """Return each word with its reason, what is not resolved, and which of the paper's words were measured."""
         verdict = self.profile.verdict
         lines = [f"{word}: {verdict.reasons[word]}" for word in self.words]
         lines += [*verdict.open, *verdict.lines]
@@ -575,20 +578,20 @@ class Report:
         return lines
 
     def table(self) -> pd.DataFrame:
-        """Return the chief numbers, a row each, indexed by `measure`, with the column `value` as text."""
+        """Return a table of the main numbers, indexed by `measure`, with the column `value` as text."""
         import pandas as pd
 
         return pd.DataFrame({"value": self.measures}).rename_axis("measure")
 
     def plot(self, width: float | None = None) -> Picture:
-        """Draw gradient quality over the slice, for a screen, or for a page so wide [mm].
+        """Draw gradient quality over the slice, for a screen, or for print with this `width` [mm].
 
-        Raises ValueError where its files do not hold what it is drawn from.
+        Raises ValueError if its files do not contain the data of the picture.
         """
         return self.picture()(width=width)
 
     def picture(self) -> Callable[..., Picture]:
-        """Read what it is drawn from, and return what draws it, for any width. Raises ValueError as `plot` does."""
+        """Read the data of the picture, and return a function that draws it. Raises ValueError as `plot` does."""
         from ..landscapes.draw.figures.quality import quality_figure
         from ..landscapes.lattice import sampled_lattice
         from ..landscapes.measures.gradient_quality import GradientQuality, compare_samples
@@ -597,7 +600,8 @@ class Report:
 
         if self.folder is None or self.store is None or not (self.folder / ARRAYS).exists():
             raise ValueError(
-                f"{self.folder} is a report from before {ARRAYS} was kept to draw from; delete it to measure it again"
+                f"{self.folder} is an older report without {ARRAYS}, which the picture needs; delete it to measure it "
+                "again"
             )
         dataset, kept = sampled_lattice(open_slice(self.store)), open_bundle(self.folder / ARRAYS)
         samples = compare_samples(dataset, deviation=float(np.nan_to_num(kept["noise"]["deviation"])))
@@ -607,13 +611,13 @@ class Report:
         self, path: str | Path, *, include: Sequence[str | Path] = (), env: Environment | None = None,
         watch: Watch | None = None,
     ) -> Path:  # fmt: skip
-        """Write a page about the landscape that anyone can open, one file that needs no network; return its path.
+        """Write a page about the landscape, one file that needs no network, and return its path.
 
-        `include` are folders of runs, races and checks that the page shows, too. With the environment, `env`, it shows
-        the episodes at the lowest and the highest loss, where there are some to draw.
+        `include` are folders of runs, races and checks that the page also shows. With the environment, `env`, it shows
+        the episodes at the lowest and the highest loss, if there are episodes to draw.
 
-        Raises ValueError where the slice is on no disk, where a folder holds none of these, and where a run searched
-        other parameters.
+        Raises ValueError if the slice is not on disk, if a folder contains none of these, or if a run searched other
+        parameters.
         """
         from .report_page import save_page
 
@@ -630,7 +634,7 @@ class Report:
 
 @dataclass(frozen=True)
 class Reports:
-    """Hold the reports of several slices, in their order, and by name what was wrong with those that failed."""
+    """Record the reports of several slices, in order, and the reasons why others failed, by name."""
 
     derived: ClassVar = ("environments",)
 
@@ -639,15 +643,15 @@ class Reports:
 
     @property
     def environments(self) -> dict[str, EnvironmentCounts]:
-        """What the slices of each environment have in common."""
+        """The words of the slices of each environment, counted."""
         return by_environment(self.reports)
 
 
 @dataclass
 class EnvironmentCounts:
-    """In how many `slices` of an environment each word was measured, and each of the paper's.
+    """The number of `slices` of an environment in which each word was `measured`, and each word of the `paper`.
 
-    In so many slices a word of the paper's is `unresolved`.
+    `unresolved` counts the slices in which a word of the paper is not resolved.
     """
 
     slices: int = 0

@@ -42,19 +42,19 @@ def save_page(
 ) -> None:  # fmt: skip
     """Write the page of a report.
 
-    `include` are folders of runs, races and checks that the page shows, too. Of an environment that has episodes the
-    page has films of those at the lowest and the highest loss.
+    `include` are folders of runs, races and checks that the page also shows. If the environment has episodes, the page
+    has films of those at the lowest and the highest loss.
 
-    Raises ValueError where the slice is on no disk, where a folder holds none of these, and where a run searched other
+    Raises ValueError if the slice is not on disk, if a folder contains none of these, or if a run searched other
     parameters.
     """
     if report.store is None:
-        raise ValueError("the page of a report shows its slice, which is on no disk; sample it into a folder")
+        raise ValueError("the page of a report shows its slice, but that is not on disk; sample it into a folder")
     watch, dataset = watch or Watch(), open_slice(report.store)
     checks = [folder for folder in map(Path, include) if (folder / CHECK.files[0]).exists()]
     others = [str(folder) for folder in include if Path(folder) not in checks]
     quoted = report.paper
-    with watch.busy(f"{report.name}: its page"):
+    with watch.busy(f"{report.name}: writing its page"):
         page = report_page(
             dataset,
             report.profile,
@@ -81,7 +81,7 @@ def _draw(dataset: xr.Dataset) -> bytes:
 
 def _read_check(folder: Path) -> CheckShown:
     path = folder / CHECK.files[0]
-    with reading(path, "check again, or leave it out"):
+    with reading(path, "run the check again, or leave it out"):
         found: Any = read_json(path)
         diagnoses = [from_json(Diagnosis, one) for one in found["diagnoses"]]
         return CheckShown(bool(found["passed"]), diagnoses, [from_json(Finding, one) for one in found["checks"]])

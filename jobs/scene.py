@@ -41,13 +41,13 @@ MAX_WORK_RATIO = 2.0  # times the least expected work, beyond which a variant is
 
 @dataclass(frozen=True)
 class SceneSpec:
-    """Say which scene is simulated, and how.
+    """Record which scene to simulate, and how.
 
     `name` is a registered name, FILE.py:NAME, an environment's class, or an environment. `fidelity` is a name or a
-    record, by default the cheapest; `tolerance` chooses it by measured loss errors instead ("5%" of the losses' spread,
-    or "0.05" in their unit). `device` is auto, cpu or cuda, `engine` one of the scene's, by default its first, and
-    `options` are the scene's own. `policy`, mlp:32x32, decides instead of the scene's parameters, and its weights are
-    the parameters. `remedy` is what is done about the landscape, such as smooth:2% (`envs.remedies`).
+    record, by default the cheapest. `tolerance` chooses it by measured loss errors instead ("5%" or "0.05" of the
+    spread of losses). `device` is auto, cpu or cuda. `engine` is one of the scene's engines, by default its first, and
+    `options` are the scene's own. `policy`, such as mlp:32x32, controls the scene, and its weights are the parameters.
+    `remedy` changes the landscape, such as smooth:2% (`envs.remedies`).
     """
 
     name: str | type[Environment] | Environment
@@ -70,20 +70,20 @@ class SceneSpec:
 
     @property
     def kind(self) -> type[Environment] | Environment:
-        """The environment, or the class of one. Raises ValueError where there is none of that name."""
+        """The environment or its class. Raises ValueError if there is none of that name."""
         return find_environment(self.name)
 
     def resolve(self, watch: Watch) -> SceneSpec:
         """Return the spec with the fidelity that its tolerance chooses.
 
-        Raises ValueError where both are given, and where no measured fidelity is within the tolerance.
+        Raises ValueError if both are given, or if no measured fidelity is within the tolerance.
         """
         if self.tolerance is None:
             return self
         return replace(self, tolerance=None, fidelity=choose_fidelity(self, watch))
 
     def make(self, watch: Watch | None = None, **changes: Any) -> Environment:
-        """Make the environment; `changes` are other options. Raises ValueError for what the scene does not have."""
+        """Make the environment with its options and `changes`. Raises ValueError if the scene does not have one."""
         spec = self.resolve(watch or Watch())
         made = make(
             spec.name, fidelity=spec.fidelity, device=spec.device, engine=spec.engine,
@@ -141,8 +141,8 @@ def environment_of(dataset: xr.Dataset, device: str, env: Any = None) -> Environ
     identity = stored_identity(dataset)
     if missing := {"objective", "settings", "engine", "options", "deterministic"} - set(identity):
         raise ValueError(
-            f"the slice is not one of an environment, its identity lacks {', '.join(sorted(missing))}; "
-            "`landscape slice ENV` samples one"
+            f"the slice does not belong to an environment: its identity lacks {', '.join(sorted(missing))}; "
+            "`landscape slice ENV` samples one that does"
         )
     policy, remedy = made_with(identity)
     name = str(identity["objective"]).removesuffix(f" with policy {policy}")
@@ -152,7 +152,7 @@ def environment_of(dataset: xr.Dataset, device: str, env: Any = None) -> Environ
         if env is not None:
             raise
         raise ValueError(
-            f"{name} is not registered here, and evaluating it again needs it: say where it is, --env FILE.py:NAME, or "
+            f"{name} is not registered here, and it is needed to evaluate more points; give --env FILE.py:NAME, or "
             "env= in Python"
         ) from error
     made = make(
@@ -201,7 +201,7 @@ def _known_runs(env: Environment, *, needed: bool) -> list[xr.Dataset]:
         found += [run for run in runs if has_options(stored_identity(run), env)]
     if needed and not found:
         raise ValueError(
-            f"no run of {env.name} with these options is known under {ROOT}/; `landscape optimize {env.name}` makes one"
+            f"there is no run of {env.name} with these options in {ROOT}/; `landscape optimize {env.name}` makes one"
         )
     return found
 
@@ -231,7 +231,7 @@ def runs_in(objective: Objective, run: str) -> list[xr.Dataset]:
     tables, name = run_tables([run]), objective.name
     searched = {str(stored_identity(table).get("objective")) for table in tables}
     if searched != {name}:
-        raise ValueError(f"{run} holds no runs of {name} alone; it holds those of {', '.join(sorted(searched))}")
+        raise ValueError(f"the runs have to be of {name} only; {run} contains runs of {', '.join(sorted(searched))}")
     return tables
 
 
@@ -250,7 +250,7 @@ def named_point(objective: Objective, text: str) -> Tensor:
     if kind == "random" and seed.isdecimal():
         return objective.space.uniform(1, seed=int(seed))[0]
     forms = "center, random:SEED, a table (.csv, .parquet) or a tensor"
-    raise ValueError(f"{objective.name} can be cut through {forms}; got {text!r}")
+    raise ValueError(f"a slice of {objective.name} can go through {forms}; got {text!r}")
 
 
 def given_point(objective: Objective, through: Any, who: str) -> Tensor:
@@ -285,32 +285,30 @@ def choose_fidelity(spec: SceneSpec, watch: Watch) -> Fidelity:
     name = env.name
     if not env.model_version:
         raise ValueError(
-            f"--tolerance chooses among stored measurements, and nothing says whether {name} is still what was "
-            f"measured; name a fidelity, {', '.join(env.fidelities)}"
+            f"--tolerance uses stored measurements, but {name} has no version to show that it has not changed since; "
+            f"choose a fidelity instead: {', '.join(env.fidelities)}"
         )
     found, source, rows = _candidates(env, spec.options)
     errors = {row.name: off for row in rows if (off := row.p95(relative=True)) is not None}
     within = [row for row in rows if errors.get(row.name, float("inf")) <= limit]
     if not errors:
-        raise ValueError(f"the losses of {name} that were measured have no spread to be within a share of ({source})")
+        raise ValueError(f"the measured losses of {name} have no spread, so --tolerance cannot choose ({source})")
     if not within:
         best = min(errors, key=lambda name: errors[name])
         raise ValueError(
-            f"no measured fidelity of {name} is within {limit:.3g} of the losses' spread; the best is {best}, "
-            f"{errors[best]:.2%} off at the 95th percentile"
+            f"no measured fidelity of {name} is within {limit:.3g} of the spread of losses; the best is {best}, with "
+            f"an error of {errors[best]:.2%} at the 95th percentile"
         )
     row, known = _quickest(watch, env, within)
     theirs, ours = found.identity[MODEL_VERSION], env.version_on(found.identity["engine"])
     if theirs != ours:
-        watch.note(f"warning: measured by {name} model {theirs}; this is model {ours}")
-    accuracy = (
-        f"its losses are {errors[row.name]:.2%} of their spread off or less in 95 % of {row.comparison.compared} points"
-    )
+        watch.note(f"warning: the errors were measured by {name} model {theirs}; this is model {ours}")
+    accuracy = f"its loss error is at most {errors[row.name]:.2%} at 95 % of {row.comparison.compared} points"
     if row.name == found.reference:
-        accuracy = "the others are compared with it, so that its own error is not known"
+        accuracy = "it is the reference, so its own error is not known"
     watch.note(
-        f"{row.name}: the quickest of {len(within)} of {len(rows)} measured that are within {limit:.3g} of the losses' "
-        f"spread; {accuracy} ({source}); {known}"
+        f"{row.name}: the fastest of {len(within)} fidelities, out of {len(rows)} measured, within {limit:.3g} of the "
+        f"spread of losses; {accuracy} ({source}); {known}"
     )
     return row.fidelity
 
@@ -321,16 +319,16 @@ def _quickest(watch: Watch, env: Environment, rows: Sequence[MeasuredVariant]) -
 
     if rows[0].device == env.device:
         best = min(rows, key=lambda row: row.seconds)
-        return best, f"{best.seconds:.3g} s an episode with gradient on {env.device}, by `landscape study fidelity`"
+        return best, f"{best.seconds:.3g} s per episode with gradient on {env.device}, by `landscape study fidelity`"
     made = {row.name: env.remake(fidelity=row.fidelity) for row in rows}
     work = {name: expected_work(one) for name, one in made.items()}
     likely = [row for row in rows if work[row.name] <= MAX_WORK_RATIO * min(work.values())]
     if len(likely) == 1:
-        return likely[0], f"the others have {MAX_WORK_RATIO:g} times its work and more; none was timed on {env.device}"
+        return likely[0], f"the others take over {MAX_WORK_RATIO:g} times its work; none was timed on {env.device}"
     with watch.busy(f"{env.name}: timing {len(likely)} fidelities on {env.device}, where none was measured"):
         timed = _time(env, [made[row.name] for row in likely])
     best = min(likely, key=lambda row: timed[row.name])
-    return best, f"{timed[best.name]:.3g} s an episode with gradient, one alone on {env.device}, timed here"
+    return best, f"{timed[best.name]:.3g} s per episode with gradient, one at a time on {env.device}, timed here"
 
 
 def _time(env: Environment, variants: Sequence[Environment]) -> dict[str, float]:
@@ -346,14 +344,14 @@ def _time(env: Environment, variants: Sequence[Environment]) -> dict[str, float]
     path = own_folder() / f"{env.name}-{env.device}-{of}.seconds.json"
     known: dict[str, float] = {}
     if path.is_file():
-        with reading(path, "delete it, and fidelities are timed again"):
+        with reading(path, "delete it to time the fidelities again"):
             known = {name: number(seconds) for name, seconds in read_json(path).items()}
     timed = {}
     for variant in variants:
         key = f"{variant.fidelity.name} {digest(variant.fidelity.record())}"
         if key not in known:
             known[key] = timing.seconds_with_gradient(variant)
-            with moved_by("XDG_DATA_HOME", "what was measured"):
+            with moved_by("XDG_DATA_HOME", "the measured times"):
                 write_json(path, known)
         timed[variant.fidelity.name] = known[key]
     return timed
@@ -371,15 +369,15 @@ def find_variant(env: Environment, device: str) -> tuple[MeasuredVariant, Path]:
         if found and row.device == device and row.fidelity == env.fidelity:
             return row, found[1]
     raise ValueError(
-        f"there is no {device} device here, and no rate of {env.name} at {env.fidelity.name} on one is kept; "
-        f"`landscape study fidelity {env.name} --device {device}` measures it where there is one"
+        f"this machine has no {device} device, and no rate of {env.name} at {env.fidelity.name} on one is stored; "
+        f"run `landscape study fidelity {env.name} --device {device}` on a machine that has one"
     )
 
 
 def tolerance_of(spec: SceneSpec) -> float:
     """Return the tolerance of a scene. Raises ValueError where it is no share, and where a fidelity is named too."""
     if spec.fidelity is not None:
-        raise ValueError(f"--tolerance chooses the fidelity; got --fidelity {spec.fidelity} too, leave out one of them")
+        raise ValueError(f"--tolerance chooses the fidelity; got --fidelity {spec.fidelity} too, so leave out one")
     return read_tolerance(spec.tolerance)
 
 
@@ -391,7 +389,7 @@ def read_tolerance(given: object) -> float:
     except ValueError:
         value = -1.0
     if not 0 <= value <= 1:
-        raise ValueError(f"--tolerance takes a share of the losses' spread such as 5% or 0.05; got {text!r}")
+        raise ValueError(f"--tolerance takes a share of the spread of losses such as 5% or 0.05; got {text!r}")
     return value
 
 
@@ -403,12 +401,12 @@ def _candidates(env: Environment, options: Mapping[str, Any]) -> tuple[FidelityR
     measuring = ["landscape", "study", "fidelity", env.name, *settings]
     found = find_fidelity(env, env.device)
     if found is None:
-        said = f"no fidelities of {env.name} with these options are measured"
+        said = f"no fidelity of {env.name} with these options is measured yet"
         raise ValueError(f"{said}; `{shlex.join(measuring)}` measures them")
     rows = _rows(found[0], env, env.device)
     if not rows:
         measuring += ["--engine", env.engine]
-        raise ValueError(f"{found[1]} holds no variant of engine {env.engine}; `{shlex.join(measuring)}` measures them")
+        raise ValueError(f"{found[1]} has no variant of engine {env.engine}; `{shlex.join(measuring)}` measures them")
     return *found, rows
 
 
@@ -437,7 +435,7 @@ def best_of_league(env: Environment) -> tuple[Tensor, float] | None:
     path = league_file(env.name)
     if not path.is_file():
         return None
-    with reading(path, "delete it, and `landscape gallery compute --part league` makes it again"):
+    with reading(path, "delete it and run `landscape gallery compute --part league` to make it again"):
         found = from_json(SceneStandings, read_json(path))
     if found.best is None or not has_options(found.identity, env) or len(found.best.x) != env.space.dim:
         return None

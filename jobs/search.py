@@ -44,9 +44,9 @@ class BestRecord:
 
 @dataclass(frozen=True)
 class SearchSummary:
-    """Say what a run cost and found, as `summary.json` next to it has it; `best` is None where no episode succeeded.
+    """Record the cost and the result of a run, as in its `summary.json`; `best` is None if no episode succeeded.
 
-    `forwards` is what it cost in episodes without gradient, `error` is what the first episode that raised said.
+    `forwards` is the cost in episodes without gradient. `error` is the message of the first episode that raised.
     """
 
     env: str
@@ -133,7 +133,7 @@ class SearchJob(SummaryJob[SearchSummary]):
         if resumed < self.budget:
             resumed = self._search(watch)
         else:
-            watch.note(f"{self._place()}\nall {self.budget} episodes are there already")
+            watch.note(f"{self._place()}\nall {self.budget} episodes are done already")
         printed = self.draw(self.result().plot)
         return self._summary(resumed, time.monotonic() - start, [STORE, PICTURE, *printed, SUMMARY])
 
@@ -181,11 +181,11 @@ class SearchJob(SummaryJob[SearchSummary]):
         with watch.busy(f"{self.env.name}: {PREPARING}"):
             cost = episode_cost(self.env, grad=grad and store.gradient_cost is None)
         ratio, left = store.gradient_cost or cost.ratio, self.budget - store.told
-        kept = f", {store.told} are there already" if store.told else ""
+        kept = f", {store.told} are done already" if store.told else ""
         forward = duration(left * cost.forward)
         costs = f"{forward} without gradients, {duration(left * cost.forward * ratio)} with" if grad else forward
         watch.note(
-            f"{self._place()}\n{left} episodes to compute{kept}: one by one {costs}, and what the method takes itself"
+            f"{self._place()}\n{left} episodes to compute{kept}: {costs}, one by one, plus the time of the method"
         )
         return ratio if grad else None
 
@@ -229,7 +229,9 @@ def points_within(env: Environment, budget: int) -> int:
     """
     budget, cost = as_whole(budget, "a budget", least=1), env.episodes_per_point
     if budget < cost:
-        raise ValueError(f"a point of {env.name} takes {cost} episodes with its remedy; got a budget of {budget}")
+        raise ValueError(
+            f"a point of {env.name} takes {cost} episodes with its remedy; got a budget of {budget}, so raise it"
+        )
     return budget // cost
 
 

@@ -79,13 +79,13 @@ Draw = Callable[..., "Figure"]
 
 @dataclass(frozen=True)
 class SliceSummary:
-    """Say what a slice cost, as `summary.json` next to it has it; `status` counts points, `flat` those without slope.
+    """Record the cost and the content of a slice, as in its `summary.json`.
 
-    Gradients are at every `gradients_every` samples along each axis. `episodes` are those of the samples;
-    `undersampled` has those that looked between them, and what they found, None where nothing is known of it.
-    `barrier` [loss unit] is that between the ends of a line. `error` is what the first point that raised said.
-    `floor` is what replicas of the objective differ by, None where it has none; `training` is the path of a training
-    that the slice was cut along.
+    `status` counts points by status, and `flat` those with a gradient of exactly zero. Gradients are at every
+    `gradients_every` samples along each axis. `episodes` counts the evaluated samples. `undersampled` contains the
+    checks between samples and their result, None if unknown. `barrier` [loss unit] is the barrier between the ends of a
+    line. `error` is the message of the first point that raised. `floor` is the numerical floor from replicas of the
+    objective, None if it has none. `training` is the path of a training that the slice was cut along.
     """
 
     env: str | None
@@ -122,7 +122,7 @@ class SliceSummary:
         asked = min(sloped, sum(counts.values()) - counts.get("interpolated", 0))
         share = (self.flat or 0) / asked if asked else 0.0
         flat = f"; gradient exactly zero at {share:.1%} of points" if share else ""
-        barred = "" if self.barrier is None else f"; barrier of {self.barrier:.4g} above the line between its ends"
+        barred = "" if self.barrier is None else f"; barrier of {self.barrier:.4g} above the line between the ends"
         hidden = f"; {said}" if self.undersampled and (said := self.undersampled.describe()) else ""
         numerics = f"; {self.floor.sentence()}" if self.floor else ""
         trained = f"; {self.training.sentence()}" if self.training else ""
@@ -300,17 +300,17 @@ class SliceJob(SummaryJob[SliceSummary]):
         kind = kind_of(self.store)
         watch.note(" · ".join([env, str(about.get("fidelity")), str(about.get("device")), str(self.folder)]))
         if not cost.episodes:
-            watch.note(f"all {total} {kind} are there already")
+            watch.note(f"all {total} {kind} are done already")
             return
-        kept = f", {total - cost.episodes} are there already" if cost.episodes < total else ""
+        kept = f", {total - cost.episodes} are done already" if cost.episodes < total else ""
         most, losses = "up to " if self.refinement else "", probes(total, grad=whole)
         again = floor_episodes(self.objective, total)
-        more = [f"{losses} between samples"] * (losses > 0) + [f"{again} of its replicas"] * (again > 0)
+        more = [f"{losses} between samples"] * (losses > 0) + [f"{again} of replicas"] * (again > 0)
         between = f"; plus at most {' and '.join(more)}" if more else ""
         floors = len(self.objective.replicas()) * total if self.floor else 0
         seconds = cost.seconds * (1 + (losses + again + floors) / cost.episodes) + PICTURE_SECONDS
         watch.announce(
-            f"{most}{cost.episodes} {kind} to compute{kept}: about {duration(seconds)} with all that follows, "
+            f"{most}{cost.episodes} {kind} to compute{kept}: about {duration(seconds)} in all, "
             f"{size(cost.memory)} of memory{_gpu_memory(self.objective)}{between}",
             seconds,
         )
@@ -494,7 +494,7 @@ def default_folder(
     root: Path,
     refinement: Refinement | None,
 ) -> Path:
-    """Return a folder of its own for every different slice, the same for the same one.
+    """Return the default folder of a slice, unique for its settings and always the same for them.
 
     That of a cut along directions, which may differ by rounding, does not depend on the `plane`.
     """
@@ -549,7 +549,7 @@ def conclude_slice(
     With an `executor` its workers evaluate. Where it was cut along a `training`, they say its path, too.
     """
     floor = None
-    with _sampled_all_the_same(f"{objective.name}'s replicas raised, so its numerical floor is not known"):
+    with _sampled_all_the_same(f"replicas of {objective.name} raised an error, so the numerical floor is not known"):
         floor = find_floor(objective, dataset, through=lambda one: evaluator(one, executor, recipe(one)))
     hidden = look_between(evaluator(objective, executor, remake), dataset, floor=counted_from(floor))
     path = {} if training is None else training.over(plane_of(dataset), objective).attribute()
@@ -562,7 +562,7 @@ def look_between(objective: Objective, dataset: xr.Dataset, *, floor: float = 0.
     `floor` [loss unit] is the least difference that counts. An objective that raises between them has been sampled all
     the same: that is warned of, and nothing is said.
     """
-    with _sampled_all_the_same(f"{objective.name} raised between the samples, so what they hide is not known"):
+    with _sampled_all_the_same(f"{objective.name} raised an error between samples, so undersampling is not known"):
         found = find_undersampled(objective, dataset, floor=floor)
         return found.attribute() if found else {}
     return {}

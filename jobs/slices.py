@@ -1,9 +1,9 @@
-"""The slices under a folder as a table: what the `summary.json` of each says, so that no slice is opened.
+"""The slices under a folder as a table, from the `summary.json` of each, without opening a slice.
 
-The table is kept in that folder as a file of SQLite, and is brought up to date whenever it is read: summaries that are
-new, or of another size, time or inode than before, are read, and rows of those that are gone go. So slices may be
-added, cut again, moved and removed, by any process or by hand, and the file may be deleted. Where it cannot be written,
-or another process writes it for long, the table is made in memory.
+The table is a file of SQLite in that folder, and every read brings it up to date. Summaries that are new, or have
+another size, time or inode than before, are read, and rows of summaries that are gone are removed. So any process or
+user can add, sample again, move and remove slices, and delete the file. If it cannot be written, or another process
+writes it for a long time, the table is made in memory.
 """
 
 from __future__ import annotations
@@ -66,10 +66,10 @@ NAME = "CAST(? AS TEXT)"  # of bytes, as names of folders need not be Unicode
 
 @dataclass(frozen=True)
 class SliceTable:
-    """The slices under a folder, a row each, and how many folders of slices are not in it.
+    """The slices under a folder, one row each, and the number of slice folders without a row.
 
-    `damaged` ones have a summary that cannot be read, `bare` ones have none: they are not finished, or were left
-    before it was written.
+    `damaged` counts folders with a summary that cannot be read. `bare` counts folders without a summary, because they
+    are not finished.
     """
 
     folder: Path
@@ -91,7 +91,7 @@ def find_slices(folder: Path, where: str | None = None) -> SliceTable:
     links are not followed. Raises ValueError where there is no such folder, and for what is no condition.
     """
     if not folder.is_dir():
-        raise ValueError(f"there is no folder {folder}; give one that holds folders of slices")
+        raise ValueError(f"there is no folder {folder}; give one that contains folders of slices")
     _check(where)
     path = folder / TABLE
     try:
@@ -117,7 +117,7 @@ def _check(where: str | None) -> None:
 
 
 def _refusal(where: str | None, error: Exception) -> str:
-    return f"--where takes a condition of SQLite over folder, {', '.join(COLUMNS)}; got {where!r}: {error}"
+    return f"--where takes an SQLite condition over folder, {', '.join(COLUMNS)}; got {where!r}: {error}"
 
 
 def _query(where: str | None) -> str:

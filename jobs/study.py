@@ -104,6 +104,6 @@ class StudyJob(CheckpointedJob[StudyRecord]):
             seconds = self.seconds()
         if seconds:
             dearest = max(seconds, key=lambda name: seconds[name])
-            most = f"{duration(seconds[dearest])} of it {dearest}, " if len(seconds) > 1 else ""
+            most = f", {duration(seconds[dearest])} of it for {dearest}" if len(seconds) > 1 else ""
             whole = sum(seconds.values()) + PICTURE_SECONDS
-            watch.announce(f"about {duration(whole)}, {most}by the work of an episode; {study.advice}", whole)
+            watch.announce(f"about {duration(whole)} (from the work per episode){most}; {study.advice}", whole)

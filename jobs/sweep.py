@@ -63,7 +63,7 @@ STORE_MEMORY, STORE_BLOCKS = 100e3, 4  # of a slice without samples: bytes of it
 
 @dataclass(frozen=True)
 class FrameSummary:
-    """Say what a frame shows: the value of what moves, the ends of its losses, how many points ended how."""
+    """Record a frame: the value of the swept quantity, the range of its losses, and its points by status."""
 
     value: float
     loss: dict[str, float | None]
@@ -78,7 +78,7 @@ class FrameSummary:
 
 @dataclass(frozen=True)
 class SweepSummary:
-    """Say what a sweep cost and what each of its frames shows, as `summary.json` next to it has it."""
+    """Record the cost of a sweep and the content of each frame, as in its `summary.json`."""
 
     env: str
     dims: list[str]
@@ -145,7 +145,7 @@ class SweepJob(SummaryJob[SweepSummary]):
         """
         if plane.rank != 2 or frames < 2:
             dims = ", ".join(plane.names)
-            raise ValueError(f"a sweep has two dims and two frames or more; got {dims} and {frames} frames")
+            raise ValueError(f"sweep takes two dims and at least two frames; got {dims} and {frames} frames")
         gradients = check_gradients(gradients, plane, refined=False)
         gradients = 0 if over == SMOOTHING else gradients
         refuse_too_large(plane, frames, out or ROOT, grad=gradients > 0, over=over)
@@ -234,11 +234,11 @@ class SweepJob(SummaryJob[SweepSummary]):
         left, env, kind = self.total - self.done(), self.env, kind_of(self.stores[0])
         watch.note(f"{env.name} · {env.fidelity.name} · {env.device} · {self.folder}")
         if not left:
-            watch.note(f"all {self.total} {kind} of {len(self.stores)} slices are there already")
+            watch.note(f"all {self.total} {kind} of {len(self.stores)} slices are done already")
             return
         with watch.busy(f"{env.name}: {PREPARING}"):
             cost = self.cost()
-        kept = f", {self.total - left} are there already" if left < self.total else ""
+        kept = f", {self.total - left} are done already" if left < self.total else ""
         slices = f"{len(self.stores)} slices" if len(self.stores) > 1 else "one slice"
         seconds = cost.seconds + PICTURE_SECONDS + FRAME_SECONDS * len(self.motion.values)
         takes = f"about {duration(seconds)} with the film, {size(cost.memory)} of memory"
@@ -294,7 +294,7 @@ def _identity(env: Environment, gradients: int, cut: Mapping[str, Any] | None) -
 def sweep_folder(
     env: Environment, motion: Motion, over: int | str, *, gradients: int = 1, cut: Mapping[str, Any] | None = None
 ) -> Path:
-    """Return a folder of its own for every different sweep, the same for the same one."""
+    """Return the default folder of a sweep, unique for its settings and always the same for them."""
     planes = [plane.record() for plane in motion.planes]
     what = over if over in (SMOOTHING, HORIZON) else env.space.index(over)
     points = "x".join(map(str, (*planes[0]["resolution"], len(motion.values))))
@@ -318,7 +318,7 @@ def _along_kept(path: Path, plane: Plane, cut: Mapping[str, Any]) -> Plane:
 
 
 def check_folder(folder: Path) -> None:
-    """Raise ValueError where a folder holds anything but a sweep: its films without any slice are somebody else's."""
+    """Raise ValueError if a folder contains anything but a sweep; films without a slice do not count as one."""
     held = visible_files(folder)
     begun = [file for file in held if file.name in (FRAMES, *(place.name for place in slice_places(Path(ONLY))))]
     strange = [file for file in visible_files(folder / FRAMES) if not FRAME.fullmatch(file.name)]
@@ -340,9 +340,9 @@ def _clear(folder: Path) -> None:
 
 @dataclass(frozen=True)
 class Motion:
-    """Say what moves: frames show `slices` of what is sampled on `planes` at the `values` of what `label` names.
+    """Record the swept quantity `label` and its `values`: frames show `slices` of the samples on `planes`.
 
-    `env_at` makes the environment of a plane, by its number. A `logarithmic` one moves by equal ratios.
+    `env_at` makes the environment of a plane, by its number. A `logarithmic` quantity moves by equal ratios.
     """
 
     label: str
@@ -401,7 +401,7 @@ def _parameter(name: int | str, env: Environment, plane: Plane, frames: int) -> 
     number = env.space.index(name)
     if _holds(plane, number):
         raise ValueError(
-            f"a sweep moves a third parameter, {HORIZON} or {SMOOTHING}; got --over {name}, which the slice varies"
+            f"sweep moves a third parameter, {HORIZON} or {SMOOTHING}; got --over {name}, which the slice itself varies"
         )
     space = env.space
     places = torch.linspace(float(space.lower[number]), float(space.upper[number]), frames, dtype=torch.float64)
@@ -416,11 +416,11 @@ def _horizon(env: Environment, plane: Plane, frames: int) -> Motion:
     whole = env.horizon
     if whole is None:
         raise ValueError(
-            f"{env.name} has no {HORIZON} to sweep over: no setting says how long an episode is (horizon= of a "
-            f"function names one); sweep a third parameter or {SMOOTHING}"
+            f"{env.name} has no {HORIZON} to sweep over: no setting controls how long an episode is (for your own "
+            f"function, horizon= names one); sweep a third parameter or {SMOOTHING}"
         )
     if env.horizon_option == HORIZON and whole != 1 and env.model_version:
-        raise ValueError(f"--over {HORIZON} moves that option itself; leave out --set {HORIZON}=...")
+        raise ValueError(f"--over {HORIZON} changes this option itself; leave out --set {HORIZON}=...")
     shares = [(frame + 1) / frames for frame in range(frames)]
     values = tuple(100 * share for share in shares)
     return Motion(

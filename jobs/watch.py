@@ -1,4 +1,4 @@
-"""What a job tells whoever watches it, and how it ends when it is stopped. A job itself prints nothing."""
+"""The messages of a job to its watch, and how a job ends when it is stopped. A job itself prints nothing."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ AdvanceOne = Callable[[str, int, str], None]  # advance(name, done, said): the s
 Say = Callable[[str], None]  # say(text): what is being done now
 
 
-PREPARING = "preparing (kernels are compiled once, then kept)"
+PREPARING = "preparing (kernels are compiled once, then cached)"
 
 
 @dataclass(frozen=True)
 class Work:
-    """Hold what a job has to simulate: `losses` without gradients and `gradients` with, and the bytes it leaves.
+    """Record what a job has to simulate: `losses` without gradients and `gradients` with, and the bytes it leaves.
 
-    `memory` is what its own arrays take [bytes], without the simulation's. It makes so many `others` of the objective's
-    kind, each of which compiles programs of its own where the objective does. Its repeats, by which it is timed, take
-    so long [s] where an episode with gradient takes so long [s].
+    `memory` is the size of its own arrays [bytes], without the simulation's. `others` is the number of variants of the
+    objective that it makes, each of which may compile its own programs. `repeats` returns the time of repetitions for
+    timing [s], given the time of an episode with gradient [s].
     """
 
     objective: Objective
@@ -40,9 +40,9 @@ class Work:
 
 
 class Stopped(KeyboardInterrupt):
-    """Say what is kept of a job that Ctrl-C has stopped; the same call, or the same command, continues from there.
+    """A job was stopped by Ctrl-C; the message says what is kept, and the same call or command continues from there.
 
-    Where nothing is `kept`, it begins again.
+    If nothing is `kept`, it starts again.
     """
 
     def __init__(self, said: str, *, kept: bool = True) -> None:

@@ -1,8 +1,8 @@
 """Workers on Dask distributed: a running cluster by its address, or one here with a worker per GPU or core.
 
-Workers of a GPU see that GPU only; those of a CPU are held to cores of their own. Whoever reaches a worker runs code on
-it. Those here listen on the loopback interface, where other users of the machine still reach them, and so they take TLS
-with keys made for this cluster, which lie in the memory of its processes only.
+A GPU worker sees only its GPU, and a CPU worker uses only its own cores. Anyone who can reach a worker can run code on
+it. Local workers listen on the loopback interface, which other users of the machine can still reach. They therefore use
+TLS, with keys made for this cluster that exist only in the memory of its processes.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ def workers(scheduler: str | None, device: str) -> Iterator[Executor | None]:
         except (OSError, ValueError) as error:
             raise ConnectionError(f"no Dask scheduler answers at {scheduler}: {error}") from error
         if not client.nthreads():
-            print(f"waiting for a first worker of {printable(scheduler)}", file=sys.stderr)
+            print(f"waiting for the first worker of {printable(scheduler)}", file=sys.stderr)
             client.wait_for_workers(1)
         try:
             yield client.get_executor(pure=False)
@@ -76,7 +76,8 @@ def workers(scheduler: str | None, device: str) -> Iterator[Executor | None]:
             from ..landscapes.sampling.distribution import WorkersLostError
 
             said = (
-                "what every worker that took it died of was given up; the rest is kept, and the same command continues"
+                "a task was given up because every worker that took it died; the rest is kept, and the same command "
+                "continues from there"
             )
             raise WorkersLostError(f"{said}: {error}") from error
 
@@ -92,7 +93,7 @@ def _greet(address: str) -> None:
     except OSError as error:
         raise ValueError(f"the certificates that Dask's configuration names cannot be read: {error}") from None
     if closed and how["ssl_context"] is None:
-        raise ValueError(f"{address} takes certificates; docs/clusters.md says where they are named")
+        raise ValueError(f"{address} needs certificates; docs/clusters.md says how to name them")
 
     async def greeted() -> None:
         comm = await asyncio.wait_for(connect(address, deserialize=False, **how), ANSWER)  # type: ignore[no-untyped-call]
@@ -102,12 +103,12 @@ def _greet(address: str) -> None:
         with ThreadPoolExecutor(1) as beside:  # where this thread runs a loop of its own, as a notebook's does
             beside.submit(asyncio.run, greeted()).result()
     except Exception as error:  # whatever it is that answers there, or does not
-        said = f"{error}" or f"nothing is said there in {ANSWER:g} s"
+        said = f"{error}" or f"no answer within {ANSWER:g} s"
         raise ConnectionError(f"no Dask scheduler answers at {address}: {said}") from error
     if not closed:
         print(
-            f"warning: {printable(address)} is without TLS, so whoever reaches it runs code on its workers and here; "
-            "docs/clusters.md says how a cluster is closed",
+            f"warning: {printable(address)} has no TLS, so anyone who can reach it can run code on its workers and on "
+            "this machine; docs/clusters.md says how to secure a cluster",
             file=sys.stderr,
         )
 
@@ -136,8 +137,8 @@ def _make_checked(
     env = made_over(make(source, **settings), *over)
     if (theirs := env.version_on(env.engine)) != model:
         raise ValueError(
-            f"worker {platform.node()} has {env.name} model {theirs}; here it is model {model}: install the same "
-            "version of it there"
+            f"worker {platform.node()} has {env.name} model {theirs}, but this machine has model {model}; install the "
+            "same version there"
         )
     return env
 
@@ -167,7 +168,7 @@ def _local(count: int | None, device: str) -> Any:
 
 
 def _keys() -> Any:
-    """Make a certificate that nobody but the processes of one cluster have."""
+    """Make a certificate that only the processes of one cluster have."""
     from distributed.security import Security
 
     try:
@@ -180,7 +181,9 @@ def _gpus(count: int | None) -> list[dict[str, Any]]:
     """Return a Nanny's options for each worker of a GPU, which sees no other."""
     names = _names()
     if count is not None and count > len(names):
-        raise ValueError(f"--scheduler local:{count} needs {count} GPUs; {len(names)} are here, so say local or less")
+        raise ValueError(
+            f"--scheduler local:{count} needs {count} GPUs; this machine has {len(names)}, so use local or a smaller N"
+        )
     return [{"env": {"CUDA_VISIBLE_DEVICES": name}, "preload": [DEAF]} for name in names[:count]]
 
 

@@ -1,1 +1,1 @@
-"""What a landscape is: its parameter space, its plane, its samples and its pictures."""
+"""Landscapes: their parameter spaces, planes, samples, measures and pictures."""

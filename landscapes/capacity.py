@@ -1,4 +1,4 @@
-"""The memory and the disk that are free: a size that cannot fit is refused before anything is allocated."""
+"""Free memory and disk: a size that cannot fit is refused before anything is allocated."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class TooLargeError(ValueError):
 
 @dataclass(frozen=True)
 class Need:
-    """Hold an estimate of the bytes of memory and of disk that something takes."""
+    """An estimate of the memory and disk that something needs [bytes]."""
 
     memory: float = 0.0
     disk: float = 0.0
@@ -33,12 +33,10 @@ class Need:
 
 
 def require(what: str, value: int, need: Callable[[int], Need], folder: Path | None = None) -> None:
-    """Refuse a value that takes more than there is, before it is allocated, and say up to which one it would fit.
+    """Refuse a value that needs more than there is, before allocation, and name the largest one that would fit.
 
-    `what` names the value, such as resolution, and `need` says what each value of it takes, a larger one no less.
-    Without a `folder` nothing is written.
-
-    Raises TooLargeError where it does not fit.
+    `what` names the value, such as resolution, and `need` gives the need of each value, which must not decrease.
+    Without a `folder` nothing is written. Raises TooLargeError where it does not fit.
     """
     there = Need(available_memory(), free_disk(folder) if folder else float("inf"))
     too_large = min(value, ENDLESS)
@@ -51,15 +49,15 @@ def require(what: str, value: int, need: Callable[[int], Need], folder: Path | N
     wanted = need(min(value, ENDLESS))
     name = "memory" if wanted.memory > there.memory else "disk"
     digit: int = 10 ** max(0, len(str(fits)) - 2)  # two digits: more would pretend to more accuracy than there is
-    most = f"{what} {fits // digit * digit} would fit" if fits else f"not even {what} 1 would fit, so make room"
+    most = f"{what} {fits // digit * digit} would fit" if fits else f"not even {what} 1 would fit, so free some space"
     raise TooLargeError(
-        f"{what} {value} takes about {size(getattr(wanted, name))} of {name}, and {size(getattr(there, name))} are "
-        f"free here; {most}"
+        f"{what} {value} needs about {size(getattr(wanted, name))} of {name}, but only {size(getattr(there, name))} "
+        f"are free here; {most}"
     )
 
 
 def available_memory() -> float:
-    """Return how many bytes of memory can still be taken, by what the system and the groups of this process allow."""
+    """Return the bytes of memory that the system and the groups of this process still allow."""
     if not MEMINFO.exists():
         return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
     lines = dict(line.split(":") for line in MEMINFO.read_text().splitlines())
@@ -67,13 +65,13 @@ def available_memory() -> float:
 
 
 def peak_memory() -> int:
-    """Return the most memory this process has held [bytes]."""
+    """Return the peak memory of this process [bytes]."""
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else 1024 * peak
 
 
 def free_disk(folder: Path) -> float:
-    """Return how many bytes are free on the disk that a folder is on, or will be."""
+    """Return the free bytes on the disk of a folder, which need not exist yet."""
     there = next((place for place in (folder, *folder.absolute().parents) if place.exists()), Path.cwd())
     return float(shutil.disk_usage(there).free)
 
@@ -90,7 +88,7 @@ def _fits(wanted: Need, there: Need) -> bool:
 
 
 def _group_limits() -> list[float]:
-    """Return what the control groups (version 2) that this process is in leave of their limits, where they have one."""
+    """Return the remaining memory of the control groups (version 2) of this process, where they have a limit."""
     try:
         own = next(line[3:] for line in Path("/proc/self/cgroup").read_text().splitlines() if line.startswith("0::"))
     except (OSError, StopIteration):

@@ -1,4 +1,4 @@
-"""Records as JSON and back: a record's fields stand once, in its dataclass, and a library converts them."""
+"""Convert records to JSON and back: a dataclass declares the fields of a record once, and a library converts them."""
 
 from __future__ import annotations
 
@@ -20,28 +20,28 @@ NOT_JSON: Final = {"json": False}  # the metadata of a field that JSON leaves ou
 
 
 def to_json(record: Any) -> Any:
-    """Return a record as JSON has it, at any depth; see `from_json`.
+    """Return a record in JSON form, at any depth; see `from_json`.
 
-    Dataclasses become dicts of their fields, but for those with the metadata `NOT_JSON`, followed by the properties
-    that their class names in `derived`, which are for readers alone. NaN and infinity become None; arrays, tensors and
-    tuples become lists. Raises TypeError for what has no form in JSON.
+    Dataclasses become dicts of their fields, except fields with the metadata `NOT_JSON`. After these come the
+    properties that their class names in `derived`, which are only for readers. NaN and infinity become None; arrays,
+    tensors and tuples become lists. Raises TypeError for values without a JSON form.
     """
     return jsonable(record)
 
 
 def from_json(kind: type[Record], data: Any) -> Record:
-    """Return a record of a class from what `to_json` made of it.
+    """Return a record of a class from a result of `to_json`.
 
     The field types of the class are the only schema, so they are imported where the class is defined, not under
-    TYPE_CHECKING. None becomes NaN where a number is wanted; what the class does not know is ignored. Raises an error
-    of any kind for what is not such a record; `storage.records.reading` says which file is damaged.
+    TYPE_CHECKING. None becomes NaN for number fields; unknown fields are ignored. Raises any kind of error for other
+    input; `storage.records.reading` names the damaged file.
     """
     return _converter().structure(data, kind)
 
 
 @cache
 def _converter() -> Converter:
-    """Return a converter that takes no value for another one: no text is a number, no number a text."""
+    """Return a converter that never turns one type into another: no text into a number, no number into text."""
     from cattrs import Converter
 
     converter = Converter(detailed_validation=False)
@@ -81,12 +81,12 @@ def _exactly(value: Any, kind: type[Any]) -> Any:
 
 
 def to_attribute(name: str, record: Any) -> dict[str, str]:
-    """Return the attribute of a name that a slice holds a record in, as text."""
+    """Return the text of the attribute in which a slice stores a record."""
     return {name: json.dumps(to_json(record))}
 
 
 def from_attribute(kind: type[Record], attributes: Mapping[Any, Any], name: str) -> Record | None:
-    """Read a record from a slice's attributes, None where there is none of the name or what it holds is none."""
+    """Read a record from a slice's attributes, None where there is no such attribute or record."""
     try:
         return from_json(kind, json.loads(attributes[name]))
     except Exception:  # text of any content makes the converter raise anything at all

@@ -1,4 +1,4 @@
-"""The seconds that an episode takes, measured on the objective itself; everything that is announced uses it."""
+"""Measure the seconds of an episode on the objective itself; all estimates use it."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ WARM_UP = 10.0  # seconds from which a first batch, which may compile, is not re
 
 @dataclass(frozen=True)
 class EpisodeCost:
-    """Say what an episode costs [s], alone, without gradient and with it; the latter NaN where it was not measured."""
+    """The cost of an episode [s], alone, without and with gradient; the latter NaN where it was not measured."""
 
     forward: float
     gradient: float
 
     @property
     def ratio(self) -> float:
-        """What an episode with gradient costs, in episodes without."""
+        """The cost of an episode with gradient, in episodes without."""
         return self.gradient / self.forward
 
 
@@ -52,13 +52,13 @@ def episode_cost(objective: Objective, *, grad: bool = True) -> EpisodeCost:
 def seconds_per_episode(
     objective: Objective, points: Float[Tensor, "batch dim"], *, grad: bool, count: float = math.inf
 ) -> float:
-    """Measure what an episode costs where many are computed, at points such as those that will be [s].
+    """Measure the cost of an episode in large batches, at points similar to the planned ones [s].
 
-    As many points as there are threads are timed, again (a first time is longer), then more until they take long, or
-    until all that are to be, `count` of them, would not: what is over at once needs no better estimate. A GPU takes a
-    whole batch at once: of one point most would be launches; so does an engine with `whole_batches`, to which one point
-    costs as much. Where its memory does not hold the batch, parts of it are timed, as they will be computed; raises
-    MemoryError where it does not hold one point.
+    As many points as there are threads are timed, twice, because the first time is longer. More points follow until
+    they take long, or until all `count` planned ones would be quick, which need no better estimate. A GPU takes a whole
+    batch at once, because for one point most of the time would be launches. So does an engine with `whole_batches`,
+    where one point costs as much as a batch. If the batch does not fit into its memory, parts of it are timed, as they
+    will be computed. Raises MemoryError where one point does not fit.
     """
     bound = MemoryBound(objective)
     whole = objective.device == "cuda" or objective.whole_batches
@@ -75,9 +75,9 @@ def seconds_per_episode(
 
 
 def start_seconds(objective: Objective, points: Float[Tensor, "batch dim"], *, grad: bool = True) -> float:
-    """Measure what an objective that compiles programs of its own takes until it can evaluate as many points [s].
+    """Measure the start-up time of an objective that compiles its own programs, for this number of points [s].
 
-    It is 0 for others: what these compile, all objectives of their kind share.
+    It is 0 for others, because all objectives of their kind share compiled code.
     """
     if not objective.own_programs:
         return 0.0
@@ -86,7 +86,7 @@ def start_seconds(objective: Objective, points: Float[Tensor, "batch dim"], *, g
 
 
 def measure_seconds(objective: Objective, points: Float[Tensor, "batch dim"], *, grad: bool) -> float:
-    """Return how long one evaluation takes [s]."""
+    """Return the time of one evaluation [s]."""
     start = time.perf_counter()
     objective.evaluate(points, grad=grad)
     return time.perf_counter() - start

@@ -1,4 +1,4 @@
-"""The Hessian of an objective at a point, in box units: by differences, with a step that is chosen and an error."""
+"""The Hessian of an objective at a point, in box units: by differences, with a chosen step and an error."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class FailedPointsError(ValueError):
 
 @dataclass(frozen=True)
 class StepChange:
-    """Say by how much products with the Hessian change [loss unit] from a step [box] to a quarter of it."""
+    """The change of products with the Hessian [loss unit] from a step [box] to a quarter of it."""
 
     step: float
     change: float
@@ -52,10 +52,10 @@ class StepChange:
 
 @dataclass(frozen=True, eq=False)
 class Differences:
-    """Hold second derivatives along unit directions, by steps: NaN where a point failed.
+    """Second derivatives along unit directions, by steps: NaN where a point failed.
 
-    `product` [loss unit], of the Hessian with each direction by gradients, shape (step, direction, dim), without
-    columns where there are none; `curvature` [loss unit], along each direction by losses, shape (step, direction).
+    `product` [loss unit] of the Hessian with each direction, by gradients, shape (step, direction, dim), without
+    columns where there are none. `curvature` [loss unit] along each direction, by losses, shape (step, direction).
     """
 
     product: Array
@@ -68,16 +68,16 @@ class Differences:
 
     @property
     def known(self) -> Array:
-        """What is compared between steps: products, or losses' curvatures, shape (step, value)."""
+        """The values compared between steps: products, or curvatures of losses, shape (step, value)."""
         return (self.product if self.by_gradients else self.curvature).reshape(len(self.curvature), -1)
 
 
 class Curvature:
     """Differences of an objective around a point `z` of the unit box; losses in their unit, lengths in box units.
 
-    Differences are of gradients, or of losses where the objective has none. A point within `EDGE` of a bound is moved
-    inwards, by `moved` at most, unless the objective allows points beyond. `keep` stores what is computed by name.
-    Raises ValueError for a point beyond the bounds.
+    They are differences of gradients, or of losses where the objective has none. A point within `EDGE` of a bound is
+    moved inwards, by at most `moved`, unless the objective allows points outside. `keep` stores results by name. Raises
+    ValueError for a point outside the bounds.
     """
 
     def __init__(self, objective: Objective, x: Float[Tensor, " dim"], *, keep: Keep | None = None) -> None:
@@ -86,7 +86,7 @@ class Curvature:
         self.lower, self.width = space.lower.numpy(), (space.upper - space.lower).numpy()
         given = (x.numpy() - self.lower) / self.width
         if not objective.beyond_box and not bool(in_box(space, x[None]).all()):
-            raise ValueError(f"{objective.name} has no Hessian at a point beyond its bounds; got {x.tolist()}")
+            raise ValueError(f"{objective.name} has no Hessian outside its bounds; got point {x.tolist()}")
         self.z = given if objective.beyond_box else np.clip(given, EDGE, 1 - EDGE)
         self.moved = float(np.abs(self.z - given).max())
         self.keep: Keep = keep or (lambda name, compute: compute())
@@ -103,8 +103,8 @@ class Curvature:
     def centre(self) -> Arrays:
         """The `loss` and the gradient `grad` at the point, the latter of shape (0,) where there is none, and `why`.
 
-        Raises FailedPointsError where the point itself fails, and ValueError where it has neither gradients nor few
-        enough parameters for differences of losses.
+        Raises FailedPointsError where the point itself fails. Raises ValueError where it has no gradients and too many
+        parameters for differences of losses.
         """
         found = self._part("centre", self._centre)
         self.count(1)
@@ -114,18 +114,18 @@ class Curvature:
 
     @property
     def source(self) -> str:
-        """What differences are of: gradients or losses."""
+        """The quantity that is differenced: gradients or losses."""
         return "gradients" if len(self.centre["grad"]) else "losses"
 
     @property
     def whole(self) -> bool:
-        """Whether the matrix is computed as a whole, not products with it."""
+        """Whether the whole matrix is computed, not only products with it."""
         return self.source == "losses" or self.dim <= MATRIX
 
     def _at(self, offsets: Array, *, grad: bool) -> dict[str, Any]:
         """Return losses, shape (point,), and gradients in box units, shape (point, dim), at offsets from the point.
 
-        NaN where they failed, and which `failed`, in words. Without gradients they have no columns.
+        Failed ones are NaN; `failed` describes them. Without gradients there are no columns.
         """
         points = torch.from_numpy(self.lower + (self.z + offsets) * self.width)
         parts = torch.split(points, self.objective.preferred_batch)
@@ -137,7 +137,7 @@ class Curvature:
     def differences(self, directions: Array, steps: Sequence[float], name: str) -> Differences:
         """Return central differences along unit directions, shape (direction, dim), with each of some steps [box].
 
-        A part of the work is kept under the name and a number, as many directions as fill a batch.
+        Parts of the work are stored under the name and a number, each with the directions of one batch.
         """
         grad = self.source == "gradients"
         size = max(1, self.objective.preferred_batch // (2 * len(steps)))
@@ -150,7 +150,7 @@ class Curvature:
         return Differences(product, curvature)
 
     def count(self, episodes: int) -> None:
-        """Count episodes, and tell whoever follows."""
+        """Count episodes, and report the progress."""
         self.episodes += episodes
         self.follow(self.episodes)
 
@@ -158,16 +158,16 @@ class Curvature:
         """Return values that are all finite. Raises FailedPointsError where some are not."""
         if not np.isfinite(values).all():
             raise FailedPointsError(
-                f"{self.objective.name} failed near this point, so that it has no Hessian there: {self._bad}; take "
+                f"{self.objective.name} failed near this point, so it has no Hessian there: {self._bad}; choose "
                 "another point with --through"
             )
         return values
 
     def ladder(self, *, seed: int = 0) -> list[StepChange]:
-        """Return how much second derivatives along a few random directions change from each step to a quarter of it.
+        """Return the change of second derivatives along a few random directions from each step to a quarter of it.
 
-        Left out are steps that leave the box, that a parameter's rounding spoils, and at which a point fails. Raises
-        FailedPointsError where none is left.
+        Steps that leave the box, that rounding of a parameter spoils, or at which a point fails are left out. Raises
+        FailedPointsError where none remains.
         """
         room = float("inf") if self.objective.beyond_box else float(np.minimum(self.z, 1 - self.z).min())
         precision, count = str(self.centre["precision"]), min(self.dim, TRIED[self.source])
@@ -185,7 +185,7 @@ class Curvature:
         return found
 
     def _part(self, name: str, compute: Callable[[], Arrays]) -> Arrays:
-        """Return a part of the work, and note which of its points failed."""
+        """Return a part of the work, and record which of its points failed."""
         found = self.keep(name, compute)
         self.failures.extend(found["failed"].tolist())
         return found
@@ -198,9 +198,9 @@ class Curvature:
             found, why = self._at(zero, grad=False), str(error)
             if self.dim > LOSSES:
                 raise ValueError(
-                    f"{self.objective.name} has no gradients ({error}); differences of losses alone are for {LOSSES} "
-                    f"parameters at most, and it has {self.dim}: give it gradients (gs.from_torch, gs.from_jax, or "
-                    "gs.from_numpy of a function that returns them, too)"
+                    f"{self.objective.name} has no gradients ({error}); differences of losses take at most {LOSSES} "
+                    f"parameters, and it has {self.dim}; give it gradients (gs.from_torch, gs.from_jax, or "
+                    "gs.from_numpy of a function that also returns them)"
                 ) from None
         known = {"loss": found["loss"][0], "grad": found["grad"][0], "failed": found["failed"], "why": np.array(why)}
         return {**known, "precision": np.array(self.objective.precision)}  # which losses tell, of some
@@ -229,20 +229,20 @@ class Curvature:
 
     @property
     def _bad(self) -> str:
-        """What failed, the first few of it in words."""
+        """The first few failed points, in words."""
         more = len(self.failures) - SAID
         return "; ".join(self.failures[:SAID]) + (f"; and {more} more points" if more > 0 else "")
 
 
 @dataclass(frozen=True, eq=False)
 class Spectrum:
-    """Hold eigenvalues [loss unit] of a Hessian in box units, descending, and what is wrong with them.
+    """Eigenvalues [loss unit] of a Hessian in box units, descending, with their errors.
 
-    `values`, shape (pair,), with unit `vectors`, shape (pair, dim): all, or the ends. `residual` |Hv - value v| and
-    `difference`, by how much Hv changes with the step, shapes (pair,). `by_losses`, the curvature that losses have
-    along a vector, and `loss_error` of that; NaN where it was not measured. `nodes` and `weights` are Ritz values by
-    probe and their shares of the spectrum, shape (probe, step), none of a whole matrix. `ladder` says by how much
-    second derivatives change at each step, of which `step` is the one taken.
+    `values`, shape (pair,), with unit `vectors`, shape (pair, dim): all, or those at both ends. `residual` |Hv - value
+    v| and `difference`, the change of Hv with the step, shapes (pair,). `by_losses`, the curvature of losses along a
+    vector, and its `loss_error`; NaN where not measured. `nodes` and `weights` are Ritz values by probe and their
+    shares of the spectrum, shape (probe, step), empty for a whole matrix. `ladder` is the change of second derivatives
+    at each step, and `step` is the one used.
     """
 
     step: float
@@ -261,15 +261,15 @@ class Spectrum:
 
     @property
     def disputed(self) -> NDArray[np.bool_]:
-        """Which eigenvalues losses contradict: by more than the errors of both."""
+        """Which eigenvalues the losses contradict by more than the errors of both."""
         return np.abs(self.by_losses - self.values) > self._own_error + self.loss_error
 
     @property
     def error(self) -> Array:
-        """How far from each value an eigenvalue is at most [loss unit], shape (pair,).
+        """The largest distance of an eigenvalue from each value [loss unit], shape (pair,).
 
-        A symmetric matrix has an eigenvalue within |Hv - value v| of any value (Parlett 1998, theorem 4.5.1); to that
-        comes what Hv itself is off by, what losses say otherwise, and rounding.
+        A symmetric matrix has an eigenvalue within |Hv - value v| of any value (Parlett 1998, theorem 4.5.1). The error
+        of Hv itself, contradictions by losses, and rounding are added.
         """
         return np.where(self.disputed, np.abs(self.by_losses - self.values), self._own_error)
 
@@ -281,10 +281,10 @@ class Spectrum:
 
 
 def measure_spectrum(curvature: Curvature, *, pairs: int, probes: int, seed: int = 0) -> Spectrum:
-    """Return the Hessian's spectrum, with that step of the ladder at which differences change least.
+    """Return the Hessian's spectrum, at the step of the ladder where differences change least.
 
-    Where points fail at this step, or differences change far more than along the directions that were tried, as at a
-    kink that these miss, the next best step is tried, too. Raises FailedPointsError where points fail at all of them,
+    The next best step is also tried if points fail at this step. The same happens if differences change far more than
+    along the tested directions, as at a kink that these miss. Raises FailedPointsError where points fail at all steps,
     ValueError where the objective has no gradients and too many parameters.
     """
     ladder = tuple(curvature.ladder(seed=seed))
@@ -355,7 +355,7 @@ def _matrix(curvature: Curvature, step: float) -> Array:
 def _partial_spectrum(
     curvature: Curvature, step: float, ladder: tuple[StepChange, ...], pairs: int, probes: int, seed: int
 ) -> Spectrum:
-    """Return the ends of the spectrum by ARPACK, and the whole by Lanczos' method from random probes."""
+    """Return the ends of the spectrum by ARPACK, and its density by Lanczos' method from random probes."""
     dim, signs = curvature.dim, np.random.default_rng(seed).choice([-1.0, 1.0], (probes, curvature.dim))
     starts = signs / np.sqrt(dim)
     both = curvature.differences(starts, (step, step / QUARTER), f"starts-{step:g}").product
@@ -381,7 +381,7 @@ def _partial_spectrum(
 
 @dataclass(frozen=True, eq=False)
 class _Krylov:
-    """Hold Lanczos' method from several starts: `basis`, shape (step, start, dim), and Ritz values with their weights.
+    """Lanczos' method from several starts: `basis`, shape (step, start, dim), and Ritz values with their weights.
 
     `ritz` are the coefficients of the Ritz vectors, shape (start, step, step).
     """
@@ -392,7 +392,7 @@ class _Krylov:
     ritz: Array
 
     def vectors(self, count: int) -> Array:
-        """Return the Ritz vectors at both ends that the first start has, shape (2 count, dim)."""
+        """Return the Ritz vectors at both ends from the first start, shape (2 count, dim)."""
         shown = ends(self.nodes.shape[1], count)
         return _unit(self.ritz[0][:, shown].T @ self.basis[:, 0])
 
@@ -422,10 +422,10 @@ def _lanczos(curvature: Curvature, step: float, starts: Array, first: Array) -> 
 
 
 def _extremes(curvature: Curvature, step: float, known: _Krylov, count: int, noise: float) -> Array:
-    """Return unit vectors at both ends of the spectrum, shape (2 count, dim), to the differences' own error.
+    """Return unit vectors at both ends of the spectrum, shape (2 count, dim), to the error of the differences.
 
-    Where ARPACK does not converge they are the Ritz vectors, whose residuals say how far they are off. The spectrum is
-    shifted to its middle, so that both its ends are large.
+    Where ARPACK does not converge they are the Ritz vectors, whose residuals give their error. The spectrum is shifted
+    to its middle, so that both its ends are large.
     """
     from scipy.sparse.linalg import ArpackError, LinearOperator, eigsh
 
@@ -458,7 +458,7 @@ def _extremes(curvature: Curvature, step: float, known: _Krylov, count: int, noi
 def _examine(
     curvature: Curvature, step: float, vectors: Array, values: Array | None = None
 ) -> tuple[Array, Array, Array, Array]:
-    """Return |Hv - value v|, how much Hv changes to a quarter of the step, curvatures by losses, and the values.
+    """Return |Hv - value v|, the change of Hv to a quarter of the step, curvatures by losses, and the values.
 
     The values are v'Hv where none are given. Without gradients the first two are those of v'Hv alone.
     """
@@ -475,7 +475,7 @@ def _examine(
 
 
 def _loss_error(curvature: Curvature, step: float) -> float:
-    """Return what noise and rounding of losses make of their second difference over a step."""
+    """Return the error of the losses' second difference over a step, from noise and rounding of losses."""
     from .measures.noise import noise
 
     rounding = LAST_PLACE[str(curvature.centre["precision"])]
@@ -491,7 +491,7 @@ def _loss_error(curvature: Curvature, step: float) -> float:
 
 
 def ends(size: int, count: int) -> NDArray[np.int64]:
-    """Return the places of `count` at the beginning and as many at the end, all where they meet."""
+    """Return the positions of the first and the last `count`, or all where they meet."""
     return np.arange(size) if size <= 2 * count else np.r_[:count, size - count : size]
 
 

@@ -1,4 +1,4 @@
-"""Directions to cut a landscape along: random, along the gradient, along the curvature; lines between points."""
+"""Directions of slices: random, along the gradient, along the curvature; lines between points."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ SHARES = "shares of the box"
 
 
 def orthonormal(generator: np.random.Generator, dim: int) -> Array:
-    """Draw two orthonormal directions, evenly over all of them; shape (2, dim)."""
+    """Draw two orthonormal directions, uniformly; shape (2, dim)."""
     frame, scale = np.linalg.qr(generator.standard_normal((dim, 2)))
     directions: Array = (frame * np.sign(np.diag(scale))).T
     return directions
 
 
 def random_directions(space: ParameterSpace, seed: int) -> tuple[Array, list[str]]:
-    """Return two random directions, orthonormal in widths of the box, and what they are called."""
+    """Return two random directions, orthonormal in widths of the box, and their labels."""
     _two(space)
     labels = [f"random direction {axis} [{SHARES}]" for axis in (1, 2)]
     return orthonormal(np.random.default_rng(seed), space.dim), labels
@@ -38,20 +38,20 @@ def filter_directions(space: ParameterSpace, x: Float[Tensor, " dim"], seed: int
     """Return two random directions, filter-normalised at a point (Li et al. 2018), in the parameters' own units.
 
     Gaussian noise is scaled filter by filter, so that each filter of a direction has the norm of that filter at the
-    point; biases do not change. Directions are not made orthogonal, as theirs are not. Raises ValueError where the
-    space, that of what is called `name`, has no filters, and where all of them are zero at the point.
+    point; biases do not change. As in the paper, the directions are not made orthogonal. Raises ValueError where the
+    space of `name` has no filters, and where all of them are zero at the point.
     """
     filters, here = space.filters, x.numpy()
     if not filters:
         raise ValueError(
-            f"{name} does not say which of its {space.dim} parameters are the weights of one neuron; make its space by "
-            "ParameterSpace.of_weights({'weight': (8, 3), 'bias': (8,)}), or cut along random:SEED"
+            f"{name} does not say which of its {space.dim} parameters are the weights of one neuron; make its space "
+            "with ParameterSpace.of_weights({'weight': (8, 3), 'bias': (8,)}), or slice along random:SEED"
         )
     norms = np.array([np.linalg.norm(here[own]) for own in filters])
     if not norms.any():
         raise ValueError(
-            f"all filters of {name} are zero at this point, so directions have no length there; cut it "
-            "--through another"
+            f"all filters of {name} are zero at this point, so directions have no length there; choose another point "
+            "with --through"
         )
     noise, found = np.random.default_rng(seed).standard_normal((2, space.dim)), np.zeros((2, space.dim))
     for own, norm in zip(filters, norms, strict=True):
@@ -61,25 +61,25 @@ def filter_directions(space: ParameterSpace, x: Float[Tensor, " dim"], seed: int
 
 
 def gradient_directions(objective: Objective, x: Float[Tensor, " dim"]) -> tuple[Array, list[str]]:
-    """Return the gradient's direction, and the one orthogonal to it that changes it most: of H g without g.
+    """Return the gradient's direction, and the orthogonal one along which the gradient changes most.
 
-    Both are orthonormal in widths of the box. Raises ValueError where the gradient is zero or not known, and where its
-    change has no part orthogonal to it.
+    The second is H g without its part along g. Both are orthonormal in widths of the box. Raises ValueError where the
+    gradient is zero or unknown, and where its change has no orthogonal part.
     """
     _two(objective.space)
     curvature = Curvature(objective, x)
     g = curvature.centre["grad"]
     if not len(g):
-        raise ValueError(f"{objective.name} has no gradients to cut along; cut along random:SEED instead")
+        raise ValueError(f"{objective.name} has no gradients to slice along; slice along random:SEED instead")
     if not (size := float(np.linalg.norm(g))):
-        raise ValueError(f"{objective.name} has a gradient of zero at this point; cut it through another")
+        raise ValueError(f"{objective.name} has a zero gradient at this point; choose another point with --through")
     first = g / size
     step = min(curvature.ladder(), key=lambda one: one.change).step
     change = curvature.refuse_failed(curvature.differences(first[None], (step,), "gradient").product[0, 0])
     second = change - (change @ first) * first
     if not np.linalg.norm(second) > 1e-6 * np.linalg.norm(change):  # what differences of gradients can tell from none
         raise ValueError(
-            f"{objective.name}'s gradient changes along itself only at this point; cut along random:SEED instead"
+            f"{objective.name}'s gradient changes only along itself at this point; slice along random:SEED instead"
         )
     labels = [f"gradient [{SHARES}]", f"where the gradient turns most [{SHARES}]"]
     return np.stack([first, second / np.linalg.norm(second)]), labels
@@ -88,13 +88,13 @@ def gradient_directions(objective: Objective, x: Float[Tensor, " dim"]) -> tuple
 def hessian_directions(objective: Objective, x: Float[Tensor, " dim"]) -> tuple[Array, list[str]]:
     """Return the two eigenvectors of the Hessian with the largest curvatures, by magnitude, in widths of the box.
 
-    They are those that `landscape hessian` measures; the largest component of each is positive. Raises ValueError where
-    points fail, where there is no curvature, and where there are no gradients and too many parameters.
+    They are those of `landscape hessian`; the largest component of each is positive. Raises ValueError where points
+    fail, where there is no curvature, and where there are no gradients and too many parameters.
     """
     _two(objective.space)
     found = measure_spectrum(Curvature(objective, x), pairs=2, probes=1)
     if not np.abs(found.values).max():
-        raise ValueError(f"{objective.name} has no curvature at this point; cut it through another")
+        raise ValueError(f"{objective.name} has no curvature at this point; choose another point with --through")
     order = np.argsort(-np.abs(found.values), kind="stable")[:2]
     labels = [
         f"Hessian's direction {axis + 1}, curvature {found.values[at]:.3g} \N{PLUS-MINUS SIGN} {found.error[at]:.2g} "
@@ -106,7 +106,7 @@ def hessian_directions(objective: Objective, x: Float[Tensor, " dim"]) -> tuple[
 
 def _two(space: ParameterSpace) -> None:
     if space.dim < 2:
-        raise ValueError("two directions take two parameters and more; got one")
+        raise ValueError("two directions need at least two parameters; got one")
 
 
 def joining(
@@ -114,8 +114,8 @@ def joining(
 ) -> Plane:
     """Return the line from one point to another, or the plane through three: the first at 0, the others at 1.
 
-    A line's ends are samples, and it continues a little beyond them where the box does. Raises ValueError where
-    points are the same or lie on a line.
+    A line's ends are samples, and it continues a little beyond them within the box. Raises ValueError where points are
+    equal or on one line.
     """
     along = torch.stack([point - points[0] for point in points[1:]])
     labels = [f"from {names[0]} to {name}" for name in names[1:]]
@@ -131,10 +131,10 @@ def joining(
 
 
 def barrier(u: Array, loss: Array) -> float:
-    """Return the height of the barrier between 0 and 1 [loss unit]: the most that losses lie above the straight line.
+    """Return the height of the barrier between 0 and 1 [loss unit]: the largest loss above the straight line.
 
-    That line joins the losses of both ends (Frankle et al. 2020, Garipov et al. 2018). It is of the samples: a lower
-    bound where the landscape is finer. NaN where an end or any sample between failed.
+    That line joins the losses of both ends (Frankle et al. 2020, Garipov et al. 2018). Between samples the barrier can
+    be higher. NaN where an end or any sample between failed.
     """
     between = (u > -1e-9) & (u < 1 + 1e-9)
     at, height = u[between], loss[between]

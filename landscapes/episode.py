@@ -1,4 +1,4 @@
-"""An episode as it is drawn: its frames over time, and the look of the things in them."""
+"""An episode to draw: its frames over time, and the look of its objects."""
 
 from __future__ import annotations
 
@@ -48,11 +48,11 @@ Material = Literal[
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """Hold the shape, material and motion of one thing in an episode.
+    """The shape, material and motion of one object in an episode.
 
-    `at` [m], shape (frame, point, 3), is where it is: the vertices of a sheet, the particles of a lump, the points of a
-    path, else the places of so many copies of a solid of `size` [m]. `turn`, shape (frame, 3, 3), rotates solids about
-    their places; `tint` tells parts of one material apart.
+    `at` [m], shape (frame, point, 3), is its position: the vertices of a sheet, the particles of a lump, the points of
+    a path, or the positions of copies of a solid of `size` [m]. `turn`, shape (frame, 3, 3), rotates solids about their
+    positions; `tint` distinguishes parts of one material.
     """
 
     shape: Shape
@@ -66,9 +66,9 @@ class Part:
 
 @dataclass(frozen=True)
 class View:
-    """Say what a picture shows: the box from `lower` to `upper` [m], seen from the direction `eye`, y upwards.
+    """The visible box from `lower` to `upper` [m], seen from the direction `eye`, y upwards.
 
-    `ground` is the height of the ground that is drawn [m], None for none.
+    `ground` is the height of the drawn ground [m], None for none.
     """
 
     lower: Point
@@ -79,10 +79,10 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class Episode:
-    """Hold the frames of one episode to draw.
+    """The frames of one episode to draw.
 
     `time` [s], shape (frame,); `points` [m], body name -> shape (frame, point, axis); `tools` [m], tool name -> shape
-    (frame, axis). `parts` say what all of it looks like, and `view` from where.
+    (frame, axis). `parts` describe their look, and `view` the viewpoint.
     """
 
     time: Float[Tensor, " frame"]
@@ -92,7 +92,7 @@ class Episode:
     view: View | None = None
 
     def viewpoint(self) -> View:
-        """Return the view of the episode, or one of all that its parts take up where it has none."""
+        """Return the view of the episode, or one that includes all its parts if it has none."""
         if self.view:
             return self.view
         every = np.concatenate([part.at.reshape(-1, 3).numpy() for part in self.parts])
@@ -101,9 +101,9 @@ class Episode:
         return View(tuple((low - room).tolist()), tuple((high + room).tolist()), ground=None)
 
     def show(self, keys: int = 5) -> Picture:
-        """Draw so many key frames side by side, evenly spaced from the first to the last; a notebook shows the picture.
+        """Draw this many key frames in a row, evenly spaced from the first to the last; a notebook shows the picture.
 
-        Raises ValueError where the episode has no `parts`, which say what things look like.
+        Raises ValueError where the episode has no `parts`, which describe the look of its objects.
         """
         from .draw.figure import figure_of
 

@@ -1,4 +1,4 @@
-"""A slice or a run as a table or a file that other programs read: CSV, Parquet, netCDF."""
+"""Write a slice or a run as a file for other programs: CSV, Parquet, netCDF."""
 
 from __future__ import annotations
 
@@ -25,12 +25,11 @@ SUFFIXES = {"csv": ".csv", "parquet": ".parquet", "netcdf": ".nc"}
 def save_as(dataset: xr.Dataset, path: Path, kind: str) -> None:
     """Write a slice or a run as csv, parquet or netcdf, whole or not at all.
 
-    The first two hold `frame`; the last holds the dataset itself, with all of its attributes.
-
-    Raises ValueError where `kind` is another.
+    The first two contain `frame`; netcdf contains the dataset itself, with all its attributes. Raises ValueError for
+    another `kind`.
     """
     if kind not in SUFFIXES:
-        raise ValueError(f"a slice or a run is exported to {', '.join(SUFFIXES)}; got {kind!r}")
+        raise ValueError(f"export takes {', '.join(SUFFIXES)}; got {kind!r}")
     with replacing(path) as partial:
         if kind == "netcdf":
             dataset.to_netcdf(partial)
@@ -41,7 +40,7 @@ def save_as(dataset: xr.Dataset, path: Path, kind: str) -> None:
 
 
 def save_csv(table: pd.DataFrame, path: Path) -> None:
-    """Write a table as CSV in which no cell is a formula to a spreadsheet: headings and words are `quoted`."""
+    """Write a table as CSV without cells that a spreadsheet would take for formulas: words are `quoted`."""
     words = table.select_dtypes(exclude=["number", "bool"]).columns
     table = table.assign(**{name: table[name].map(quoted) for name in words})
     table.rename(columns=quoted).to_csv(path, index=False)
@@ -70,9 +69,9 @@ def _is_formula(cell: str) -> bool:
 def frame(dataset: xr.Dataset) -> pd.DataFrame:
     """Return a slice, a row for each sample, or a run, a row for each episode, columns named with their units.
 
-    A slice's rows begin with the values along the plane's axes, a run's with those of the parameters; then come the
-    loss, in words how the evaluation ended and, where they were asked for, the gradient's components: of a logarithmic
-    parameter "gradient by log10 k", per decade.
+    A slice's rows begin with the values along the plane's axes, a run's with those of the parameters. Then come the
+    loss, the status in words and, if requested, the gradient's components. For a logarithmic parameter the column is
+    "gradient by log10 k", per decade.
     """
     import pandas as pd
 

@@ -1,4 +1,4 @@
-"""Points that other programs evaluated, as a table laid over a slice like a run: CSV, Parquet, pandas, Optuna, Ax."""
+"""Points that other programs evaluated, overlaid on a slice like a run: CSV, Parquet, pandas, Optuna, Ax."""
 
 from __future__ import annotations
 
@@ -44,14 +44,14 @@ Values = NDArray[np.float64]
 
 
 class GivenKind(IntEnum):
-    """Say what a point of another program was evaluated for, which is not known."""
+    """The purpose of a point of another program, which is unknown."""
 
     GIVEN = 0
 
 
 @dataclass(frozen=True)
 class Trials:
-    """Hold the trials of a search by another program; where it maximised, losses are its values `negated`."""
+    """The trials of a search by another program; if it maximised, losses are its values `negated`."""
 
     frame: pd.DataFrame
     negated: bool
@@ -76,7 +76,7 @@ def read_points(path: Path) -> pd.DataFrame:
 
 
 def _read_csv(path: Path) -> pd.DataFrame:
-    """Return the cells of a CSV file, separated by commas, semicolons or tabs, as text; lines without any are no rows.
+    """Return the cells of a CSV file, separated by commas, semicolons or tabs, as text; empty lines are skipped.
 
     Decimal commas become points where commas do not separate. Raises ValueError for a row longer than the heading.
     """
@@ -105,17 +105,17 @@ def _read_csv(path: Path) -> pd.DataFrame:
 
 
 def _separator(heading: str) -> str:
-    """Return what separates the cells of a heading: what makes most of them, a comma where nothing does."""
+    """Return the separator of a heading's cells: the one that makes most cells, a comma where none does."""
     return max(SEPARATORS, key=lambda one: len(next(csv.reader([heading], delimiter=one), [])))
 
 
 def table_point(space: ParameterSpace, text: str) -> Tensor | None:
-    """Return the point in a row of a table, FILE:ROW; FILE alone is its row of the least loss.
+    """Return the point in a row of a table, FILE:ROW; FILE alone is its row with the lowest loss.
 
-    The table is a CSV or Parquet file whose columns are called as the parameters, with or without their units in
-    brackets. ROW counts as the file does: row 1 of a CSV file is its heading. None is returned where `text` names no
-    such file: a CSV file without a name of a parameter is none. Raises ValueError where a column is missing or the row
-    is not there, holds no numbers, or is not said: of several rows without a loss none is best.
+    The table is a CSV or Parquet file whose columns have the names of the parameters, with or without their units in
+    brackets. ROW counts as in the file: row 1 of a CSV file is its heading. Returns None where `text` names no such
+    file; a CSV file without a parameter name does not count. Raises ValueError where a column or the row is missing,
+    where the row has no numbers, and where several rows without a loss leave the choice open.
     """
     place, colon, number = text.rpartition(":")
     path, row = (Path(place), number) if colon and number.isdecimal() and len(number) <= DIGITS else (Path(text), "")
@@ -131,7 +131,7 @@ def table_point(space: ParameterSpace, text: str) -> Tensor | None:
     if at < 0:
         heading = " (1 is the heading)" if path.suffix.lower() == ".csv" else ""
         raise ValueError(
-            f"{path} has points in its rows {frame.index[0]} to {frame.index[-1]}{heading}; got row {int(row)}"
+            f"{path} has points in rows {frame.index[0]} to {frame.index[-1]}{heading}; got row {int(row)}"
         )
     if gaps := _gaps(frame, x[[at]], space, str(path)):
         raise ValueError(f"row {frame.index[at]} of {path} has no number in column {gaps[0]}")
@@ -139,9 +139,9 @@ def table_point(space: ParameterSpace, text: str) -> Tensor | None:
 
 
 def _best_row(frame: pd.DataFrame, x: Values, name: str) -> int:
-    """Return the position of the row with the least loss, of those that hold a point."""
+    """Return the position of the row with the lowest loss among those with a point."""
     names = [one for one in _heading(frame) if one.casefold() == LOSS or one.casefold().startswith(f"{LOSS} [")]
-    rows = f"say which one, {name}:ROW, as the file counts them"
+    rows = f"choose one as {name}:ROW, counted as in the file"
     if not names:
         if len(frame) > 1:
             raise ValueError(f"{name} has {len(frame)} rows and no column {LOSS!r}; {rows}")
@@ -153,19 +153,19 @@ def _best_row(frame: pd.DataFrame, x: Values, name: str) -> int:
 
 
 def study_trials(study: Any) -> Trials:
-    """Return the trials of an Optuna study, numbered as there; of a study that maximises the values are negated.
+    """Return the trials of an Optuna study, with its numbers; values are negated if the study maximises.
 
     Raises ValueError where the study has several goals, or no trial.
     """
     directions = [direction.name for direction in study.directions]
     if len(directions) != 1:
         raise ValueError(
-            f"Optuna's study {study.study_name!r} has the directions {', '.join(directions)}; a loss is one value, so "
-            f"give a table with a column {LOSS} instead"
+            f"Optuna's study {study.study_name!r} has the directions {', '.join(directions)}; a loss is a single "
+            f"value, so pass a table with a column {LOSS} instead"
         )
     trials = study.trials_dataframe(attrs=("number", VALUE, "params", STATE))
     if not len(trials):
-        raise ValueError(f"Optuna's study {study.study_name!r} holds no trial yet; `study.optimize` evaluates them")
+        raise ValueError(f"Optuna's study {study.study_name!r} has no trial yet; run `study.optimize` first")
     negated = directions == ["MAXIMIZE"]
     if negated:
         trials[VALUE] = -trials[VALUE].astype(float)
@@ -173,10 +173,10 @@ def study_trials(study: Any) -> Trials:
 
 
 def experiment_trials(experiment: Any) -> Trials:
-    """Return the arms of an Ax experiment's trials that have ended, a column for each parameter and one for the loss.
+    """Return the arms of an Ax experiment's ended trials, a column for each parameter and one for the loss.
 
-    An arm of a trial that failed or was abandoned has no loss; of one that was measured step by step the last counts.
-    Of an experiment that maximises the values are negated. Raises ValueError where it has several goals, or no arm.
+    An arm of a failed or abandoned trial has no loss. If a trial was measured step by step, the last value counts.
+    Values are negated if the experiment maximises. Raises ValueError where it has several goals, or no arm.
     """
     import pandas as pd
 
@@ -184,8 +184,8 @@ def experiment_trials(experiment: Any) -> Trials:
     objective = None if config is None else config.objective
     if objective is None or len(objective.metric_names) != 1:
         raise ValueError(
-            f"Ax's experiment {experiment.name!r} has the objective {objective}; a loss is one metric, so give a table "
-            f"with a column {LOSS} instead"
+            f"Ax's experiment {experiment.name!r} has the objective {objective}; a loss is a single metric, so pass a "
+            f"table with a column {LOSS} instead"
         )
     data, sign = experiment.lookup_data().df, 1.0 if objective.minimize else -1.0
     measured = data[data["metric_name"] == objective.metric_names[0]]
@@ -197,7 +197,7 @@ def experiment_trials(experiment: Any) -> Trials:
         for arm in trial.arms
     ]
     if not rows:
-        raise ValueError(f"Ax's experiment {experiment.name!r} holds no trial that has ended")
+        raise ValueError(f"Ax's experiment {experiment.name!r} has no ended trial")
     return Trials(pd.DataFrame(rows), sign < 0)
 
 
@@ -206,13 +206,11 @@ def points_table(
 ) -> xr.Dataset:
     """Return the points of a table, a row each in the order of evaluation, as `landscapes.overlay.overlay` takes a run.
 
-    The columns are called as the parameters of the slice `dataset`, with or without their units in brackets, or as
-    "loss", or as Optuna's `trials_dataframe` calls them; others do not count. A loss that is missing or not finite says
-    that the evaluation failed. A row without a number for each parameter is skipped, and counted in the attribute
-    `skipped`; `note` takes what is said of it. `space` is what the points are of, `name` what a picture calls them.
-    Gradients are not known.
-
-    Raises ValueError where a column is missing, is there twice or holds no numbers, and where there is no point.
+    Columns have the names of the parameters of the slice `dataset`, with or without their units in brackets, "loss", or
+    the names in Optuna's `trials_dataframe`. Other columns are ignored. A missing or non-finite loss means that the
+    evaluation failed. A row without a number for each parameter is skipped, and counted in the attribute `skipped`;
+    `note` receives the messages. `space` is the space of the points, and `name` labels them in a picture. Gradients are
+    unknown. Raises ValueError where a column is missing, duplicate or without numbers, and where there is no point.
     """
     unit = str(dataset["loss"].attrs.get("units", ""))
     frame = _points_of(frame, space, name, note)
@@ -222,13 +220,13 @@ def points_table(
     if gaps := ", ".join(_gaps(frame, x, space, name)):
         note(f"{name}: {skipped} of {len(x)} rows skipped: no number in column {gaps}")
     if not point.any():
-        raise ValueError(f"{name} holds no point: each of its {len(x)} rows lacks a number in column {gaps}")
+        raise ValueError(f"{name} has no point: each of its {len(x)} rows lacks a number in column {gaps}")
     points = space.from_values(torch.from_numpy(x[point])).numpy()
     return _run_of(points, loss[point], dataset, space, name).assign_attrs(skipped=skipped)
 
 
 def _run_of(x: Values, loss: Values, dataset: xr.Dataset, space: ParameterSpace, name: str) -> xr.Dataset:
-    """Return points and their losses as a run of the landscape of which `dataset` is a slice."""
+    """Return points and their losses as a run in the landscape of the slice `dataset`."""
     ended = np.where(np.isfinite(loss), Status.OK, Status.NONFINITE).astype(np.int8)
     deep, flat = ("evaluation", "dim"), "evaluation"
     data = {
@@ -250,27 +248,27 @@ def _run_of(x: Values, loss: Values, dataset: xr.Dataset, space: ParameterSpace,
 
 
 def _points_of(frame: pd.DataFrame, space: ParameterSpace, name: str, note: Note = lambda _: None) -> pd.DataFrame:
-    """Return the rows of a table that may hold points: not one of units below the heading, nor trials that continue.
+    """Return the rows of a table that can be points: no row of units below the heading, no running trials.
 
     Raises ValueError where there is none.
     """
     if len(frame) and (units := _units(frame, space)):
-        note(f"{name}: row {frame.index[0]} holds units ({', '.join(units)}) and is no point")
+        note(f"{name}: row {frame.index[0]} contains units ({', '.join(units)}) and is skipped")
         frame = frame.iloc[1:]
     if not len(frame):
-        raise ValueError(f"{name} holds no point: below its heading there is no row of numbers")
+        raise ValueError(f"{name} has no point: there is no row of numbers below its heading")
     ended = _ended(frame)
     if len(ended) < len(frame):
         note(f"{name}: {len(frame) - len(ended)} of {len(frame)} trials have not ended and are left out")
     if not len(ended):
-        raise ValueError(f"{name} holds no point: none of its {len(frame)} trials has ended")
+        raise ValueError(f"{name} has no point: none of its {len(frame)} trials has ended")
     return ended
 
 
 def _units(frame: pd.DataFrame, space: ParameterSpace) -> list[str]:
-    """Return the words of the first row where it holds units.
+    """Return the words of the first row if it contains units.
 
-    It does where no cell is a number, none says that one lacks, and a word stands in a column that should hold numbers.
+    It does if no cell is a number or marks a missing one, and a word is in a column for numbers.
     """
     wanted = {one.casefold() for names in _names(space) for one in names} | {LOSS, VALUE}
     cells = dict(zip(_heading(frame, str.casefold), frame.iloc[0].tolist(), strict=False))
@@ -282,7 +280,7 @@ def _units(frame: pd.DataFrame, space: ParameterSpace) -> list[str]:
 def _ended(frame: pd.DataFrame) -> pd.DataFrame:
     """Return the trials of Optuna's `trials_dataframe` that have ended, with a loss where they are complete.
 
-    Any other table is returned as it is.
+    Any other table is returned unchanged.
     """
     names = _heading(frame)
     if names.count(VALUE) != 1 or names.count(STATE) != 1:
@@ -295,20 +293,20 @@ def _ended(frame: pd.DataFrame) -> pd.DataFrame:
 
 
 def _heading(frame: pd.DataFrame, case: Callable[[str], str] = str) -> list[str]:
-    """Return the names of the columns; those of several levels, as Optuna may have them, are joined."""
+    """Return the names of the columns; those of several levels, as Optuna can have them, are joined."""
     parts = (one if isinstance(one, tuple) else (one,) for one in frame.columns)
     return [case("_".join(str(part) for part in name if part != "").strip()) for name in parts]
 
 
 def _names(space: ParameterSpace) -> list[tuple[str, str, str]]:
-    """Return what the column of each parameter may be called."""
+    """Return the possible names of the column of each parameter."""
     return [(name, label, PARAMETER + name) for name, label in zip(space.names, space.labels, strict=True)]
 
 
 def _parameters(frame: pd.DataFrame, space: ParameterSpace, name: str) -> Values:
     """Return the parameters in each row, shape (row, dim), NaN where there is no number.
 
-    Raises ValueError where a column is missing, is there twice, or holds no number at all.
+    Raises ValueError where a column is missing, duplicate, or without any number.
     """
     columns = []
     for at in _places(frame, space, name):
@@ -320,7 +318,7 @@ def _parameters(frame: pd.DataFrame, space: ParameterSpace, name: str) -> Values
 
 
 def _places(frame: pd.DataFrame, space: ParameterSpace, name: str) -> list[int]:
-    """Return where the column of each parameter is."""
+    """Return the position of the column of each parameter."""
     every = _names(space)
     return [_place(frame, own, name, {one for other in every if other != own for one in other}) for own in every]
 
@@ -335,7 +333,7 @@ def _gaps(frame: pd.DataFrame, x: Values, space: ParameterSpace, name: str) -> l
 def _losses(frame: pd.DataFrame, names: Sequence[str], name: str) -> Values:
     """Return the loss in each row, not finite where there is none.
 
-    Raises ValueError where the column is missing, is there twice, or holds words alone that do not say that.
+    Raises ValueError where the column is missing, duplicate, or has only words that do not mean a missing loss.
     """
     at = _place(frame, names, name)
     values = _column(frame, at)
@@ -345,9 +343,9 @@ def _losses(frame: pd.DataFrame, names: Sequence[str], name: str) -> Values:
 
 
 def _place(frame: pd.DataFrame, names: Sequence[str], name: str, others: Collection[str] = ()) -> int:
-    """Return where the column is that has one of the names, or else one of them in other capitals.
+    """Return the position of the column with one of the names, or else with one of them in other capitals.
 
-    What is exactly the name of one of the `others` is theirs. Raises ValueError where there is none, or several are.
+    A column with exactly a name in `others` belongs to them. Raises ValueError where there is none, or several.
     """
     heading = _heading(frame)
     folded = [one.casefold() for one in names]
@@ -360,13 +358,13 @@ def _place(frame: pd.DataFrame, names: Sequence[str], name: str, others: Collect
         raise ValueError(f"{name} has several columns for {names[0]!r}: {twice}; keep one of them")
     there = ", ".join(heading[:LISTED]) + (", ..." if len(heading) > LISTED else "")
     raise ValueError(
-        f"{name} has no column {names[0]!r}; its columns are {there or 'none'}. There must be one for each "
-        f"parameter, called as it is, and {LOSS}"
+        f"{name} has no column {names[0]!r}; its columns are {there or 'none'}. It needs a column for each parameter, "
+        f"with its name, and {LOSS}"
     )
 
 
 def _column(frame: pd.DataFrame, at: int) -> Values:
-    """Return a column as numbers, NaN where a cell holds none."""
+    """Return a column as numbers, NaN for cells without a number."""
     cells = frame.iloc[:, at]
     if getattr(cells.dtype, "kind", "O") in "iufb":
         numbers: Values = cells.to_numpy(np.float64, na_value=np.nan)
@@ -375,7 +373,7 @@ def _column(frame: pd.DataFrame, at: int) -> Values:
 
 
 def _number(cell: Any) -> float:
-    """Return a cell as a number, NaN where it is none."""
+    """Return a cell as a number, NaN if it is none."""
     try:
         return float(cell)
     except (TypeError, ValueError, OverflowError):
@@ -383,13 +381,13 @@ def _number(cell: Any) -> float:
 
 
 def _is_word(cell: Any) -> bool:
-    """Return whether a cell holds something that is no number, and does not say that a number lacks."""
+    """Return whether a cell is no number, and does not mark a missing one."""
     return isinstance(cell, str) and np.isnan(_number(cell)) and cell.strip().casefold() not in MISSING
 
 
 def _refuse_words(frame: pd.DataFrame, at: int, name: str) -> None:
-    """Raise ValueError for a column without a number, with the first cell that it holds in its place."""
+    """Raise ValueError for a column without a number, quoting its first cell."""
     cells = frame.iloc[:, at]
     first = next((row for row, cell in enumerate(cells) if _is_word(cell)), 0)
     there = f"row {frame.index[first]} has {cells.iloc[first]!r}"
-    raise ValueError(f"the column {_heading(frame)[at]!r} of {name} holds no numbers: {there}")
+    raise ValueError(f"the column {_heading(frame)[at]!r} of {name} contains no numbers: {there}")

@@ -1,4 +1,4 @@
-"""The identity of a slice or a run: all settings that decide its numbers; stores of different ones are never mixed."""
+"""The identity of a slice or a run: all settings that decide its numbers; stores never mix different ones."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ VERSIONS, PACKAGE = "versions", "gradscape"  # in a provenance; the package's ow
 
 
 class StoreError(ValueError):
-    """A path does not hold the store that was asked for."""
+    """A path does not contain the requested store."""
 
 
 class StoreExistsError(StoreError):
@@ -44,36 +44,36 @@ class StoreExistsError(StoreError):
 
 
 class StoreMismatchError(StoreError):
-    """A store was made by other settings."""
+    """A store has other settings."""
 
 
 class DamagedError(StoreError):
-    """A file is not what was written."""
+    """The content of a file differs from what was written."""
 
     @classmethod
     def of(cls, path: Path, why: str, todo: str) -> DamagedError:
-        """Return the error for a file, with the reason and what to do."""
+        """Return the error for a file, with the reason and the advice."""
         return cls(f"{path} is damaged ({why}); {todo}")
 
 
 def full_identity(identity: Mapping[str, Any], plane: Plane, space: ParameterSpace, *, grad: bool) -> dict[str, Any]:
-    """Add to a caller's settings what the slice itself decides, as plain JSON.
+    """Add the settings of the slice itself to a caller's settings, as plain JSON.
 
-    Raises ValueError where the settings hold a name of the slice's own, or are not plain JSON.
+    Raises ValueError where the settings contain a name of the slice's own, or are not plain JSON.
     """
     own = {"plane": plane.record(), **record_parameters(space), "gradients": grad}
     if clash := own.keys() & identity.keys():
-        raise ValueError(f"a slice's identity gets {', '.join(sorted(clash))} from the slice; leave them out")
+        raise ValueError(f"a slice's identity takes {', '.join(sorted(clash))} from the slice; leave them out")
     return plain_json({**identity, **own}, "a slice's identity")
 
 
 def record_parameters(space: ParameterSpace) -> dict[str, Any]:
-    """Return what an identity says of the parameters: their names, and their scales unless all are linear."""
+    """Return the part of an identity on parameters: their names, and their scales unless all are linear."""
     return {"parameters": list(space.names), **({} if space.is_linear else {SCALES: list(space.scales)})}
 
 
 def stored_scales(dataset: xr.Dataset) -> tuple[str, ...]:
-    """Return the scales that the parameters of a slice or a run are on, linear where nothing else is said."""
+    """Return the scales of the parameters of a slice or a run, linear by default."""
     from .space import LINEAR
 
     about = stored_identity(dataset) if "identity" in dataset.attrs else {}
@@ -81,17 +81,17 @@ def stored_scales(dataset: xr.Dataset) -> tuple[str, ...]:
 
 
 def current_identity(stored: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a stored identity as it is written now.
+    """Return a stored identity in its present form.
 
-    Results of before there were versions hold the package's version and digests of source text instead. They count as
-    of version 1: by measurement, that is what every one in the gallery computes whose losses are of its scene today.
+    Results from before model versions have the package's version and digests of source text instead. They count as
+    version 1. By measurement, every one of them in the gallery with today's losses is version 1.
     """
     new = {name: 1 for old, name in REPLACED.items() if old in stored}
     return {**new, **{name: value for name, value in stored.items() if name not in (*REPLACED, PACKAGE)}}
 
 
 def current_provenance(stored: Mapping[str, Any], identity: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a stored provenance with the package's version, which the identity stored with it held before."""
+    """Return a stored provenance with the package's version, which the identity stored with it contained before."""
     return with_package(stored, str(identity[PACKAGE])) if PACKAGE in identity else dict(stored)
 
 
@@ -101,20 +101,20 @@ def with_package(provenance: Mapping[str, Any], version: str = __version__) -> d
 
 
 def with_stride(identity: Mapping[str, Any], gradients: int) -> dict[str, Any]:
-    """Add to a slice's settings that it has gradients at every so many samples along each axis, where that says more.
+    """Add the stride of gradients to a slice's settings, where that is not one.
 
-    Whether it has any at all is said by its store.
+    Whether it has gradients at all is recorded in its store.
     """
     return {**identity, EVERY: gradients} if gradients > 1 else dict(identity)
 
 
 def gradient_stride(identity: Mapping[str, Any]) -> int:
-    """Return at every how many samples along each axis a slice of such an identity has gradients: 1 is at all."""
+    """Return the stride of the gradients along each axis of a slice with this identity: 1 is every sample."""
     return int(identity.get(EVERY, 1))
 
 
 def stored_identity(dataset: xr.Dataset) -> dict[str, Any]:
-    """Return what decides the numbers of a slice or a run: objective, options, fidelity, device and so on.
+    """Return the settings that decide the numbers of a slice or a run: objective, options, fidelity, device and so on.
 
     Raises ValueError where the dataset is neither.
     """
@@ -122,7 +122,7 @@ def stored_identity(dataset: xr.Dataset) -> dict[str, Any]:
 
 
 def stored_provenance(dataset: xr.Dataset) -> dict[str, Any]:
-    """Return what else is known of how a slice or a run was made: command, date, versions, the loss's unit.
+    """Return how a slice or a run was made: command, date, versions, the loss's unit.
 
     Raises ValueError where the dataset is neither.
     """
@@ -130,9 +130,9 @@ def stored_provenance(dataset: xr.Dataset) -> dict[str, Any]:
 
 
 def record_cut(cut: Mapping[str, Any] | None, *, boxed: bool = False) -> dict[str, Any]:
-    """Return what an identity says of how a slice was cut along directions, by what is `along` in it.
+    """Return the part of an identity on the directions of a slice, from `along`.
 
-    It is boxed then, inside the bounds only, but for directions of weights.
+    It is boxed then (inside the bounds only), except for directions of weights.
     """
     if cut is None:
         return {BOXED: True} if boxed else {}
@@ -141,13 +141,13 @@ def record_cut(cut: Mapping[str, Any] | None, *, boxed: bool = False) -> dict[st
 
 
 def simulator_parts(identity: Mapping[str, Any]) -> list[str]:
-    """Return the simulator's name, its fidelity, but for that of a function which names none, and its remedies."""
+    """Return the simulator's name, its fidelity, unless a function has no named one, and its remedies."""
     said = {key: str(identity[key]) for key in ("objective", "fidelity", REMEDY) if identity.get(key)}
     return [text for key, text in said.items() if (key, text) != ("fidelity", UNNAMED)]
 
 
 def stored_space(dataset: xr.Dataset) -> ParameterSpace | None:
-    """Return the parameters of a slice with their bounds; None where an earlier version has not kept these."""
+    """Return the parameters of a slice with their bounds; None where an earlier version did not store them."""
     from .space import ParameterSpace
 
     bounds = stored_provenance(dataset).get(BOUNDS)
@@ -159,21 +159,21 @@ def stored_space(dataset: xr.Dataset) -> ParameterSpace | None:
 
 
 def errors_of(dataset: xr.Dataset) -> str:
-    """Say how many points of a slice or a run raised and what the first of them said; nothing where none did."""
+    """Return the number of points of a slice or a run that raised, and the first message; empty where none did."""
     from .objective import Status, describe_errors
 
     return describe_errors(int((dataset["status"] == Status.ERROR).sum()), str(dataset.attrs.get(ERROR, "")))
 
 
 def plane_of(dataset: xr.Dataset) -> Plane:
-    """Return the plane that a slice was sampled on; raises ValueError where the dataset is no slice."""
+    """Return the plane of a slice; raises ValueError where the dataset is no slice."""
     from .plane import Plane
 
     return Plane.from_record(stored_identity(dataset)["plane"])
 
 
 def digest_of(dataset: xr.Dataset) -> str:
-    """Return what a slice is known by in what is measured of it: of its identity and its losses."""
+    """Return a digest of a slice for its measurements: of its identity and its losses."""
     identity = json.dumps(json.loads(dataset.attrs["identity"]), sort_keys=True).encode()  # as it is stored
     return hashlib.sha256(identity + dataset["loss"].to_numpy().tobytes()).hexdigest()[:12]
 
@@ -184,7 +184,9 @@ def _decode(dataset: xr.Dataset, name: str) -> dict[str, Any]:
     except (KeyError, TypeError, ValueError):
         found = None
     if not isinstance(found, dict):
-        raise ValueError(f"no slice or run of gradscape: the dataset's attribute {name} is missing or no JSON object")
+        raise ValueError(
+            f"this dataset is no slice or run of gradscape: its attribute {name} is missing or not a JSON object"
+        )
     return found
 
 
@@ -204,13 +206,13 @@ def check_identity(
     if len(differ) > LISTED_SETTINGS:
         said.append(f"and {len(differ) - LISTED_SETTINGS} more")
     raise StoreMismatchError(
-        f"{path or 'the store'} holds a {what} made by other settings ({'; '.join(said)}); "
-        "write elsewhere with --out, or replace it with --force"
+        f"{path or 'the store'} contains a {what} made by other settings ({'; '.join(said)}); write elsewhere with "
+        "--out, or replace it with --force"
     )
 
 
 def differing_settings(ours: Mapping[str, Any], theirs: Mapping[str, Any]) -> dict[str, tuple[str, str]]:
-    """Return both values, as Python writes them, of each setting that differs, by its name ("options.drag")."""
+    """Return both values, as Python writes them, of each differing setting, by its name ("options.drag")."""
     one, other = dict(_leaves(ours)), dict(_leaves(theirs))
     return {name: (_show(one, name), _show(other, name)) for name in one | other if one.get(name) != other.get(name)}
 

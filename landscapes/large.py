@@ -1,4 +1,4 @@
-"""Losses so large that differences between them overflow: a slice of them is drawn in a unit of its own."""
+"""Losses so large that their differences overflow: a slice of them is drawn in its own unit."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ SUPERSCRIPTS = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def unit_of(loss: NDArray[Any]) -> float:
-    """Return what losses are divided by, so that their differences are numbers: 1 but for those that are large."""
+    """Return the divisor that makes differences of losses finite: 1 unless they are large."""
     most = _largest(loss)
     return 10.0 ** math.floor(math.log10(most)) if most > LARGE else 1.0
 
 
 def in_unit(dataset: xr.Dataset) -> xr.Dataset:
-    """Return a slice with losses and gradients in the unit of its losses, which their own unit says then."""
+    """Return a slice with losses and gradients divided by that unit, which their own unit then includes."""
     unit = unit_of(dataset["loss"].to_numpy())
     if unit == 1.0:
         return dataset
@@ -33,11 +33,11 @@ def in_unit(dataset: xr.Dataset) -> xr.Dataset:
 
 
 def refuse_large(values: NDArray[Any]) -> None:
-    """Raise ValueError for values of which differences, and sums of them, may be no numbers."""
+    """Raise ValueError for values whose differences and sums can overflow."""
     if (most := _largest(values)) > LARGEST:
         raise ValueError(
-            f"values as large as {most:.3g} cannot be measured or drawn, since differences between them overflow; "
-            "divide the loss by a constant"
+            f"values up to {most:.3g} cannot be measured or drawn, because their differences overflow; divide the "
+            "loss by a constant"
         )
 
 

@@ -1,4 +1,4 @@
-"""What is taken of a refined slice, which is not sampled everywhere: for measures, and for pictures."""
+"""The samples of a refined slice, which is not sampled everywhere, for measures and for pictures."""
 
 from __future__ import annotations
 
@@ -21,44 +21,45 @@ DRAWN = ("loss", "status")
 
 
 def has_all_gradients(dataset: xr.Dataset) -> bool:
-    """Whether a slice has a gradient at each of its samples, but for those that failed."""
+    """Whether a slice has a gradient at each of its samples, except failed ones."""
     return "grad" in dataset and gradient_stride(stored_identity(dataset)) == 1
 
 
 def check_gradients(gradients: bool | int, plane: Plane, *, refined: bool) -> int:
-    """Return at every how many samples along each axis a slice shall have gradients, 0 for none.
+    """Return the requested stride of gradients along each axis of a slice, 0 for none.
 
-    Raises ValueError where it then has fewer than two along an axis, or is refined, which takes gradients at all.
+    Raises ValueError where it would then have fewer than two along an axis, or is refined, which needs gradients
+    everywhere.
     """
     gradients = as_stride(gradients)
     if gradients > 1 and refined:
         raise ValueError(
-            f"a slice is refined by the gradients of all its samples; got gradients at every {gradients} samples, so "
+            f"refining a slice needs the gradients of all its samples; got gradients at every {gradients} samples, so "
             "leave out one of the two"
         )
     if gradients >= min(plane.resolution):
         shape = " x ".join(map(str, plane.resolution))
         raise ValueError(
-            f"a slice has gradients at two samples along each axis or more; got {shape} samples and gradients at every "
-            f"{gradients}; {min(plane.resolution) - 1} would fit, or take a higher resolution"
+            f"a slice needs gradients at two or more samples along each axis; got {shape} samples and gradients at "
+            f"every {gradients}; use at most {min(plane.resolution) - 1}, or a higher resolution"
         )
     return gradients
 
 
 def count_gradients(resolution: Sequence[int], gradients: int) -> int:
-    """Return how many samples of a slice have a gradient: those at every so many along each axis, 0 for none."""
+    """Return the number of samples of a slice with a gradient, for a stride along each axis, 0 for none."""
     return math.prod(-(-points // gradients) for points in resolution) if gradients else 0
 
 
 def with_gradients(dataset: xr.Dataset) -> xr.Dataset:
-    """Return the samples of a slice that have a gradient: all, or every so many along each axis."""
+    """Return the samples of a slice that have a gradient: all, or those at the stride."""
     return dataset[_every(dataset, gradient_stride(stored_identity(dataset)))]
 
 
 def sampled_lattice(dataset: xr.Dataset) -> xr.Dataset:
-    """Return a slice without points that are interpolated: itself, or every second, fourth, eighth ... sample of it.
+    """Return a slice without interpolated points: itself, or every second, fourth, eighth ... sample of it.
 
-    A measure over neighbours takes them to be equally far apart, and nothing that is interpolated to be a loss.
+    A measure over neighbours needs equal distances, and must not take an interpolated value for a loss.
     """
     stride = 1
     while (dataset["status"][_every(dataset, stride)] == Status.INTERPOLATED).any():
@@ -77,16 +78,16 @@ def _every(dataset: xr.Dataset, stride: int) -> dict[str, slice]:
 
 
 def lift_between(plane: Plane, places: NDArray[np.float64]) -> torch.Tensor:
-    """Return the parameters at places between samples, shape (count, rank), in steps along each axis of the array."""
+    """Return the parameters at positions between samples, shape (count, rank), in array steps along each axis."""
     axes = [axis.numpy() for axis in plane.axes()[::-1]]
     u = [np.interp(places[:, axis], np.arange(len(one)), one) for axis, one in enumerate(axes)][::-1]
     return plane.lift(torch.from_numpy(np.stack(u, axis=-1)))
 
 
 def own_cells(dataset: xr.Dataset, kind: Status = Status.INTERPOLATED) -> xr.Dataset:
-    """Return a slice as it is drawn: where it was not sampled it has loss and status of the nearest sample.
+    """Return a slice for drawing: points that were not sampled have loss and status of the nearest sample.
 
-    That is where its status is of that `kind`, but for a slice that has no samples.
+    These are the points with a status of that `kind`, unless the slice has no samples.
     """
     lacking = dataset["status"].to_numpy() == kind if "status" in dataset else np.zeros(0, bool)
     if not lacking.any() or lacking.all():

@@ -27,8 +27,8 @@ ROUNDING = 1e-9  # of the box; points that are no farther beyond it are moved ba
 class Status(IntEnum):
     """Say how the evaluation of one point ended; a NaN result is not a missing one.
 
-    INTERPOLATED is a point of a refined slice that was not evaluated, as those around it explain it: its loss is NaN.
-    NO_GRADIENT has a finite loss, which is kept, and a gradient that is not finite and therefore NaN.
+    INTERPOLATED is a point of a refined slice that was not evaluated, because its neighbours predict it: its loss is
+    NaN. NO_GRADIENT has a finite loss, which is kept, but its gradient is not finite and is stored as NaN.
     """
 
     MISSING = 0
@@ -47,12 +47,12 @@ LONGEST_ERROR = 200  # characters of a message that are shown
 
 
 def has_loss(status: Codes) -> Codes:
-    """Say which points have a finite loss; `status` is a tensor, an array or one Status."""
+    """Return which points have a finite loss; `status` is a tensor, an array or one Status."""
     return _is_any(status, HAS_LOSS)
 
 
 def failed(status: Codes) -> Codes:
-    """Say which points were evaluated and have no loss; `status` is a tensor, an array or one Status."""
+    """Return which points were evaluated and have no loss; `status` is a tensor, an array or one Status."""
     return _is_any(status, FAILED)
 
 
@@ -64,7 +64,7 @@ def _is_any(status: Codes, kinds: tuple[Status, ...]) -> Codes:
 
 
 def describe_errors(count: int, first: str) -> str:
-    """Say how many points raised and what the first of them said, in a line; nothing where none did."""
+    """Return how many points raised, and the first message, in a line; empty where none did."""
     if not count:
         return ""
     said = " ".join(first.split())
@@ -74,12 +74,12 @@ def describe_errors(count: int, first: str) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """Hold the result of evaluating a batch of points.
+    """The result of evaluating a batch of points.
 
-    `loss` [objective's unit], float64, shape (batch,); `grad` [loss unit / parameter unit], float64, shape
-    (batch, dim), or None where it was not asked for; `status`, int8, shape (batch,). Where the status is not OK, the
-    gradient is NaN, and so is the loss unless the status is NO_GRADIENT. `error` is what the first of the points with
-    status ERROR raised. Arrays become tensors; raises ValueError for what is no real number, or no Status.
+    `loss` [objective's unit], float64, shape (batch,). `grad` [loss unit / parameter unit], float64, shape (batch,
+    dim), or None if it was not requested. `status`, int8, shape (batch,). Where the status is not OK, the gradient is
+    NaN, and so is the loss unless the status is NO_GRADIENT. `error` is the message of the first point with status
+    ERROR. Arrays become tensors. Raises ValueError for values that are not real numbers, or no Status.
     """
 
     loss: Float[Tensor, " batch"]
@@ -99,7 +99,7 @@ class Evaluation:
 
     @property
     def has_gradient(self) -> Bool[Tensor, " batch"]:
-        """Which points have a finite gradient; none where gradients were not asked for."""
+        """Which points have a finite gradient; none where gradients were not requested."""
         return (self.status == Status.OK) & (self.grad is not None)
 
     @property
@@ -115,12 +115,11 @@ class Evaluation:
         failed: Int[Tensor, " batch"] | None = None,
         error: str = "",
     ) -> Evaluation:
-        """Make an evaluation from raw results: mark non-finite rows, keep what `failed` says, blank what is missing.
+        """Make an evaluation from raw results: mark non-finite rows, keep `failed`, blank missing values.
 
-        `failed` holds a Status per row, OK where nothing is known to have gone wrong. A row whose loss alone is finite
-        keeps it and has status NO_GRADIENT; without gradients, none is missing, and its status is OK.
-
-        Raises ValueError where results are no real numbers, or codes in `failed` mean no Status.
+        `failed` has a Status per row, OK where no failure is known. A row with only a finite loss keeps it and has
+        status NO_GRADIENT. Without gradients none is missing, and its status is OK. Raises ValueError where results are
+        not real numbers, or codes in `failed` are no Status.
         """
         loss, grad = _real(loss, "a loss"), None if grad is None else _real(grad, "a gradient")
         status = torch.full(loss.shape, Status.OK, dtype=torch.int8)
@@ -141,14 +140,14 @@ class Evaluation:
     def join(cls, parts: Iterable[Evaluation], *, dim: int, grad: bool) -> Evaluation:
         """Return the evaluation of several batches, one after the other; of none, that of no points at all.
 
-        Gradients are left out unless `grad` asks for them. Raises ValueError where a part has none of those asked for.
+        Gradients are left out unless `grad` requests them. Raises ValueError where a part lacks requested gradients.
         """
         parts = list(parts)
         if not parts:
             return cls.empty(dim, grad=grad)
         slopes = [part.grad for part in parts if part.grad is not None] if grad else []
         if grad and len(slopes) < len(parts):
-            raise ValueError(f"{len(parts) - len(slopes)} of {len(parts)} evaluations to join have no gradients")
+            raise ValueError(f"cannot join gradients: {len(parts) - len(slopes)} of {len(parts)} evaluations have none")
         loss, status = torch.cat([part.loss for part in parts]), torch.cat([part.status for part in parts])
         error = next((part.error for part in parts if part.error), "")
         return cls(loss, torch.cat(slopes) if grad else None, status, error)
@@ -160,7 +159,7 @@ class Evaluation:
         return Evaluation(self.loss[rows], None if self.grad is None else self.grad[rows], status, error)
 
     def without_gradients(self) -> Evaluation:
-        """Return what would be there had gradients not been asked for: none is missing."""
+        """Return the evaluation as if gradients had not been requested: none is missing."""
         return Evaluation.from_results(self.loss, None, self.status, self.error)
 
     @classmethod
@@ -181,8 +180,8 @@ class Evaluation:
 class Objective(abc.ABC):
     """Anything with a parameter space that can be evaluated at a batch of points.
 
-    Needed are `space` and `evaluate`. What only some can do has a default, so that nobody has to ask. An objective is
-    evaluated inside its bounds only, unless `beyond_box` allows more.
+    It needs `space` and `evaluate`. Optional abilities have a default, so callers never need to ask. An objective is
+    evaluated only inside its bounds, unless `beyond_box` allows more.
     """
 
     name: str  # by default the class's own in lower case
@@ -208,77 +207,77 @@ class Objective(abc.ABC):
 
     @abc.abstractmethod
     def evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool = True) -> Evaluation:
-        """Return losses, and gradients if asked, at points `x` of the space."""
+        """Return losses, and gradients if requested, at points `x` of the space."""
 
     def __call__(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, " batch"]:
-        """Return losses that torch can differentiate. Raises ValueError for x that holds no floating-point numbers."""
+        """Return losses that torch can differentiate. Raises ValueError for x that is not a floating-point tensor."""
         if not isinstance(x, Tensor) or not x.is_floating_point():
             kind = f"a tensor of {x.dtype}" if isinstance(x, Tensor) else type(x).__name__
-            raise ValueError(f"{self.name}(x) takes a floating-point tensor, and evaluate(x) any numbers; got {kind}")
+            raise ValueError(f"{self.name}(x) takes a floating-point tensor, evaluate(x) takes any numbers; got {kind}")
         losses: Tensor = _Bridge.apply(x, self)  # type: ignore[no-untyped-call]
         return losses
 
     @property
     def precision(self) -> str:
-        """float32 or float64: what losses are computed in."""
+        """float32 or float64: the precision of the losses."""
         return "float64"
 
     @property
     def packages(self) -> tuple[str, ...]:
-        """Packages that losses depend on, in addition to those that all depend on."""
+        """Additional packages that affect the losses."""
         return ()
 
     def identity(self) -> dict[str, Any]:
-        """Return what decides the numbers, as plain JSON."""
+        """Return the settings that decide the numbers, as plain JSON."""
         return {"objective": self.name}
 
     def prepare(self) -> None:  # noqa: B027 -- most have nothing to prepare
-        """Do what the first evaluation would do besides evaluating."""
+        """Do the one-time work of the first evaluation."""
 
     def shrink(self, rows: int) -> None:  # noqa: B027 -- most hold no memory between evaluations
-        """Take at most `rows` points at once from now on."""
+        """Evaluate at most `rows` points together from now on."""
 
     def release(self) -> None:  # noqa: B027 -- most hold no memory between evaluations
-        """Give back the memory that is held between evaluations."""
+        """Free the memory that is held between evaluations."""
 
     def memory(self) -> int:
-        """Estimate the bytes that the evaluation of one point takes."""
+        """Estimate the memory of the evaluation of one point [bytes]."""
         return 0
 
     def events(self, x: Float[Tensor, "batch dim"]) -> Mapping[str, Int[Tensor, " batch"]]:
-        """Count what happens at each point, name -> shape (batch,); where a count changes, losses may jump."""
+        """Count the events at each point, name -> shape (batch,); where a count changes, losses can jump."""
         return {}
 
     def special_places(self) -> Mapping[str, Float[Tensor, " dim"]]:
-        """Return points by name at which a check is to look: a contact begins, two bodies meet, a motor stalls."""
+        """Return points by name that a check should examine: a contact begins, two bodies meet, a motor stalls."""
         return {}
 
     def nan_origin(self, x: Float[Tensor, " dim"]) -> str:
-        """Say which operation makes the first NaN of the gradient at one point; empty where nothing tells."""
+        """Return the operation that makes the first NaN of the gradient at one point; empty if unknown."""
         return ""
 
     def wrong_origin(self, x: Float[Tensor, " dim"]) -> str:
-        """Say which operation's own derivative is wrong at one point, where it is finite; empty where nothing tells."""
+        """Return the operation whose own derivative is wrong at one point, where it is finite; empty if unknown."""
         return ""
 
     def energy(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch step"] | None:
-        """Return the mechanical energy [J] over time of a motion that nothing drives; None where there is none."""
+        """Return the mechanical energy [J] over time of an undriven motion; None where there is none."""
         return None
 
     def noise(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, " batch"] | None:
-        """Return the standard error of the loss at each point [loss unit]; None where repeats have to tell."""
+        """Return the standard error of the loss at each point [loss unit]; None where only repeats can measure it."""
         return None
 
     def replicas(self) -> Mapping[str, Objective]:
-        """Return objectives of the same space, by what was changed, that would be the same if physics alone decided.
+        """Return objectives of the same space, by the name of the change, that would be equal if only physics mattered.
 
-        The same physics computed otherwise: a shifted grid, other particles, the mirrored scene with its parameters
-        mirrored. Each takes points of this space and returns losses and gradients in it.
+        They compute the same physics differently: a shifted grid, other particles, the mirrored scene with its
+        parameters mirrored. Each takes points of this space and returns losses and gradients in it.
         """
         return {}
 
     def observe(self, x: Float[Tensor, "batch dim"], decision: int) -> Float[Tensor, "batch feature"]:
-        """Return what a policy sees before a decision: here no more than that nothing has happened yet."""
+        """Return a policy's observation before a decision: here only that nothing has happened yet."""
         return x.new_zeros(len(x), 1)
 
 
@@ -300,7 +299,7 @@ class _Bridge(torch.autograd.Function):
 
 
 class ObjectiveWrapper(Objective):
-    """An objective around another one, which has all that the other one has: below, what is asked of that one."""
+    """An objective around another one, which delegates everything below to that one."""
 
     def __init__(self, objective: Objective) -> None:
         self.objective = objective
@@ -319,7 +318,7 @@ for _part in PASSED_ON.split():
 
 
 class BoxedObjective(ObjectiveWrapper):
-    """Evaluate an objective inside its box only, though it allows points beyond: these have status ESCAPED."""
+    """Evaluate an objective only inside its box, although it allows points outside: these have status ESCAPED."""
 
     def __init__(self, objective: Objective) -> None:
         super().__init__(objective)
@@ -335,7 +334,7 @@ class BoxedObjective(ObjectiveWrapper):
 
 
 class LossesOnly(ObjectiveWrapper):
-    """An objective whose losses alone are known: its gradients are NaN."""
+    """An objective with only its losses: its gradients are NaN."""
 
     def evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool = True) -> Evaluation:
         """Return losses at points `x` of the space."""
@@ -344,15 +343,15 @@ class LossesOnly(ObjectiveWrapper):
 
 
 class SimulatorError(ValueError):
-    """What a simulator returned is not what it has to return; no status of a single point can say that."""
+    """A simulator returned an invalid result, which no status of a single point can express."""
 
 
 def evaluate(objective: Objective, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
-    """Evaluate an objective, hold the result against the protocol, and blank every failure.
+    """Evaluate an objective, check the result against the protocol, and blank every failure.
 
-    Points beyond its bounds have left the domain (status ESCAPED), unless the objective invites them.
+    Points outside its bounds have left the domain (status ESCAPED), unless the objective allows them.
 
-    Raises ValueError where the objective's answer is not what the protocol says, and what it raises itself.
+    Raises ValueError where the objective's result violates the protocol, and any error of the objective.
     """
     raw = _ask(objective, x, grad=grad) if objective.beyond_box else evaluate_inside(objective, x, grad=grad)
     loss, status = (tensor.detach().cpu() for tensor in (raw.loss, raw.status))
@@ -361,11 +360,9 @@ def evaluate(objective: Objective, x: Float[Tensor, "batch dim"], *, grad: bool)
 
 
 def evaluate_inside(objective: Objective, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
-    """Evaluate an objective at those of the points that lie in its box; the others have left the domain.
+    """Evaluate an objective at the points inside its box; the others have left the domain.
 
-    What is no point at all, of a wrong shape or not a number, is for the objective to refuse.
-
-    Raises what `evaluate` does.
+    The objective itself refuses invalid points, of a wrong shape or not a number. Raises what `evaluate` does.
     """
     if x.ndim != 2 or x.shape[1] != objective.space.dim:
         return objective.evaluate(x, grad=grad)
@@ -384,7 +381,7 @@ def evaluate_inside(objective: Objective, x: Float[Tensor, "batch dim"], *, grad
 
 
 def _ask(objective: Objective, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
-    """Return what an objective says of points, held against the protocol."""
+    """Return an objective's evaluation of points, checked against the protocol."""
     found, who = objective.evaluate(x, grad=grad), objective.name
     if not isinstance(found, Evaluation):
         raise SimulatorError(f"{who} must return an Evaluation; got {type(found).__name__}")
@@ -402,12 +399,12 @@ def _ask(objective: Objective, x: Float[Tensor, "batch dim"], *, grad: bool) -> 
             )
     for status in NOT_EVALUATED:
         if bool((found.status == status).any()):
-            raise SimulatorError(f"{who} must say how every point ended; got status {status.name}")
+            raise SimulatorError(f"{who} must give the final status of every point; got status {status.name}")
     return found
 
 
 def in_box(space: ParameterSpace, x: Float[Tensor, "batch dim"]) -> Bool[Tensor, " batch"]:
-    """Say which points lie nowhere beyond the bounds, to rounding."""
+    """Return which points are inside the bounds, up to rounding."""
     unit = space.to_unit(x)
     return ~((unit < -ROUNDING) | (unit > 1 + ROUNDING)).any(dim=1)
 
@@ -417,7 +414,7 @@ def _clamp(space: ParameterSpace, x: Float[Tensor, "batch dim"]) -> Float[Tensor
 
 
 def check_points(x: object, space: ParameterSpace, name: str) -> Float[Tensor, "batch dim"]:
-    """Return points as a tensor. Raises ValueError where they are no points of the space."""
+    """Return points as a tensor. Raises ValueError where they are not points of the space."""
     points = as_tensor(x, name)
     if points.ndim != 2 or points.shape[1] != space.dim:
         raise ValueError(
@@ -428,31 +425,31 @@ def check_points(x: object, space: ParameterSpace, name: str) -> Float[Tensor, "
 
 
 def first_line(error: BaseException) -> str:
-    """Return the first line of what an error says: others' messages may go on for pages."""
-    return (str(error).strip().splitlines() or ["it says nothing"])[0].rstrip(":")
+    """Return the first line of an error's message: others' messages can be pages long."""
+    return (str(error).strip().splitlines() or ["it has no message"])[0].rstrip(":")
 
 
 def _real(values: object, what: str) -> Tensor:
-    """Return a tensor of real numbers as it is, and one of what else holds some."""
+    """Return a tensor of real numbers, converting anything else that contains some."""
     if isinstance(values, Tensor) and not values.is_complex() and values.dtype != torch.bool:
         return values
     return as_tensor(values, what)
 
 
 def _check_codes(status: object) -> Tensor:
-    """Return a tensor of statuses as it is, and refuse codes that mean none: as int8, 257 would be OK."""
+    """Return a tensor of statuses unchanged, and refuse codes that mean none: as int8, 257 would be OK."""
     codes = _real(status, "a status")
     sound = (codes >= 0) & (codes <= max(Status)) & (codes % 1 == 0)
     if not bool(sound.all()):
         known = ", ".join(f"{kind.value} {kind.name}" for kind in Status)
-        raise ValueError(f"a status is one of {known}; got {codes[~sound][0].item()}")
+        raise ValueError(f"status takes {known}; got {codes[~sound][0].item()}")
     return codes
 
 
 def _require_gradient(grad: Tensor | None, who: str) -> Tensor:
     if grad is None:
         raise SimulatorError(
-            f"{who} was asked for gradients and returned none; sample with gradients=0 (--no-gradients), "
-            "or search with a method that needs none"
+            f"{who} returned no gradients with grad=True; sample with gradients=0 (--no-gradients), or search with a "
+            "method that needs none"
         )
     return grad

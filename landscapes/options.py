@@ -13,13 +13,13 @@ ADDED = "added"  # in a field's metadata
 
 @dataclasses.dataclass(frozen=True)
 class NoOptions:
-    """The options of what has none."""
+    """No options."""
 
 
 def read_options(owner: str, declared: type[Any], given: Mapping[str, Any]) -> Any:
-    """Return `declared` filled from `given`; values may be text.
+    """Return `declared` filled from `given`; values can be text.
 
-    Raises ValueError where an option does not exist or a value is not of its type; `owner` says whose options they are.
+    Raises ValueError where an option does not exist or a value has another type; `owner` names whose options they are.
     """
     known = _list_options(declared)
     for name in given:
@@ -29,10 +29,10 @@ def read_options(owner: str, declared: type[Any], given: Mapping[str, Any]) -> A
 
 
 def record_options(options: Any) -> dict[str, Any]:
-    """Return options by name, as identities hold them.
+    """Return options by name, as identities store them.
 
-    An option that was added later, whose field has the metadata ADDED, is left out while it has its default: results
-    of before do not have it, and are the same.
+    An option that was added later has the metadata ADDED in its field. It is left out while it has its default, because
+    earlier results lack it and are the same.
     """
     later = [f for f in dataclasses.fields(options) if f.metadata.get(ADDED)]
     left = {f.name for f in later if getattr(options, f.name) == f.default}
@@ -40,17 +40,17 @@ def record_options(options: Any) -> dict[str, Any]:
 
 
 def added(default: Any, **metadata: Any) -> Any:
-    """Declare an option that results of before do not have: its default is what they were made with."""
+    """Declare an option that earlier results lack: its default is the setting they were made with."""
     return dataclasses.field(default=default, metadata={ADDED: True, **metadata})
 
 
 def describe(declared: type[Any]) -> str:
-    """Return every option with what it takes and its default, as one line."""
+    """Return every option with its values and its default, as one line."""
     return ", ".join(f"{o.name}={o.wanted} (default {o.default})" for o in _list_options(declared).values())
 
 
 def in_full(declared: type[Any]) -> str:
-    """Return every option on a line of its own, then what they mean, in the words of all classes that declare them."""
+    """Return every option on its own line, then their meaning, from the docstrings of all declaring classes."""
     known = _list_options(declared).values()
     if not known:
         return "options: none"
@@ -59,14 +59,14 @@ def in_full(declared: type[Any]) -> str:
 
 
 def _explain(declared: type[Any]) -> str:
-    """Return the docstrings of a class and of those it is derived from, but for those that dataclasses make up."""
+    """Return the docstrings of a class and its base classes, without those that dataclasses generate."""
     docs = [(kind.__name__, kind.__doc__ or "") for kind in declared.__mro__ if dataclasses.is_dataclass(kind)]
     return "\n\n".join(inspect.cleandoc(doc) for name, doc in docs if doc and not doc.startswith(f"{name}("))
 
 
 @dataclasses.dataclass(frozen=True)
 class _Option:
-    """An option as it is declared; a number that has a `most` is above 0."""
+    """A declared option; a number with a `most` is above 0."""
 
     name: str
     kind: Any
@@ -77,7 +77,7 @@ class _Option:
     def wanted(self) -> str:
         if get_origin(self.kind) is Literal:
             return "|".join(map(str, get_args(self.kind)))
-        names = {bool: "true|false", int: "a whole number", float: "a number"}
+        names = {bool: "true|false", int: "a whole number", float: "a number", str: "a word"}
         return names.get(self.kind, str(self.kind)) + (f" above 0, at most {self.most:g}" if self.most else "")
 
 

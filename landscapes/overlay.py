@@ -1,4 +1,4 @@
-"""Runs laid over a slice: the plane coordinates of their points, their distances from the plane, the losses beneath."""
+"""Runs overlaid on a slice: plane coordinates of their points, distances from the plane, and losses of the slice."""
 
 from __future__ import annotations
 
@@ -24,24 +24,23 @@ PARALLEL = 1e-12  # most by which the cosine between a step and the negative gra
 
 
 def overlay(dataset: xr.Dataset, tables: Sequence[xr.Dataset]) -> list[xr.Dataset]:
-    """Lay runs over a slice of rank 2: return their tables with the plane coordinates of each point.
+    """Overlay runs on a slice of rank 2: return their tables with the plane coordinates of each point.
 
-    Added are, over `evaluation`: `u` and `v` [plane units], the nearest point of the plane; `distance` to it
-    [half-widths of the box]; `outside`, whether it lies beyond what the slice's picture covers; `beneath` [loss unit],
-    the loss of the sample whose cell is there, NaN outside and where that sample failed; `previous`, the row whose
-    gradient led to this one, -1 for none; `best`, the least loss so far. Nearness is measured in the box scaled to
-    [-1, 1], so that the parameters' units do not count. The attribute `label` tells runs apart.
-
-    Raises ValueError where the slice is a line, or a run searched other parameters.
+    Added columns over `evaluation` are: `u` and `v` [plane units], the nearest point of the plane; `distance` to it
+    [half-widths of the box]; `outside`, whether it is outside the slice's picture; `beneath` [loss unit], the loss of
+    the sample whose cell contains it, NaN outside and where that sample failed; `previous`, the row whose gradient led
+    to this one, -1 for none; `best`, the lowest loss so far. Distances are measured in the box scaled to [-1, 1], so
+    the parameters' units do not matter. The attribute `label` distinguishes runs. Raises ValueError where the slice is
+    a line, or a run searched other parameters.
     """
     plane = plane_of(dataset)
     if plane.rank != 2:
-        raise ValueError(f"runs are laid over planes; got a slice of rank {plane.rank}, so vary two parameters")
+        raise ValueError(f"an overlay needs a plane; got a slice of rank {plane.rank}, so vary two parameters")
     return [lay(dataset, table, label) for table, label in zip(tables, _labels(tables), strict=True)]
 
 
 def lay(dataset: xr.Dataset, table: xr.Dataset, label: str) -> xr.Dataset:
-    """Lay one run over a line, where no point has a `v`, or a plane, as `overlay` does.
+    """Overlay one run on a line, where no point has a `v`, or on a plane, as `overlay` does.
 
     Raises ValueError where the run searched other parameters than the slice has.
     """
@@ -50,12 +49,12 @@ def lay(dataset: xr.Dataset, table: xr.Dataset, label: str) -> xr.Dataset:
     if parameters != [str(name) for name in table["dim"].to_numpy()]:
         raise ValueError(
             f"{label} searched {table.sizes['dim']} parameters ({_list_parameters(table)}), the slice has "
-            f"{len(parameters)} ({_list_parameters(dataset)}); lay runs over slices of the same environment"
+            f"{len(parameters)} ({_list_parameters(dataset)}); overlay runs on slices of the same environment"
         )
     if stored_scales(dataset) != stored_scales(table):
         raise ValueError(
             f"{label} searched parameters on the scales {', '.join(stored_scales(table))}, the slice has "
-            f"{', '.join(stored_scales(dataset))}; lay runs over slices of the same environment"
+            f"{', '.join(stored_scales(dataset))}; overlay runs on slices of the same environment"
         )
     half, x = _box(table)[1], _points(table)
     scaled = replace(plane, origin=plane.origin / half, basis=plane.basis / half)
@@ -76,24 +75,24 @@ def lay(dataset: xr.Dataset, table: xr.Dataset, label: str) -> xr.Dataset:
 
 
 def run_name(table: xr.Dataset, between: str = ", seed ") -> str:
-    """Return a run's method and seed, or what points of another program are called, which have none."""
+    """Return a run's method and seed, or the label of points of another program, which have none."""
     method, seed = table.attrs["method"], table.attrs.get("seed")
     return f"{method}{between}{seed}" if seed is not None else str(method)
 
 
 def improvements(run: xr.Dataset) -> NDArray[np.intp]:
-    """Return the rows of a run laid over a slice that lowered its least loss so far, in the order of evaluation."""
+    """Return the rows of an overlaid run that lowered its lowest loss so far, in the order of evaluation."""
     return lowered(run["best"].to_numpy())
 
 
 def lowered(best: NDArray[np.float64]) -> NDArray[np.intp]:
-    """Return where the least loss so far has fallen, NaN standing for none yet."""
+    """Return where the lowest loss so far has fallen; NaN means none yet."""
     before = np.append(np.inf, best[:-1])
     return np.flatnonzero(np.isfinite(best) & ~(best >= before))
 
 
 def best_point(tables: Sequence[xr.Dataset]) -> tuple[Float[Tensor, " dim"], float]:
-    """Return the point of least loss among all the runs, as `evaluate` takes it, and its loss.
+    """Return the point with the lowest loss of all runs, as `evaluate` takes it, and its loss.
 
     Raises ValueError where no episode succeeded.
     """
@@ -110,9 +109,8 @@ def principal_plane(
 ) -> Plane:
     """Lay a plane through the principal directions of the runs' points, found in the box scaled to [-1, 1].
 
-    Its coordinates are in half-widths of the box. With `through` it is moved, parallel to itself, to hold that point.
-
-    Raises ValueError where the points are too few, or spread in one direction alone.
+    Its coordinates are in half-widths of the box. `through` moves it, parallel to itself, to contain that point. Raises
+    ValueError where the points are too few, or spread in a single direction.
     """
     center, half = _box(tables[0])
     scaled = torch.cat([(_points(table) - center) / half for table in tables])
@@ -123,7 +121,7 @@ def principal_plane(
 
 
 def _nearest(dataset: xr.Dataset, axes: dict[str, NDArray[np.float64]]) -> NDArray[np.float64]:
-    """Return the loss of the samples whose cells hold these places: what a picture shows there."""
+    """Return the loss of the samples whose cells contain these positions, as in a picture."""
     samples = {name: dataset[name].to_numpy() for name in reversed(axes)}
     cells = tuple(np.searchsorted((at[1:] + at[:-1]) / 2, axes[name]) for name, at in samples.items())
     found: NDArray[np.float64] = own_cells(dataset)["loss"].transpose(*samples).to_numpy()[cells]
@@ -131,9 +129,9 @@ def _nearest(dataset: xr.Dataset, axes: dict[str, NDArray[np.float64]]) -> NDArr
 
 
 def _previous(table: xr.Dataset) -> NDArray[np.intp]:
-    """Find the descents among a run's points: each iterate lies along the negative gradient of the one before it.
+    """Find the descents among a run's points: each iterate lies along the negative gradient of the previous one.
 
-    Both are taken in the scaled box, where descents step; parameters that a step stopped at the border do not count.
+    Both are taken in the scaled box, where descents step; parameters that a step stopped at the border are ignored.
     """
     center, half = (part.numpy() for part in _box(table))
     z, slope = (table["x"].to_numpy() - center) / half, -table["grad"].to_numpy() * half
@@ -168,7 +166,7 @@ def _labels(tables: Sequence[xr.Dataset]) -> list[str]:
 
 
 def _box(table: xr.Dataset) -> tuple[Float[Tensor, " dim"], Float[Tensor, " dim"]]:
-    """Return the middle and the half-widths of the box a run searched."""
+    """Return the middle and the half-widths of the box that a run searched."""
     lower, upper = (torch.tensor(table.attrs[side], dtype=torch.float64) for side in ("lower", "upper"))
     return (lower + upper) / 2, (upper - lower) / 2
 

@@ -1,4 +1,4 @@
-"""Values as plain JSON, and as plain text: what records, names and terminals may hold, and what becomes of all else."""
+"""Values as plain JSON and plain text: the allowed content of records, names and terminals."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ CONTROL = re.compile("[\0-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\
 
 
 def printable(text: str) -> str:
-    """Return text as a terminal may have it: a control character is its escape, as in Python's strings."""
+    """Return text for a terminal: a control character becomes its escape, as in Python's strings."""
     return CONTROL.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
 
 
 def finite(value: float) -> float | None:
-    """Return a number as JSON has it: None where it is NaN or infinite."""
+    """Return a number in JSON form: None for NaN and infinity."""
     return float(value) if math.isfinite(value) else None
 
 
 def jsonable(value: Any) -> Any:
-    """Return a value as JSON has it, at any depth.
+    """Return a value in JSON form, at any depth.
 
-    NaN and infinity become None; arrays, tensors and tuples become lists, numbers of numpy those of Python; whatever
-    has a `record` is what that returns, any other dataclass its fields, and the properties that it names in `derived`.
-    Raises TypeError for anything else that JSON does not know.
+    NaN and infinity become None; arrays, tensors and tuples become lists, numbers of numpy those of Python. An object
+    with a `record` becomes the result of that. Any other dataclass becomes its fields, and the properties that it names
+    in `derived`. Raises TypeError for anything else.
     """
     if callable(record := getattr(value, "record", None)):
         return jsonable(record())
@@ -52,7 +52,7 @@ def jsonable(value: Any) -> Any:
 def plain_json(settings: Mapping[str, Any], what: str) -> dict[str, Any]:
     """Return settings exactly as they come back from JSON: tuples are lists, keys are strings.
 
-    Raises ValueError, which says `what` they are, where JSON would not keep them: NaN and infinity are refused, too.
+    Raises ValueError, naming `what` they are, where JSON would change them: NaN and infinity are refused, too.
     """
     try:
         found: dict[str, Any] = json.loads(json.dumps(settings, allow_nan=False))
@@ -62,9 +62,9 @@ def plain_json(settings: Mapping[str, Any], what: str) -> dict[str, Any]:
 
 
 def text(value: Any) -> str:
-    """Return what has to be a string.
+    """Return a string unchanged.
 
-    Raises TypeError where it is none.
+    Raises TypeError for anything else.
     """
     if not isinstance(value, str):
         raise TypeError(f"{value!r} is no text")
@@ -72,9 +72,9 @@ def text(value: Any) -> str:
 
 
 def number(value: Any) -> float:
-    """Return what has to be a finite number, as it is.
+    """Return a finite number unchanged.
 
-    Raises TypeError where it is none.
+    Raises TypeError for anything else.
     """
     if not isinstance(value, int | float) or not math.isfinite(value):
         raise TypeError(f"{value!r} is no number")
@@ -82,13 +82,13 @@ def number(value: Any) -> float:
 
 
 def read_share(text: str) -> float:
-    """Return a share that is given as 5% or 0.05. Raises ValueError where it is neither."""
+    """Return a share given as 5% or 0.05. Raises ValueError for another form."""
     text = text.strip()
     return float(text.removesuffix("%")) / (100 if text.endswith("%") else 1)
 
 
 def plain_name(text: str) -> str:
-    """Return a name of letters, digits, dots, dashes and underscores, as recordings and folders have them."""
+    """Return a name of letters, digits, dots, dashes and underscores, for recordings and folders."""
     return re.sub(r"[^A-Za-z0-9_.-]+", "-", text).strip("-.") or "points"
 
 

@@ -1,4 +1,4 @@
-"""The line or plane through parameter space that a landscape is sampled on."""
+"""The line or plane through parameter space on which a landscape is sampled."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ class Plane:
     """Span a line (rank 1) or a plane (rank 2) through parameter space.
 
     A point with plane coordinates `u` has parameters `origin + u @ basis`. `origin` [parameters' own units] is float64
-    of shape (dim,); `basis` [parameter unit / plane unit] is float64 of shape (rank, dim), with independent rows of any
-    length and angle; `lower` and `upper` [plane units], shape (rank,), bound what is sampled, at `resolution` points
-    per axis with both ends included. `labels` name the axes with their units: "speed, segment 3 [m/s]". `scales` are
-    "log10" for axes along a logarithmic parameter, whose coordinate is the decimal logarithm of its value.
+    of shape (dim,). `basis` [parameter unit / plane unit] is float64 of shape (rank, dim), with independent rows of any
+    length and angle. `lower` and `upper` [plane units], shape (rank,), bound the samples, with `resolution` points per
+    axis including both ends. `labels` name the axes with their units: "speed, segment 3 [m/s]". `scales` are "log10"
+    for axes along a logarithmic parameter, whose coordinate is the decimal logarithm of its value.
     """
 
     origin: Float[Tensor, " dim"]
@@ -65,7 +65,7 @@ class Plane:
             raise ValueError("Plane needs a finite origin and finite directions; got NaN or infinity")
         unit = self.basis / self.basis.norm(dim=1, keepdim=True)
         if not bool(unit.isfinite().all()) or int(torch.linalg.matrix_rank(unit)) < self.rank:
-            raise ValueError("Plane needs directions that are not zero and not parallel; give two that differ")
+            raise ValueError("Plane needs directions that are neither zero nor parallel; change one of them")
 
     @classmethod
     def through(
@@ -77,14 +77,12 @@ class Plane:
         resolution: int | Sequence[int],
         window: float | tuple[Bound, Bound] | None = None,
     ) -> Plane:
-        """Vary one or two parameters, named or numbered, and hold the others as they are at `origin`.
+        """Vary one or two parameters, given by name or number, and keep the others as at `origin`.
 
-        The plane coordinate is the parameter's own value, or its decimal logarithm as `space` has it. `window` is None
-        for the parameters' bounds, a fraction of them for a window of that size around `origin` (moved to stay inside
-        the bounds if it fits), or a pair (lower, upper) of values in the parameters' units, each one number or one per
-        axis.
-
-        Raises ValueError where parameters, point, resolution or window are none of this space's.
+        The plane coordinate is the parameter's own value, or its decimal logarithm if `space` says so. `window` is None
+        for the parameters' bounds, or a fraction of them for a window of that size around `origin`, moved to stay
+        inside the bounds if it fits. It can also be a pair (lower, upper) of values in the parameters' units, each one
+        number or one per axis. Raises ValueError where parameters, point, resolution or window do not fit the space.
         """
         numbers = [space.index(dim) for dim in dims]
         if len(numbers) not in (1, 2) or len(set(numbers)) != len(numbers):
@@ -93,7 +91,7 @@ class Plane:
             )
         origin = as_tensor(origin, "a slice's point")
         if origin.shape != (space.dim,):
-            raise ValueError(f"a slice goes through a point of shape ({space.dim},); got shape {tuple(origin.shape)}")
+            raise ValueError(f"a slice takes a point of shape ({space.dim},); got shape {tuple(origin.shape)}")
         scales = tuple(space.scales[number] for number in numbers)
         lower, upper = _bounds(space.lower[numbers], space.upper[numbers], origin[numbers], window, scales)
         start = origin.clone()
@@ -112,9 +110,9 @@ class Plane:
         window: tuple[Bound, Bound] = (-1.0, 1.0),
         labels: Sequence[str] | None = None,
     ) -> Plane:
-        """Span a plane by any directions, kept as given: coordinate 1 is one whole `directions[i]` from `origin`.
+        """Span a plane by any directions, unchanged: coordinate 1 is one whole `directions[i]` from `origin`.
 
-        Raises ValueError where the directions are zero or parallel, or sizes do not fit each other.
+        Raises ValueError where the directions are zero or parallel, or sizes do not match.
         """
         origin, directions = (as_tensor(t, "a slice's point and directions") for t in (origin, directions))
         rank = len(directions)
@@ -134,11 +132,10 @@ class Plane:
     ) -> Plane:
         """Lay a plane through the principal directions of a run's points.
 
-        The origin is their mean, or the point that directions are looked for `about`. Directions have unit length, the
+        The origin is their mean, or the point `about` which directions are computed. Directions have unit length, the
         largest component positive. The axes cover the projected points and a `margin`, as a fraction of their range.
-        Parameters count in their own units: where these differ wildly, run it on a space of comparable ones.
-
-        Raises ValueError where the points are too few, not finite, or spread in fewer directions than `rank`.
+        Parameters count in their own units, so use comparable ones. Raises ValueError where the points are too few, not
+        finite, or spread in fewer directions than `rank`.
         """
         points = as_tensor(points, "a principal plane")
         if points.ndim != 2 or len(points) <= rank:
@@ -150,7 +147,7 @@ class Plane:
         mean = points.mean(dim=0) if about is None else about
         _, scale, directions = torch.linalg.svd(points - mean, full_matrices=False)
         if len(scale) < rank or not bool(scale[rank - 1] > 1e-12 * scale[0]):
-            raise ValueError(f"{rank} principal directions need points that spread in as many; these do not")
+            raise ValueError(f"{rank} principal directions need points that spread in {rank} directions; these do not")
         basis = directions[:rank]
         basis = basis * basis.gather(1, basis.abs().argmax(dim=1, keepdim=True)).sign()
         u = (points - mean) @ basis.T
@@ -187,7 +184,7 @@ class Plane:
 
     @property
     def scaled_labels(self) -> tuple[str, ...]:
-        """What columns of coordinates are called, where those of `to_values` are called as `labels`."""
+        """Labels of columns of coordinates; those of `to_values` are `labels`."""
         return scaled_labels(self.labels, self.scales)
 
     def to_values(self, u: Float[Tensor, "*batch rank"]) -> Float[Tensor, "*batch rank"]:
@@ -195,7 +192,7 @@ class Plane:
         return to_values(u, self.scales)
 
     def lift(self, u: Float[Tensor, "*batch rank"]) -> Float[Tensor, "*batch dim"]:
-        """Return the parameters at plane coordinates `u`; each row's bits are independent of the batch it is in."""
+        """Return the parameters at plane coordinates `u`; each row's bits are independent of its batch."""
         return self.origin + (tensor_of(u, "lift")[..., :, None] * self.basis).sum(dim=-2)
 
     def project(self, x: Float[Tensor, "*batch dim"]) -> Float[Tensor, "*batch rank"]:
@@ -204,7 +201,7 @@ class Plane:
         return u
 
     def distance(self, x: Float[Tensor, "*batch dim"]) -> Float[Tensor, "*batch"]:
-        """Return how far `x` is from the plane (Euclidean, in the parameters' own units)."""
+        """Return the distance of `x` from the plane (Euclidean, in the parameters' own units)."""
         x = tensor_of(x, "distance")
         off: Float[Tensor, "*batch dim"] = x - self.lift(self.project(x))
         return off.square().sum(dim=-1).sqrt()
@@ -219,7 +216,7 @@ class Plane:
         return replace(self, origin=x - self.project(x) @ self.basis)
 
     def cell_bounds(self) -> tuple[Float[Tensor, " rank"], Float[Tensor, " rank"]]:
-        """Return what a picture of the samples covers: their box and half a sample's width around it."""
+        """Return the area of a picture of the samples: their box and half a sample's width around it."""
         half = (self.upper - self.lower) / (torch.tensor(self.resolution, dtype=torch.float64) - 1) / 2
         return self.lower - half, self.upper + half
 

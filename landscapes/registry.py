@@ -1,4 +1,4 @@
-"""What is found by name: ours, and what other packages register by entry points. Nothing is imported to list it."""
+"""Find things by name: ours, and those that other packages register by entry points. Listing imports nothing."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from typing import Any, Protocol, TypeVar
 
 
 class Registered(Protocol):
-    """Something with a name, and where it is: mostly "module:Class"."""
+    """Something with a name, and its location: mostly "module:Class"."""
 
     @property
     def name(self) -> str:
-        """What it is called."""
+        """Its name."""
 
     @property
     def target(self) -> Any:
-        """Where it is."""
+        """Its location."""
 
 
 Entry = TypeVar("Entry", bound=Registered)
@@ -29,8 +29,8 @@ def collect(
 ) -> dict[str, Entry]:
     """Return entries by name, ours before those of a group of entry points.
 
-    `make` takes the name and the target of one of these, and by whom it is registered. Raises ValueError where two of a
-    `kind` have the same name.
+    `make` takes the name and the target of one of these, and the package that registers it. Raises ValueError where two
+    of a `kind` have the same name.
     """
     found = {entry.name: entry for entry in builtin}
     for point in entry_points(group=group):
@@ -47,7 +47,7 @@ def collect(
 def find(known: Mapping[str, Entry], name: str, kind: str, there: str) -> Entry:
     """Return the entry of a name.
 
-    Raises ValueError, with a name that comes close and a sentence about what is `there`, where nothing has it.
+    Raises ValueError, with a similar name and the sentence `there`, for an unknown one.
     """
     if name not in known:
         close = get_close_matches(name, known, n=1)
@@ -56,7 +56,7 @@ def find(known: Mapping[str, Entry], name: str, kind: str, there: str) -> Entry:
 
 
 def load(name: str, target: str, import_named: Callable[[str], Any] = import_module) -> Any:
-    """Import what is registered under a name. Raises ValueError where its module or its attribute is not there."""
+    """Import the target registered under a name. Raises ValueError where its module or its attribute does not exist."""
     module, _, attribute = target.rpartition(":")
     try:
         return getattr(import_named(module), attribute)

@@ -1,4 +1,4 @@
-"""A sampled slice of a landscape, as one works with it: its numbers, its plane, its picture, what is measured of it."""
+"""A sampled slice of a landscape for users: its numbers, its plane, its picture, its measures."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 class HasData(Protocol):
-    """What a slice needs of a run: its table of evaluations."""
+    """The part of a run that a slice needs: its table of evaluations."""
 
     @property
     def data(self) -> xr.Dataset:
@@ -35,13 +35,13 @@ class HasData(Protocol):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Slice:
-    """Hold the samples of a slice.
+    """The samples of a slice.
 
     `data` is an xarray dataset of loss(v, u), grad(v, u, dim) unless sampled without, and status(v, u); a line has no
     v. Along a logarithmic parameter a coordinate is the decimal logarithm of the value, and has the attribute `scale`,
-    "log10"; gradients are by it. `folder` is where its files are, None for one in memory. `remake` makes the objective
-    again that it was sampled from, for what has to be evaluated again. `floor_map` has the standard deviation between
-    replicas of the objective at every sample, deviation(v, u), None where it was not mapped.
+    "log10"; gradients are with respect to it. `folder` contains its files, None for one in memory. `remake` makes its
+    objective again, for further evaluations. `floor_map` has the standard deviation between replicas of the objective
+    at every sample, deviation(v, u), None where it was not measured.
     """
 
     data: xr.Dataset
@@ -51,12 +51,12 @@ class Slice:
 
     @cached_property
     def identity(self) -> dict[str, Any]:
-        """What decides the numbers, as plain JSON: scene, options, fidelity, device, engine, code, plane."""
+        """The settings that decide the numbers, as plain JSON."""
         return stored_identity(self.data)
 
     @cached_property
     def provenance(self) -> dict[str, Any]:
-        """What else is known of how it was made: command, date, versions, the loss's unit."""
+        """How the slice was made: command, date, versions, the loss's unit."""
         return stored_provenance(self.data)
 
     @cached_property
@@ -77,22 +77,22 @@ class Slice:
 
     @property
     def floor(self) -> Floor | None:
-        """The numerical floor: how far replicas of the objective are apart, None where it was not measured."""
+        """The numerical floor: the differences between replicas of the objective, None where it was not measured."""
         from .measures.slice_floor import floor_of
 
         return floor_of(self.data)
 
     @property
     def errors(self) -> str:
-        """How many points raised and what the first of them said, in a line; empty where none did."""
+        """The number of points that raised and the first message, in a line; empty where none did."""
         return errors_of(self.data)
 
     def minima(self, depth: float = 0.01) -> pd.DataFrame:
         """Return the local minima deeper than a share of the range of the losses, deepest first, a row each.
 
-        The columns are the values along the plane's axes, the loss there, and the depth: how far one must climb to get
-        to a lower minimum (persistence). The depth of the lowest is the range of the losses. Of a refined slice its
-        finest lattice that is sampled everywhere counts.
+        The columns are the values along the plane's axes, the loss there, and the depth: the climb needed to reach a
+        lower minimum (persistence). The depth of the lowest is the range of the losses. In a refined slice, the finest
+        complete lattice counts.
         """
         import pandas as pd
 
@@ -110,10 +110,10 @@ class Slice:
         return pd.DataFrame({**columns, "loss": loss.ravel()[found.sample[deep]], "depth": found.depth[deep]})
 
     def plot(self, runs: Sequence[HasData] = (), *, width: float | None = None) -> Picture:
-        """Draw the slice, a loss map over its gradients or a profile over a line, with runs laid over it.
+        """Draw the slice, a loss map over its gradients or a profile over a line, with runs on top.
 
-        The picture is matplotlib's figure, shown by a notebook as it is; `width` draws it for a page so wide [mm].
-        Raises ValueError where a run has other parameters than the slice.
+        It returns a matplotlib figure, which notebooks show. `width` draws it for a page of this width [mm]. Raises
+        ValueError where a run has other parameters than the slice.
         """
         if runs:
             from .draw.figures.overlay import overlay_figure
@@ -131,11 +131,11 @@ class Slice:
         return profile_figure(self.data, events=events, floor=self.floor_map, width=width)
 
     def report(self, points: int = 6, seed: int = 0) -> Profile:
-        """Measure what the landscape is like here: ruggedness, noise, jumps, gradients at several scales, in words.
+        """Measure the landscape of the slice: ruggedness, noise, jumps, gradients at several scales, with a verdict.
 
-        `points` x `points` places of the slice are evaluated again, with points near them. Raises ValueError for a
-        slice without gradients, for one that is not finished, and for one whose objective cannot be made again,
-        StoreMismatchError where the objective gives other numbers now than the slice holds.
+        `points` x `points` points of the slice are evaluated again, with points near them. Raises ValueError for a
+        slice without gradients, for an incomplete one, and for one whose objective cannot be made again. Raises
+        StoreMismatchError where the objective now gives other numbers than those in the slice.
         """
         from .lattice import sampled_lattice
         from .measures.profile import measure_profile
@@ -143,10 +143,10 @@ class Slice:
         from .verification import LAST_PLACE, RESAMPLE, verify_dataset
 
         if missing := int((self.data["status"] == Status.MISSING).sum()):
-            raise ValueError(f"{missing} samples of this slice are missing; let what samples it continue first")
+            raise ValueError(f"{missing} samples of this slice are missing; finish sampling it first")
         if self.remake is None or "grad" not in self.data:
-            lacking = "the objective it was sampled from" if "grad" in self.data else "gradients"
-            raise ValueError(f"a report needs {lacking}, which this slice is without; sample it by gradscape.slice")
+            lacking = "its objective" if "grad" in self.data else "gradients"
+            raise ValueError(f"a report needs {lacking}, which this slice lacks; sample it with gradscape.slice")
         objective = self.remake()
         if self.folder is not None:
             verify_dataset(objective, self.data, self.folder, todo=RESAMPLE)
@@ -157,7 +157,7 @@ class Slice:
         )  # fmt: skip
 
     def __repr__(self) -> str:
-        """Return in a line what was sampled and what came out."""
+        """Return the slice and its result in a line."""
         about = simulator_parts(self.identity)
         points = " x ".join(map(str, self.plane.resolution))
         loss = self.data["loss"]

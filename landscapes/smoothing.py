@@ -11,14 +11,12 @@ from .identity import plane_of
 def smooth(dataset: xr.Dataset, width: float) -> xr.Dataset:
     """Average a slice's losses by a Gaussian of standard deviation `width`, a fraction of each side of its box.
 
-    Only samples that are there count: weights beyond the box and on failed samples are left out and the others scaled
-    to sum to one, so that no value is invented; a failed sample stays failed. Gradients are left out. Width 0 is the
-    slice itself.
-
-    Raises ValueError where the width is negative.
+    Only existing samples count: weights outside the box and on failed samples are left out, and the others scaled to
+    sum to one, so no value is invented. A failed sample stays failed. Gradients are left out. Width 0 is the slice
+    itself. Raises ValueError where the width is negative.
     """
     if not width >= 0:
-        raise ValueError(f"a slice is smoothed over a width that is not negative; got {width}")
+        raise ValueError(f"smooth takes a width of at least 0; got {width}")
     losses = dataset.drop_vars("grad", errors="ignore").transpose("v", "u", ...)
     if width == 0:
         return losses

@@ -1,4 +1,4 @@
-"""The box of parameters a landscape is spanned by, and the scales that they are worked with on."""
+"""The box of parameters of a landscape, and their scales."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ LINEAR, LOG10 = SCALES = ("linear", "log10")
 
 @dataclass(frozen=True)
 class Log:
-    """Bound a parameter, in its own unit, that is worked with by its decimal logarithm."""
+    """Bound a parameter, in its own unit, that is treated by its decimal logarithm."""
 
     lower: float
     upper: float
@@ -37,7 +37,7 @@ class Log:
 
 
 def log(lower: float, upper: float, unit: str = "") -> Log:
-    """Bound a parameter of a `ParameterSpace` that is worked with by its decimal logarithm.
+    """Bound a parameter of a `ParameterSpace` that is treated by its decimal logarithm.
 
         ParameterSpace({"k": log(1e-2, 1e6, "N/m"), "c": (0, 5)})
 
@@ -54,14 +54,13 @@ class ParameterSpace:
         ParameterSpace({"k": log(1e-2, 1e6, "N/m"), "c": (0, 5)})
         ParameterSpace(["k", "c"], lower=[1e-2, 0], upper=[1e6, 5], units=["N/m", ""], scales=["log10", "linear"])
 
-    Bounds are given as numbers of any kind in the parameters' own units, which are none where they are not given. A
-    point `x` has, for each parameter, its value, or the decimal logarithm of it where its scale is "log10": such
-    points are what `evaluate` takes, what slices, searches and checks work with, and what `lower` and `upper`, float64
-    of shape (dim,), bound. `to_values` and `from_values` turn one into the other. The bounds say where a landscape is
-    looked at, and an objective is not asked beyond them unless it invites that (`Objective`). `arrays` are the shapes
-    of the arrays that parameters are the numbers of, in their order, by name: none but in a space `of_weights`.
+    Bounds are any numbers in the parameters' own units; a parameter without a unit has none. A point `x` has, for each
+    parameter, its value, or its decimal logarithm if its scale is "log10". `evaluate`, slices, searches and checks use
+    such points, and `lower` and `upper`, float64 of shape (dim,), bound them. `to_values` and `from_values` convert. An
+    objective is evaluated only inside the bounds, unless it allows more (`Objective`). `arrays` are the shapes, by
+    name, of the arrays whose numbers the parameters are, in order; only a space `of_weights` has any.
 
-    Raises ValueError where names, bounds, units or scales do not belong together.
+    Raises ValueError where names, bounds, units or scales do not match.
     """
 
     names: tuple[str, ...]
@@ -82,7 +81,9 @@ class ParameterSpace:
     ) -> None:
         if isinstance(names, Mapping):
             if not (lower is None and upper is None and units is None and scales is None):
-                raise ValueError("ParameterSpace takes names with their bounds and units, or each of them; got both")
+                raise ValueError(
+                    "ParameterSpace takes either a mapping from names to bounds and units, or separate lists; got both"
+                )
             lower, upper, units, scales = _columns(names)
         if isinstance(names, str) or lower is None or upper is None:
             raise ValueError(f"ParameterSpace takes names, lower and upper bounds; got {names!r}, {lower}, {upper}")
@@ -121,7 +122,7 @@ class ParameterSpace:
 
     @classmethod
     def box(cls, names: Sequence[str], lower: float, upper: float, unit: str = "") -> ParameterSpace:
-        """Return a space whose parameters share their bounds and their unit."""
+        """Return a space whose parameters all have the same bounds and unit."""
         dim = len(names)
         return cls(tuple(names), [lower] * dim, [upper] * dim, (unit,) * dim)
 
@@ -138,15 +139,15 @@ class ParameterSpace:
             ParameterSpace.of_weights({"hidden.weight": (8, 3), "hidden.bias": (8,), "out.weight": (1, 8)}, 3.0)
             ParameterSpace.of_weights({name: one.shape for name, one in net.named_parameters()})
 
-        A point holds the arrays one after another, each flattened row by row. `reach` may be given for each array by
-        its name. The first axis of an array numbers the outputs of its layer, as torch has it, or the last one, as Flax
-        has it: what belongs to one output is a filter (`filters`). Bounds say where random points are and what a share
-        of the box is; functions of weights are evaluated beyond them, too.
+        A point contains the arrays one after another, each flattened row by row. `reach` can be given for each array by
+        its name. The outputs of a layer are the first axis of an array, as in torch, or the last, as in Flax. The
+        weights of one output are a filter (`filters`). Bounds only define random points and fractions of the box;
+        functions of weights are also evaluated outside them.
 
-        Raises ValueError for what is no shape, and where an array has no reach.
+        Raises ValueError for an invalid shape, and where an array has no reach.
         """
         if outputs not in ("first", "last"):
-            raise ValueError(f"of_weights takes outputs first or last; got {outputs!r}")
+            raise ValueError(f"of_weights takes outputs='first' or 'last'; got {outputs!r}")
         arrays = {str(name): tuple(as_whole(n, f"a side of {name}", least=1) for n in shapes[name]) for name in shapes}
         if isinstance(reach, Mapping) and (lacking := [name for name in arrays if name not in reach]):
             raise ValueError(f"of_weights takes a reach of each array; got none of {', '.join(lacking)}")
@@ -161,7 +162,7 @@ class ParameterSpace:
 
     @property
     def filters(self) -> list[NDArray[np.intp]]:
-        """The numbers of the parameters of each filter: the weights of one output of one layer, biases left out."""
+        """The numbers of the parameters of each filter: the weights of one output of one layer, without biases."""
         found, first = list[NDArray[np.intp]](), 0
         for shape in self.arrays.values():
             own = first + np.arange(math.prod(shape)).reshape(shape)
@@ -182,21 +183,21 @@ class ParameterSpace:
 
     @property
     def is_linear(self) -> bool:
-        """Whether a point holds the parameters' own values, as none of them is logarithmic."""
+        """Whether a point has the parameters' own values, because none of them is logarithmic."""
         return LOG10 not in self.scales
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """Names with units, as an axis shows them, and as columns of values are called."""
+        """Names with units, as on axes and for columns of values."""
         return tuple(map(labelled, self.names, self.units))
 
     @property
     def scaled_labels(self) -> tuple[str, ...]:
-        """What columns of points `x` are called: a logarithmic parameter is "log10 k [N/m]"."""
+        """Labels of columns of points `x`: a logarithmic parameter is "log10 k [N/m]"."""
         return scaled_labels(self.labels, self.scales)
 
     def to_values(self, x: Float[Tensor, "*batch dim"]) -> Float[Tensor, "*batch dim"]:
-        """Return the parameters' own values at points `x`; each row's bits are independent of the batch it is in."""
+        """Return the parameters' own values at points `x`; each row's bits are independent of its batch."""
         return to_values(tensor_of(x, "to_values"), self.scales)
 
     def from_values(self, values: Float[Tensor, "*batch dim"]) -> Float[Tensor, "*batch dim"]:
@@ -233,14 +234,14 @@ class ParameterSpace:
     def uniform(self, count: int, *, seed: int) -> Float[Tensor, "count dim"]:
         """Draw points uniformly from the box; the same seed gives the same points.
 
-        Raises ValueError where the count or the seed is no whole number.
+        Raises ValueError where the count or the seed is no integer.
         """
         generator = torch.Generator().manual_seed(as_whole(seed, "a seed"))
         count = as_whole(count, "a count of points")
         return self.from_unit(torch.rand(count, self.dim, generator=generator, dtype=torch.float64))
 
     def sobol(self, count: int, *, seed: int) -> Float[Tensor, "count dim"]:
-        """Return points spread evenly over the box, of a scrambled Sobol sequence; the same seed gives the same."""
+        """Return points spread evenly over the box, from a scrambled Sobol sequence; a seed gives the same points."""
         return self.from_unit(sobol(count, self.dim, seed=seed))
 
     def index(self, parameter: str | int) -> int:
@@ -253,14 +254,16 @@ class ParameterSpace:
         try:
             number = int(parameter) if isinstance(parameter, str) else operator.index(parameter)
         except (TypeError, ValueError):
-            raise ValueError(f"no parameter is called {parameter!r}; there are {', '.join(self.names)}") from None
+            raise ValueError(
+                f"no parameter is called {parameter!r}; the parameters are {', '.join(self.names)}"
+            ) from None
         if not 0 <= number < self.dim:
             raise ValueError(f"parameters are numbered 0 to {self.dim - 1}; got {number}")
         return number
 
 
 def labelled(name: str, unit: str) -> str:
-    """Return a name with its unit, as axes and columns have it."""
+    """Return a name with its unit, for axes and columns."""
     return f"{name} [{unit}]" if unit else name
 
 
@@ -277,9 +280,9 @@ def to_values(x: Float[Tensor, "*batch dim"], scales: Sequence[str]) -> Float[Te
 
 
 def _power_of_ten(exponents: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return 10^x; of the numbers that have this logarithm the one of twelve digits, where there is one.
+    """Return 10^x; of all numbers with this logarithm the one of twelve digits, where there is one.
 
-    So bounds come back as they were given: 10^log10(5) is 5.000000000000001 as NumPy rounds it, beyond a bound of 5.
+    So bounds return unchanged: 10^log10(5) is 5.000000000000001 in NumPy's rounding, outside a bound of 5.
     """
     with np.errstate(over="ignore", invalid="ignore"):
         values = np.asarray(np.power(10.0, exponents))
@@ -317,7 +320,7 @@ def sobol(count: int, dim: int, *, seed: int) -> Float[Tensor, "count dim"]:
 
 
 def as_whole(value: object, what: str, *, least: int = 0) -> int:
-    """Return a whole number of 64 bits that is not below `least`; raises ValueError, which says `what` it is, else."""
+    """Return an integer of 64 bits not below `least`; otherwise raises ValueError, which names `what` it is."""
     try:
         number = least - 1 if isinstance(value, bool) else operator.index(value)  # type: ignore[arg-type] # as it tells
     except TypeError:
@@ -330,19 +333,19 @@ def as_whole(value: object, what: str, *, least: int = 0) -> int:
 
 
 def as_stride(gradients: bool | int) -> int:
-    """Return at every how many samples gradients are: 0 for none, 1 for all. Raises ValueError for no whole number."""
+    """Return the stride of gradients: 0 for none, 1 for all samples. Raises ValueError for no integer."""
     return as_whole(int(gradients) if isinstance(gradients, bool) else gradients, "gradients")
 
 
 def tensor_of(x: object, who: str) -> Float[Tensor, "*shape"]:
-    """Return a tensor as it is, and one of any other numbers."""
+    """Return a tensor unchanged, and convert any other numbers."""
     return x if isinstance(x, Tensor) else as_tensor(x, who)
 
 
 def as_tensor(x: object, who: str) -> Float[Tensor, "*shape"]:
-    """Return numbers, whole or floating, of a tensor, an array or lists as a float64 tensor on the CPU.
+    """Return numbers in a tensor, an array or lists as a float64 tensor on the CPU.
 
-    Raises ValueError, which says `who` takes them, for what is no number, and for what an array masks.
+    Raises ValueError, naming `who` takes them, for anything else and for masked arrays.
     """
     if isinstance(x, Tensor):
         if x.is_complex() or x.dtype == torch.bool:
@@ -350,7 +353,7 @@ def as_tensor(x: object, who: str) -> Float[Tensor, "*shape"]:
         return x.detach().to("cpu", torch.float64)
     if any(map(np.ma.is_masked, x if isinstance(x, list | tuple) else [x])):
         raise ValueError(
-            f"{who} takes numbers; got an array that masks some (`.filled(numpy.nan)` makes them failures)"
+            f"{who} takes numbers; got an array with masked ones (`.filled(numpy.nan)` turns them into failures)"
         )
     try:
         values = np.asarray(x)

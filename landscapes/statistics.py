@@ -18,7 +18,7 @@ BLOCKS = {1: (16,), 2: (4, 4)}  # parts of a line, or of a plane, that are left 
 
 @dataclass(frozen=True)
 class Estimate:
-    """Hold a number and its 95 % interval; NaN where nothing could be measured."""
+    """A number and its 95 % interval; NaN where nothing could be measured."""
 
     value: float
     low: float
@@ -29,13 +29,13 @@ UNKNOWN = Estimate(math.nan, math.nan, math.nan)
 
 
 def exactly(value: float) -> Estimate:
-    """Return a number without an interval: it is of these samples alone, or they are too few for one."""
+    """Return a number without an interval: it describes only these samples, or they are too few for one."""
     return Estimate(value, math.nan, math.nan)
 
 
 @dataclass(frozen=True)
 class Line:
-    """Hold a line fitted to points by least squares, and the standard error of its slope, 0 for two points."""
+    """A line fitted to points by least squares, and the standard error of its slope, 0 for two points."""
 
     slope: float
     intercept: float
@@ -46,7 +46,7 @@ def fit_line(x: ArrayLike, y: ArrayLike) -> Line:
     """Fit y = slope x + intercept to two or more points. Raises ValueError where all of x are the same."""
     x, y = np.asarray(x, float), np.asarray(y, float)
     if len(np.unique(x)) < 2:
-        raise ValueError(f"a line is fitted to points at two or more x; got {len(x)} at {np.unique(x).tolist()}")
+        raise ValueError(f"fit_line needs points at two or more x; got {len(x)} at {np.unique(x).tolist()}")
     (variance, covariance), (_, spread) = np.cov(x, y, bias=True)
     slope = covariance / variance
     correlation = min(1.0, abs(covariance) / np.sqrt(variance * spread)) if spread > 0 else 1.0
@@ -64,10 +64,10 @@ def student(freedom: ArrayLike, level: float = (1 + CONFIDENCE) / 2) -> Any:
 def jackknife(
     statistic: Callable[[Values], float], samples: Values, *, least: float = -np.inf, most: float = np.inf
 ) -> Estimate:
-    """Measure a slice, and once more without each of 16 blocks of it: neighbours depend on each other, blocks hardly.
+    """Measure a slice, and once more without each of its 16 blocks: neighbours depend on each other, blocks hardly.
 
     The statistic takes samples, shape (u,) or (v, u), NaN where there is none. Delete-a-block jackknife: Kunsch 1989,
-    Ann. Statist. 17(3), with Student's interval, cut off at `least` and `most`.
+    Ann. Statist. 17(3), with Student's interval, truncated to `least` and `most`.
     """
     value = statistic(samples)
     parts = []
@@ -80,7 +80,7 @@ def jackknife(
 
 
 def from_parts(value: float, parts: Sequence[float], *, least: float = -np.inf, most: float = np.inf) -> Estimate:
-    """Return a number with the jackknife's interval, from those without each part of the samples; NaN is left out."""
+    """Return a number with the jackknife's interval, from values without each part of the samples; NaN is ignored."""
     known = np.array(parts)[np.isfinite(parts)]
     if len(known) < 2 or not math.isfinite(value):
         return exactly(value)
@@ -89,11 +89,11 @@ def from_parts(value: float, parts: Sequence[float], *, least: float = -np.inf, 
 
 
 def exact_share(found: Estimate, tries: int) -> Estimate:
-    """Return a share of tries that depend on each other, with an exact interval instead of its symmetric one.
+    """Return a share of dependent tries with an exact interval instead of its symmetric one.
 
-    It is the binomial interval (Clopper & Pearson 1934) of as many independent tries as would vary as much: Korn &
-    Graubard 1998, Survey Methodology 24(2). A share of 0 or 1 does not vary, and has the interval of all tries. What
-    has no interval is returned as it is.
+    It is the binomial interval (Clopper & Pearson 1934) of the number of independent tries with the same variance: Korn
+    & Graubard 1998, Survey Methodology 24(2). A share of 0 or 1 does not vary, and has the interval of all tries. A
+    value without an interval is returned unchanged.
     """
     value, reach = found.value, max(found.value - found.low, found.high - found.value)
     if not math.isfinite(reach):
@@ -112,12 +112,12 @@ def share(hits: int, tries: int) -> Estimate:
 
 
 def clustered_share(hits: Values, clusters: Sequence[NDArray[np.intp]]) -> Estimate:
-    """Return the share of tries that are hits, shape (try,), and its interval where tries of a cluster are alike.
+    """Return the share of hits among tries, shape (try,), with an interval for tries that are alike within clusters.
 
-    `clusters` are the numbers of the clusters of each try, by one or several groupings; of several the one counts that
-    says least, and of none all tries were made that there are, so that there is no interval. The exact binomial
-    interval of as many independent tries as would vary as much, corrected for few clusters: Korn & Graubard 1998,
-    Survey Methodology 24(2). Where no two clusters differ these are as many as there are clusters.
+    `clusters` are the cluster numbers of each try, by one or several groupings. Of several, the one with the least
+    information counts. Without any, the tries are a complete enumeration, so there is no interval. The interval is the
+    exact binomial one of the number of independent tries with the same variance, corrected for few clusters: Korn &
+    Graubard 1998, Survey Methodology 24(2). Where no two clusters differ, that number is the number of clusters.
     """
     tries = len(hits)
     if not tries:
@@ -130,7 +130,7 @@ def clustered_share(hits: Values, clusters: Sequence[NDArray[np.intp]]) -> Estim
 
 
 def _independent(hits: Values, cluster: NDArray[np.intp]) -> float:
-    """Return how many independent tries would tell a share as well as those of clusters do."""
+    """Return the number of independent tries that would measure a share as precisely as those of clusters."""
     names, of = np.unique(cluster, return_inverse=True)
     if len(names) < 2:
         return 0.0
@@ -144,7 +144,7 @@ def _independent(hits: Values, cluster: NDArray[np.intp]) -> float:
 
 
 def _binomial(hits: float, tries: float) -> tuple[float, float]:
-    """Return the ends of the exact interval, also of numbers that are not whole."""
+    """Return the ends of the exact interval, also for numbers that are not integers."""
     from scipy.special import betaincinv
 
     tail = (1 - CONFIDENCE) / 2
@@ -154,7 +154,7 @@ def _binomial(hits: float, tries: float) -> tuple[float, float]:
 
 
 def upper_bound(hits: int, tries: int) -> float:
-    """Return the largest share that so few hits do not rule out, one-sided (Clopper & Pearson 1934); 1 of no tries."""
+    """Return the largest share consistent with this few hits, one-sided (Clopper & Pearson 1934); 1 for no tries."""
     if hits >= tries:
         return 1.0
     from scipy.special import betaincinv
@@ -163,7 +163,7 @@ def upper_bound(hits: int, tries: int) -> float:
 
 
 def mean(values: Values, *, least: float = -np.inf, most: float = np.inf) -> Estimate:
-    """Return the mean of independent values, NaN left out, with Student's interval."""
+    """Return the mean of independent values, without NaN, with Student's interval."""
     known = values[np.isfinite(values)]
     if not len(known):
         return UNKNOWN
@@ -175,13 +175,13 @@ def mean(values: Values, *, least: float = -np.inf, most: float = np.inf) -> Est
 
 
 def middle_95(value: float, drawn: ArrayLike) -> Estimate:
-    """Return a number with the middle 95 % of what a bootstrap drew, shape (resample,)."""
+    """Return a number with the middle 95 % of bootstrap draws, shape (resample,)."""
     low, high = np.quantile(np.asarray(drawn), ((1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2))
     return Estimate(value, float(low), float(high))
 
 
 def ratio(value: float, whole: float) -> float:
-    """Return a ratio; nothing is 0 of any whole, and of a whole of 0 nothing else has a share."""
+    """Return a ratio; zero is 0 of any whole, and nothing else is a share of zero."""
     return value / whole if whole > 0 else 0.0 if value == 0 else math.nan
 
 
@@ -212,5 +212,5 @@ def median_of(values: Values) -> Values:
 
 
 def p95_of(values: Values) -> Values:
-    """Return the 95th percentile along the last axis: the next larger of the values, not interpolated."""
+    """Return the 95th percentile along the last axis: the next larger value, not interpolated."""
     return np.asarray(np.quantile(values, 0.95, axis=-1, method="higher"))

@@ -1,4 +1,4 @@
-"""How many threads torch computes with."""
+"""The number of threads that torch computes with."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ import torch
 
 @contextmanager
 def one_torch_thread() -> Iterator[None]:
-    """Keep torch to one thread meanwhile.
+    """Limit torch to one thread within this block.
 
-    How sums round depends on how many threads share them, so that a search's numbers would not depend on its seed
-    alone. And its other threads busily wait for work on cores that others need: triple times, in Taichi's case.
+    The rounding of sums depends on the number of threads, so a search's numbers would not depend on its seed alone.
+    torch's other threads also wait actively on cores that others need, which tripled times in Taichi's case.
     """
     before = torch.get_num_threads()
     torch.set_num_threads(1)

@@ -1,7 +1,7 @@
-"""Checkpoints of a training as points of a space: how they are read, and the plane that they move in.
+"""Checkpoints of a training as points of a space: reading them, and the plane in which they move.
 
-A checkpoint is a state dict of torch (.pt, .pth), a zip of Stable-Baselines3, which holds its policy's state dict, or
-arrays of NumPy (.npy, .npz). Nothing in them is run: torch reads weights only, NumPy no pickles.
+A checkpoint is a state dict of torch (.pt, .pth), a zip of Stable-Baselines3, which contains its policy's state dict,
+or arrays of NumPy (.npy, .npz). Nothing in them is executed: torch reads only weights, NumPy no pickles.
 """
 
 from __future__ import annotations
@@ -44,22 +44,22 @@ ATTRIBUTE = "training"  # of a slice that holds the path of a training
 
 @dataclass(frozen=True, eq=False)
 class Training:
-    """Hold the checkpoints of a training in order: `names` of files, and points `x`, shape (checkpoint, dim)."""
+    """The checkpoints of a training in order: `names` of files, and points `x`, shape (checkpoint, dim)."""
 
     names: tuple[str, ...]
     x: Float[Tensor, "checkpoint dim"]
 
     @classmethod
     def read(cls, folder: Path, objective: Objective) -> Training:
-        """Return the checkpoints in a folder, by their names, whose numbers count as numbers: 9 comes before 10.
+        """Return the checkpoints in a folder in the order of their names, sorted numerically: 9 comes before 10.
 
-        Raises ValueError where there are fewer than three, for one that does not hold the parameters of the objective,
-        and where one lies beyond its bounds, unless points there are evaluated, too.
+        Raises ValueError for fewer than three, and for one without the parameters of the objective. Raises it for one
+        outside the bounds, unless points there are evaluated, too.
         """
         files = checkpoints_in(folder)
         if len(files) < 3:
             raise ValueError(
-                f"a plane takes three checkpoints and more ({', '.join(SUFFIXES)}); {folder} holds {len(files)}"
+                f"a plane needs at least three checkpoints ({', '.join(SUFFIXES)}); {folder} has {len(files)}"
             )
         x = torch.stack([read_checkpoint(one, objective.space, objective.name) for one in files])
         if not objective.beyond_box:
@@ -69,10 +69,10 @@ class Training:
     def plane(self, space: ParameterSpace, resolution: int) -> Plane:
         """Lay a plane through the last checkpoint, along the two principal directions of the others about it.
 
-        Li et al. 2018, section 7. Their code centres the differences from the last one; the plane through that one is
-        then not the one nearest to the others, so here they are not centred. As by `principal_plane` it is found in the
-        box scaled to [-1, 1], and coordinates are in half-widths of the box. Raises ValueError where the checkpoints
-        spread in one direction alone.
+        Li et al. 2018, section 7. Their code centres the differences from the last one, so the plane through that one
+        is then not the nearest to the others; here they are not centred. As in `principal_plane` it is found in the box
+        scaled to [-1, 1], and coordinates are in half-widths of the box. Raises ValueError where the checkpoints spread
+        in a single direction.
         """
         half = (space.upper - space.lower) / 2
         z = (self.x - space.center) / half
@@ -80,7 +80,7 @@ class Training:
         return replace(flat, origin=space.center + half * flat.origin, basis=half * flat.basis)
 
     def over(self, plane: Plane, objective: Objective) -> TrainingPath:
-        """Evaluate the checkpoints, and return where they lie on a plane through the last, or off it."""
+        """Evaluate the checkpoints, and return their positions on a plane through the last, or distances from it."""
         half = (objective.space.upper - objective.space.lower) / 2
         z, scaled = self.x / half, replace(plane, origin=plane.origin / half, basis=plane.basis / half)
         u, off = scaled.project(z), scaled.distance(z)
@@ -92,7 +92,7 @@ class Training:
 
 @dataclass(frozen=True)
 class TrainedPoint:
-    """Say where a checkpoint lies: plane coordinates, `distance` off it [half-widths of the box], its own `loss`."""
+    """The position of a checkpoint: plane coordinates, `distance` off it [half-widths of the box], its own `loss`."""
 
     name: str
     u: float
@@ -103,9 +103,9 @@ class TrainedPoint:
 
 @dataclass(frozen=True)
 class TrainingPath:
-    """Hold the path of a training over a slice.
+    """The path of a training over a slice.
 
-    `explained` is the share of the checkpoints' squared distances from the last one that lies in the plane, in
+    `explained` is the share of the checkpoints' squared distances from the last one that is in the plane, in
     half-widths of the box.
     """
 
@@ -114,12 +114,12 @@ class TrainingPath:
 
     @property
     def farthest(self) -> float:
-        """How far a checkpoint lies off the plane at most [half-widths of the box], 0 where that is rounding."""
+        """The largest distance of a checkpoint from the plane [half-widths of the box], 0 if it is rounding."""
         most = max(one.distance for one in self.checkpoints)
         return most if most > ROUNDING else 0.0
 
     def sentence(self) -> str:
-        """Say how much of the training the plane shows."""
+        """Describe how much of the training the plane shows."""
         count = f"{len(self.checkpoints)} checkpoints"
         if not self.farthest:
             return f"{count}, all of them in the plane"
@@ -129,34 +129,34 @@ class TrainingPath:
         )
 
     def attribute(self) -> dict[str, str]:
-        """Return the attribute that a slice holds it in, as text."""
+        """Return the text of the attribute in which a slice stores it."""
         return to_attribute(ATTRIBUTE, self)
 
     @classmethod
     def of(cls, dataset: xr.Dataset) -> TrainingPath | None:
-        """Read it from a slice, None where the slice has none or what it has is none."""
+        """Read it from a slice, None where the slice has none."""
         return from_attribute(cls, dataset.attrs, ATTRIBUTE)
 
 
 def _refuse_beyond(x: Float[Tensor, "checkpoint dim"], space: ParameterSpace, who: str, folder: Path) -> None:
-    """Raise ValueError for checkpoints beyond the bounds, where nothing is evaluated."""
+    """Raise ValueError for checkpoints outside the bounds, where nothing is evaluated."""
     far = (space.to_unit(x) - 0.5).abs()
     if beyond := int((~in_box(space, x)).sum()):
         row, column = divmod(int(far.argmax()), space.dim)
         value, low, high = (float(one) for one in (x[row, column], space.lower[column], space.upper[column]))
         raise ValueError(
-            f"{beyond} of {len(x)} checkpoints in {folder} lie beyond the bounds of {who}: {space.names[column]} is "
-            f"{value:.3g}, bounds {low:.3g} to {high:.3g}; give it wider ones"
+            f"{beyond} of {len(x)} checkpoints in {folder} are outside the bounds of {who}: {space.names[column]} is "
+            f"{value:.3g}, bounds {low:.3g} to {high:.3g}; give it wider bounds"
         )
 
 
 def checkpoints_in(folder: Path) -> list[Path]:
-    """Return the files in a folder that may be checkpoints, by their names, in which numbers count as numbers."""
+    """Return the files in a folder that can be checkpoints, sorted by name with numbers as numbers."""
     return sorted((one for one in folder.iterdir() if one.suffix.lower() in SUFFIXES), key=_order)
 
 
 def digest_training(folder: Path) -> str:
-    """Return what is the same for the same checkpoints in a folder."""
+    """Return a digest of the checkpoints in a folder."""
     found = hashlib.sha256()
     for file in checkpoints_in(folder):
         found.update(file.name.encode() + file.read_bytes())
@@ -164,16 +164,16 @@ def digest_training(folder: Path) -> str:
 
 
 def _order(file: Path) -> list[tuple[int, str]]:
-    """Return what sorts files by their names, in which numbers count as numbers."""
+    """Return the sorting key of files by name, with numbers as numbers."""
     parts = re.split(r"(\d+)", file.name)
     return [(int(part), "") if part.isdecimal() else (0, part) for part in parts]
 
 
 def read_checkpoint(path: Path, space: ParameterSpace, who: str) -> Float[Tensor, " dim"]:
-    """Return the point that a checkpoint holds.
+    """Return the point of a checkpoint.
 
-    Arrays are found by the names of those of a space `of_weights`; where these are others, by their order. Raises
-    ValueError for what is no checkpoint, and where its arrays are not those of `who`.
+    Arrays are found by the names of those of a space `of_weights`, or else by their order. Raises ValueError for an
+    invalid checkpoint, and where its arrays do not match those of `who`.
     """
     try:
         arrays = _read_arrays(path)
@@ -183,12 +183,12 @@ def read_checkpoint(path: Path, space: ParameterSpace, who: str) -> Float[Tensor
     floats = {name: one for name, one in arrays.items() if one.dtype.kind in kinds}
     values = np.concatenate([one.ravel() for one in _chosen(floats, path, space, who)]).astype(np.float64)
     if lost := int((~np.isfinite(values)).sum()):
-        raise ValueError(f"{path} holds {lost} numbers that are not finite")
+        raise ValueError(f"{path} has {lost} numbers that are not finite")
     return space.from_values(torch.from_numpy(values))
 
 
 def _read_arrays(path: Path) -> Arrays:
-    """Return the arrays of a checkpoint by name, in its order; those of Stable-Baselines3 that decide."""
+    """Return the arrays of a checkpoint by name, in order; for Stable-Baselines3, those that decide actions."""
     if path.suffix.lower() == ".npy":
         return {"": np.load(path, allow_pickle=False)}
     if path.suffix.lower() == ".npz":
@@ -198,7 +198,7 @@ def _read_arrays(path: Path) -> Arrays:
         return _arrays_in(torch.load(path, map_location="cpu", weights_only=True))
     with zipfile.ZipFile(path) as held:
         if POLICY not in held.namelist():
-            raise ValueError(f"it is a zip without {POLICY}, which those of Stable-Baselines3 hold")
+            raise ValueError(f"it is a zip without {POLICY}, which zips of Stable-Baselines3 contain")
         found = _arrays_in(torch.load(io.BytesIO(held.read(POLICY)), map_location="cpu", weights_only=True))
     for prefixes in ACTORS:
         if all(any(name.startswith(prefix) for name in found) for prefix in prefixes):
@@ -207,7 +207,7 @@ def _read_arrays(path: Path) -> Arrays:
 
 
 def _arrays_in(held: Any) -> Arrays:
-    """Return the arrays of a state dict, or of the only one among what else a training has saved with it."""
+    """Return the arrays of a state dict, or of the only one in a file that a training has saved."""
     if isinstance(held, Tensor):
         held = {"": held}
     tensors = {str(name): one for name, one in held.items() if isinstance(one, Tensor)}
@@ -215,7 +215,7 @@ def _arrays_in(held: Any) -> Arrays:
     if not tensors and len(within) == 1:
         return _arrays_in(within[0])
     if not tensors:
-        raise ValueError(f"it holds {len(within)} state dicts; save the weights' alone")
+        raise ValueError(f"it contains {len(within)} state dicts; save only that of the weights")
     kinds = {name: torch.float64 if one.is_floating_point() else one.dtype for name, one in tensors.items()}
     return {name: one.detach().to(kinds[name]).numpy() for name, one in tensors.items()}
 
@@ -225,7 +225,7 @@ def _has_tensors(held: Mapping[Any, Any]) -> bool:
 
 
 def _chosen(arrays: Arrays, path: Path, space: ParameterSpace, who: str) -> list[NDArray[Any]]:
-    """Return the arrays that hold the parameters, in their order. Raises ValueError where they are not there."""
+    """Return the arrays of the parameters, in their order. Raises ValueError where they are missing."""
     wanted, there = space.arrays, list(arrays.values())
     if wanted and wanted.keys() <= arrays.keys():
         pairs = [(name, name) for name in wanted]
@@ -236,17 +236,17 @@ def _chosen(arrays: Arrays, path: Path, space: ParameterSpace, who: str) -> list
     else:
         takes = _listed(wanted) if wanted else f"{space.dim} numbers"
         held = _listed({name: one.shape for name, one in arrays.items()})
-        raise ValueError(f"{who} takes {takes}; {path} holds {held}")
+        raise ValueError(f"{who} takes {takes}; {path} has {held}")
     for name, own in pairs:
         if arrays[name].shape != wanted[own]:
             raise ValueError(
-                f"{who} takes {own} of shape {wanted[own]}; {path} holds {name} of shape {arrays[name].shape}"
+                f"{who} takes {own} of shape {wanted[own]}; {path} has {name} of shape {arrays[name].shape}"
             )
     return [arrays[name] for name, _ in pairs]
 
 
 def _listed(shapes: Mapping[str, tuple[int, ...]]) -> str:
-    """Return the names and shapes of arrays, and how many numbers they have, in words."""
+    """Return the names and shapes of arrays, and their total size, in words."""
     first = [f"{name or 'an array'} {shape}" for name, shape in list(shapes.items())[:LISTED]]
     more = [f"{len(shapes) - LISTED} more"] if len(shapes) > LISTED else []
     total = sum(math.prod(shape) for shape in shapes.values())

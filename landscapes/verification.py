@@ -1,8 +1,8 @@
 """Verification: a few points of a stored result are evaluated again before it is continued.
 
-Where their bits are the stored ones, nothing else is asked. Where they are not, it is measured how far losses and
-gradients move when nothing changes: evaluated once more, in other batches, and at points moved within rounding. What
-lies farther apart than that is the result of another function, a refusal with both numbers.
+If their bits equal the stored ones, that is enough. If not, the change of losses and gradients without a cause is
+measured: once more, in other batches, and at points moved within rounding. A larger difference means another function;
+it is refused with both numbers.
 """
 
 from __future__ import annotations
@@ -31,15 +31,15 @@ MOVES, REACH = 8, 8  # evaluations at points that are moved, and how far these a
 MARGIN = 10.0  # times what changes by noise
 SHOWN = 6  # parameters of a point that a refusal shows
 TODO = "write elsewhere with --out, or replace it with --force"
-RESAMPLE = "sample it again with --force, or take the simulator that it was sampled from"  # where it is only read
+RESAMPLE = "sample it again with --force, or use its former simulator"  # where it is only read
 
 
 @dataclass(frozen=True, eq=False)
 class StoredPoints:
-    """Hold points of a stored result with what was found there, and what the result is: a slice, a run.
+    """Points of a stored result with its values, and its type: a slice, a run.
 
-    `x` has shape (point, dim). `sloped` says that a point which failed may have been asked for its gradient, too: of
-    one that did not fail its gradient tells.
+    `x` has shape (point, dim). `sloped`: a failed point can have been evaluated with its gradient, too; for other
+    points the gradient itself shows it.
     """
 
     path: Path
@@ -62,10 +62,10 @@ class StoredPoints:
         return cls(path, "slice", x, stored_evaluation(arrays, plane.dim), "grad" in dataset)
 
     def choose(self, objective: Objective, count: int) -> list[int]:
-        """Return the rows to evaluate again: the middle one by its loss, the least and the largest.
+        """Return the rows to evaluate again: those with the median, the lowest and the highest loss.
 
-        Those that have a gradient come first, then those that have a loss. Points that the objective is not asked at
-        are none of them.
+        Rows with a gradient come first, then rows with a loss. Points at which the objective is not evaluated are left
+        out.
         """
         space, status = objective.space, self.found.status
         usable = self.x.isfinite().all(dim=1) & ~torch.isin(status, torch.tensor(NOT_EVALUATED, dtype=status.dtype))
@@ -79,7 +79,7 @@ class StoredPoints:
         return list(dict.fromkeys(int(order[pick]) for pick in picks))
 
     def asked(self) -> Bool[Tensor, " point"]:
-        """Say which points are known to have been asked for their gradients."""
+        """Return which points are known to have been evaluated with their gradients."""
         failed = self.found.status != Status.OK
         return self._has_gradient() | (failed & self.sloped)
 
@@ -90,10 +90,10 @@ class StoredPoints:
 
 @dataclass(frozen=True, eq=False)
 class _Probe:
-    """One stored point that is evaluated again, and the sizes that rounding is told in.
+    """One stored point that is evaluated again, and the scales for its rounding.
 
-    `spread` is that of all losses that are stored with it, `slope` the middle length of their gradients in widths of
-    the box, `widths`. `grad` says whether it was evaluated with its gradient.
+    `spread` is that of all losses stored with it, `slope` the median length of their gradients in widths of the box,
+    `widths`. `grad`: whether it was evaluated with its gradient.
     """
 
     stored: StoredPoints
@@ -113,11 +113,10 @@ class _Probe:
 
 
 def verify(objective: Objective, results: Sequence[StoredPoints], *, points: int = POINTS, todo: str = TODO) -> None:
-    """Evaluate so many points of each stored result again, all in one batch, and refuse other numbers.
+    """Evaluate this many points of each stored result again, all in one batch, and refuse other numbers.
 
-    Losses, gradients where they are stored, and how points ended are compared.
-
-    Raises StoreMismatchError, which names the result, both numbers and what `todo`.
+    Losses, stored gradients, and statuses are compared. Raises StoreMismatchError, which gives the result, both numbers
+    and `todo`.
     """
     probes = [probe for one in results for probe in _probes(objective, one, points)]
     for grad in (True, False):
@@ -132,14 +131,14 @@ def verify(objective: Objective, results: Sequence[StoredPoints], *, points: int
 
 
 def verify_dataset(objective: Objective, dataset: xr.Dataset, path: Path, *, todo: str = TODO) -> None:
-    """Verify a slice that was read; raises StoreMismatchError where the objective gives other numbers."""
+    """Verify a loaded slice; raises StoreMismatchError where the objective gives other numbers."""
     if stored_identity(dataset).get("boxed"):
         objective = BoxedObjective(objective)
     verify(objective, [StoredPoints.of_slice(dataset, path)], todo=todo)
 
 
 def stored_evaluation(arrays: Mapping[str, NDArray[Any]], dim: int) -> Evaluation:
-    """Return what arrays of a slice hold, point by point."""
+    """Return the content of a slice's arrays, point by point."""
     loss, status = (torch.from_numpy(arrays[name].reshape(-1)) for name in ("loss", "status"))
     return Evaluation(loss, torch.from_numpy(arrays["grad"].reshape(-1, dim)) if "grad" in arrays else None, status)
 
@@ -168,7 +167,7 @@ def _same(then: Evaluation, now: Evaluation) -> bool:
 
 
 def _apart(one: Tensor, other: Tensor) -> Tensor:
-    """Return how far numbers are apart, 0 where either is not finite."""
+    """Return the differences of numbers, 0 where either is not finite."""
     return torch.where(one.isfinite() & other.isfinite(), (one - other).abs(), 0.0)
 
 
@@ -180,19 +179,19 @@ def _differences(
     precision: str,
     names: Sequence[str],
 ) -> tuple[str, str, str]:
-    """Say how losses, statuses and gradients of a point are others now; empty by rounding, noise, or what happens too.
+    """Describe the changes of losses, statuses and gradients of a point; empty if rounding or noise explains them.
 
-    `again` was evaluated in other ways, of which `statuses` are all ends. Gradients are said by the parameter in which
-    they differ most in widths of the box.
+    `again` was evaluated in other ways, with the final `statuses`. Gradients are described by the parameter with the
+    largest difference in widths of the box.
     """
     then, loss, status, gradient = probe.then, "", "", ""
     noise = max(float(_apart(now.loss, one.loss)) for one in again)
     size = PLACES * LAST_PLACE[precision] * abs(float(now.loss.nan_to_num(0.0)))
     if float(_apart(then.loss, now.loss)) > max(ROUNDING[precision] * probe.spread, size, MARGIN * noise):
-        loss = f"losses are others now: {_both(float(then.loss), float(now.loss))}"
+        loss = f"losses have changed: {_both(float(then.loss), float(now.loss))}"
     if int(then.status) not in statuses:
         ends = f"{Status(int(then.status)).name} then, {Status(int(now.status)).name} now"
-        status = f"points end otherwise now: {ends}"
+        status = f"points end differently: {ends}"
     if then.grad is not None and now.grad is not None:
         shift = (_apart(then.grad, now.grad) * probe.widths)[0]
         noise = max(float((_apart(now.grad, one.grad) * probe.widths).max()) for one in again if one.grad is not None)
@@ -200,7 +199,7 @@ def _differences(
         axis = int(shift.argmax())
         if float(shift[axis]) > max(ROUNDING[precision] * size, MARGIN * noise):
             both = _both(float(then.grad[0, axis]), float(now.grad[0, axis]))
-            gradient = f"gradients are others now: gradient by {names[axis]} {both}"
+            gradient = f"gradients have changed: gradient by {names[axis]} {both}"
     return loss, status, gradient
 
 
@@ -223,7 +222,7 @@ def _compare(objective: Objective, probes: Sequence[_Probe], now: Evaluation, *,
         for probe, said in zip(probes, kind, strict=True):
             if said:
                 raise StoreMismatchError(
-                    f"{probe.stored.path} holds a {probe.stored.what} of {objective.name} whose {said}, at x = "
+                    f"{probe.stored.path} contains a {probe.stored.what} of {objective.name} whose {said}, at x = "
                     f"{_point(objective.space.to_values(probe.x))}; {todo}"
                 )
 
@@ -231,7 +230,7 @@ def _compare(objective: Objective, probes: Sequence[_Probe], now: Evaluation, *,
 def _evaluate_again(
     objective: Objective, x: Float[Tensor, "point dim"], *, grad: bool, reach: float
 ) -> list[Evaluation]:
-    """Evaluate points once more, one by one, in pairs, and together with others that lie within rounding of them."""
+    """Evaluate points once more: one by one, in pairs, and together with others within rounding of them."""
     space, generator = objective.space, torch.Generator().manual_seed(0)
     moves = 2 * torch.rand(MOVES, *x.shape, generator=generator, dtype=torch.float64) - 1
     moved = x + moves * reach * (space.upper - space.lower)
@@ -243,14 +242,14 @@ def _evaluate_again(
 
 
 def _evaluate(objective: Objective, x: Float[Tensor, "point dim"], *, grad: bool) -> Evaluation:
-    """Evaluate points in batches that an objective prefers, all at once where it prefers none."""
+    """Evaluate points in the objective's preferred batches, or all at once."""
     batch = objective.preferred_batch if objective.preferred_batch > 1 else max(1, len(x))
     parts = [evaluate(objective, part, grad=grad) for part in torch.split(x, batch)]
     return Evaluation.join(parts, dim=objective.space.dim, grad=grad)
 
 
 def _both(then: float, now: float) -> str:
-    """Return two numbers with as many digits as tell them apart."""
+    """Return two numbers with enough digits to distinguish them."""
     for digits in range(3, 18):
         if f"{then:.{digits}g}" != f"{now:.{digits}g}":
             break

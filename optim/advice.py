@@ -1,11 +1,11 @@
-"""Which method to begin a search with: learnt from cases, landscapes that were measured and in which methods raced.
+"""Advise a method to begin a search with, from cases: measured landscapes in which methods have raced.
 
-A case is a function or a scene. Its landscape was measured by few evaluations, and the ranks of nine methods in it are
-known at equal cost. Of a new landscape the expected rank of each method is its mean over the nearest cases. Whether
-that helps is measured by leaving out whole families of cases (`hold_out`). Only if in our scenes it is better than one
-method everywhere, beyond chance, is the method of the nearest cases advised, and else that one.
+A case is a function or a scene. Few evaluations measured its landscape, and the ranks of nine methods at equal cost are
+known. In a new landscape, the expected rank of each method is its mean rank over the nearest cases. Leaving out whole
+families of cases (`hold_out`) measures whether that helps. If, in our scenes, it beats one method everywhere beyond
+chance, the nearest cases decide the advice; otherwise that one method does.
 
-`python -m benchmarks.advice rows` makes the cases, and `python -m benchmarks.advice score` measures the score.
+`python -m benchmarks.advice rows` makes the cases, and `python -m benchmarks.advice score` computes the score.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Case:
-    """A landscape that was measured at several samples, and the mean `ranks` of methods at equal cost, 1 for best.
+    """A landscape measured at several samples, and the mean `ranks` of methods at equal cost, 1 for best.
 
-    `late` has the rank of each method if it alone had nine tenths of that cost, as it has after a tenth was measured.
-    `scene` is whether it is one of our simulated scenes.
+    `late` has the rank of each method if it alone had nine tenths of that cost, because a tenth was spent on measuring.
+    `scene`: whether it is one of our simulated scenes.
     """
 
     name: str
@@ -50,7 +50,7 @@ class Case:
 
     @cached_property
     def measures(self) -> Array:
-        """The means of its measures over the samples, NaN where none tells."""
+        """The means of its measures over the samples, NaN where no sample has one."""
         table = np.array([measures_of(one) for one in self.characters])
         known = np.isfinite(table)
         means = np.where(known, table, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
@@ -58,14 +58,14 @@ class Case:
 
     @property
     def best(self) -> tuple[str, ...]:
-        """The methods of the best mean rank."""
+        """The methods with the best mean rank."""
         least = min(self.ranks.values())
         return tuple(method for method, rank in self.ranks.items() if rank == least)
 
 
 @dataclass(frozen=True)
 class Cases:
-    """All cases, which were raced at a cost of `forwards` [forward equivalents], a gradient being `gradient_cost`."""
+    """All cases, raced at a cost of `forwards` [forward equivalents], where a gradient costs `gradient_cost`."""
 
     forwards: float
     gradient_cost: float
@@ -74,7 +74,7 @@ class Cases:
 
 @dataclass(frozen=True)
 class Near:
-    """A case near to a landscape: how far, in deviations of the measures, and the rank of the advised method there."""
+    """A case near a landscape: its distance, in deviations of the measures, and the advised method's rank in it."""
 
     name: str
     family: str
@@ -85,11 +85,11 @@ class Near:
 
 @dataclass(frozen=True)
 class Score:
-    """How good advice is for cases of families that were left out: mean ranks, with 95 % intervals over families.
+    """Quality of advice for cases of left-out families: mean ranks, with 95 % intervals over families.
 
-    `advised` is the rank of what the nearest cases advise, `single` that of one `method` everywhere, the best of these
-    cases in hindsight, `best` that of the best in each case in hindsight, and `difference` the first less the second.
-    `late` is `advised` if measuring has cost a tenth, NaN where that is not known.
+    `advised` is the rank of the methods advised by the nearest cases. `single` is that of one `method` everywhere, the
+    best of these cases in hindsight; `best` is that of the best method of each case in hindsight. `difference` is
+    `advised` minus `single`. `late` is `advised` if measuring has cost a tenth, NaN where that is unknown.
     """
 
     cases: int
@@ -103,22 +103,22 @@ class Score:
 
     @property
     def said(self) -> str:
-        """Say in words what the mean ranks are."""
+        """Describe the mean ranks in words."""
         apart = self.difference
         return (
-            f"the nearest cases advise what has mean rank {self.advised.value:.1f}, and {self.method} everywhere has "
+            f"advice by the nearest cases has mean rank {self.advised.value:.1f}, and {self.method} everywhere has "
             f"{self.single.value:.1f} (difference {apart.value:+.2f}, 95 %: {apart.low:+.2f} to {apart.high:+.2f})"
         )
 
     @property
     def helps(self) -> bool:
-        """Whether advice is better than one method everywhere, beyond chance."""
+        """Whether advice beats one method everywhere, beyond chance."""
         return self.difference.high < 0
 
 
 @dataclass(frozen=True)
 class Scores:
-    """How good advice is in our scenes, which decides whether it is given, and in functions."""
+    """Quality of advice in our scenes, which decides whether it is given, and in functions."""
 
     scenes: Score
     functions: Score
@@ -126,10 +126,10 @@ class Scores:
 
 @dataclass(frozen=True)
 class Choice:
-    """The method to begin with, why, and what the nearest cases let expect: mean ranks of methods, the best first.
+    """The method to begin with, the reason, and the expected mean ranks of methods from the nearest cases, best first.
 
-    `by_cases` is whether it is the choice of the nearest cases, rather than the best single method of our scenes.
-    `scores` say how good choices of the nearest cases are.
+    `by_cases`: the nearest cases chose it, rather than the best single method of our scenes. `scores` are the quality
+    of advice by the nearest cases.
     """
 
     method: str
@@ -142,12 +142,12 @@ class Choice:
 
 @cache
 def read_cases() -> Cases:
-    """Return the cases that the package brings."""
+    """Return the cases of the package."""
     return from_json(Cases, read_json(Path(str(resources.files("gradscape.optim"))) / FILE))
 
 
 def measures_of(one: Character) -> Array:
-    """Return the measures that landscapes are compared by, NaN where they are not known."""
+    """Return the measures by which landscapes are compared, NaN where unknown."""
     found = [np.log10(one.parameters), one.failed, one.flat, *one.falls, *one.agreement, one.across, one.convex]
     found += [one.coherence, one.steepest, np.log10(1e-6 + one.noise), max(one.linear, 0.0), max(one.quadratic, 0.0)]
     found += [one.dispersion, one.information, one.distance, one.skewness]
@@ -156,7 +156,7 @@ def measures_of(one: Character) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Neighbourhood:
-    """Cases to compare with, their measures in deviations from their means; what is not known counts as the mean."""
+    """Cases to compare with, their measures in deviations from their means; an unknown measure counts as the mean."""
 
     cases: Sequence[Case]
     mean: Array
@@ -164,7 +164,7 @@ class Neighbourhood:
 
     @classmethod
     def of(cls, cases: Sequence[Case]) -> Neighbourhood:
-        """Return that of some cases."""
+        """Return the neighbourhood of some cases."""
         table = np.array([one.measures for one in cases])
         known = np.isfinite(table)
         count = np.maximum(known.sum(axis=0), 1)
@@ -198,7 +198,7 @@ def methods_of(cases: Sequence[Case]) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class HeldOut:
-    """What cases of other families advise in a case, by one of the samples that it was measured at."""
+    """The advice of cases of other families in a case, from one of its samples."""
 
     case: Case
     method: str
@@ -206,7 +206,7 @@ class HeldOut:
 
 
 def hold_out(cases: Sequence[Case]) -> list[HeldOut]:
-    """Advise in each case, for each of its samples, by the cases of other families alone."""
+    """Advise in each case, for each of its samples, by cases of other families only."""
     methods, found = methods_of(cases), list[HeldOut]()
     for family in dict.fromkeys(one.family for one in cases):
         known = Neighbourhood.of([one for one in cases if one.family != family])
@@ -218,9 +218,9 @@ def hold_out(cases: Sequence[Case]) -> list[HeldOut]:
 
 
 def score_held_out(found: Sequence[HeldOut], ranks: Callable[[Case], Mapping[str, float]] | None = None) -> Score:
-    """Compare what was advised with what is best, by `ranks` of each case, by default its own.
+    """Compare the advised methods with the best, by `ranks` of each case, by default its own.
 
-    By others there is no `late`, which is NaN.
+    With other ranks there is no `late`; it is NaN.
     """
     known = {one.case.name: ranks(one.case) if ranks else one.case.ranks for one in found}
     rows, methods = [known[one.case.name] for one in found], methods_of([one.case for one in found])
@@ -243,26 +243,26 @@ def score_held_out(found: Sequence[HeldOut], ranks: Callable[[Case], Mapping[str
 
 
 def raced_methods() -> tuple[str, ...]:
-    """Return the methods that raced in the cases that the package brings."""
+    """Return the methods that raced in the cases of the package."""
     return methods_of(read_cases().cases)
 
 
 @cache
 def published_scores() -> Scores:
-    """Return the scores of the cases that the package brings."""
+    """Return the scores of the cases of the package."""
     found = hold_out(read_cases().cases)
     return Scores(*(score_held_out([one for one in found if one.case.scene == scene]) for scene in (True, False)))
 
 
 def choose(character: Character, methods: Sequence[str] = ()) -> Choice:
-    """Choose among `methods`, by default all that raced, the one to begin with in a landscape of such a character.
+    """Choose among `methods`, by default all that raced, the one to begin with in a landscape of this character.
 
     Raises ValueError where none of them raced.
     """
     cases, scores = read_cases().cases, published_scores()
     able = [one for one in methods_of(cases) if not methods or one in methods]
     if not able:
-        raise ValueError(f"there is no evidence on {', '.join(methods)}; there is on {', '.join(methods_of(cases))}")
+        raise ValueError(f"there is no evidence on {', '.join(methods)}; choose from {', '.join(methods_of(cases))}")
     near = Neighbourhood.of(cases).nearest(character)
     expected = expected_ranks([case for _, case in near], able)
     advised = next(iter(expected))
@@ -273,15 +273,15 @@ def choose(character: Character, methods: Sequence[str] = ()) -> Choice:
 
 
 def _reason(method: str, advised: str, near: Sequence[Near], scores: Scores) -> str:
-    """Say in a sentence why a method is advised, and how sure that is."""
+    """Explain in a sentence why a method is advised, and how certain that is."""
     first = sum(method in one.best for one in near)
     known = [one.name for one in near if method in one.best]
     alike = f"it was best in {first} of the {len(near)} nearest cases"
     alike += f", as in {' and '.join(known[:2])}" if known else ""
     if scores.scenes.helps:
         return f"{alike}; in scenes of other kinds {scores.scenes.said}"
-    other = "" if advised == method else f", which would say {advised}"
+    other = "" if advised == method else f", which would advise {advised}"
     return (
-        f"no evidence beyond that one method: in scenes of other kinds {scores.scenes.said}; "
-        f"in functions {scores.functions.said}. {alike[0].upper()}{alike[1:]}{other}"
+        "advice by similar landscapes is not shown to beat one method everywhere: in scenes of other kinds "
+        f"{scores.scenes.said}; in functions {scores.functions.said}. {alike[0].upper()}{alike[1:]}{other}"
     )

@@ -53,14 +53,14 @@ class Proposal:
 
 
 class Part:
-    """A part of an optimiser whose attributes are data, but for its `options`."""
+    """A part of an optimiser whose attributes are data, except its `options`."""
 
     def state(self) -> dict[str, Any]:
-        """Return where it stands, as data."""
+        """Return its present state, as data."""
         return {name: value for name, value in vars(self).items() if name != "options"}
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Take back what `state` returned. Raises ValueError for what is no attribute of it."""
+        """Restore a result of `state`. Raises ValueError for an unknown attribute."""
         for name, value in state.items():
             if name not in vars(self):
                 raise ValueError(f"{name} is no attribute of a {type(self).__name__}")
@@ -68,16 +68,16 @@ class Part:
 
 
 class Optimizer(abc.ABC):
-    """Search a box for the least loss: `ask` for points, evaluate them, `tell` what came out, and so on.
+    """Search a box for the least loss: `ask` for points, evaluate them, `tell` the results, and repeat.
 
-    A method is written by deriving from this class. Its hooks see the box scaled to [-1, 1] in every dimension, as
-    numpy arrays: `_ask` proposes points there, `_tell` takes their losses (+inf where an episode failed) and, where it
-    asked for them, gradients with respect to the scaled parameters: zero where an episode failed, NaN where it has a
-    loss alone. Randomness comes from `self.random` alone, so that a seed decides everything.
+    A new method derives from this class. Its hooks use the box scaled to [-1, 1] in every dimension, as numpy arrays.
+    `_ask` proposes points. `_tell` takes their losses (+inf where an episode failed) and, if requested, gradients with
+    respect to the scaled parameters. These are zero where an episode failed, and NaN where it has a loss but no
+    gradient. All random numbers come from `self.random`, so a seed decides everything.
 
-    Between `tell` and `ask` an optimiser is its `state`: what `from_state` makes of it continues bit for bit. A method
-    whose attributes are numbers, strings, arrays, lists and mappings of them, or parts (`Part`) that it has from
-    `_setup` on, needs nothing for that; any other says in `_state` and `_restore` what of it is data.
+    Between `tell` and `ask` an optimiser is its `state`: `from_state` continues it bit for bit. That works by itself if
+    the attributes of a method are numbers, strings, arrays, lists and mappings of them, or parts (`Part`) made in
+    `_setup`. Any other method converts its data in `_state` and `_restore`.
     """
 
     name: ClassVar[str]
@@ -97,21 +97,21 @@ class Optimizer(abc.ABC):
 
     @classmethod
     def on(cls, objective: Objective, *, seed: int = 0, options: Any = None) -> Self:
-        """Return the optimiser for an objective, of which most methods need no more than its box."""
+        """Return the optimiser for an objective; most methods need only its box."""
         return cls(objective.space, seed=seed, options=options)
 
     @classmethod
     def memory(cls, options: Mapping[str, Any], size: SearchSize) -> float:
-        """Estimate what a search takes at most [bytes]; `options` holds a value for each of the method's options."""
+        """Estimate the largest memory of a search [bytes]; `options` has a value for each option of the method."""
         return 100 * FLOAT * size.dim
 
     @final
     @classmethod
     def require_memory(cls, options: Any, size: SearchSize) -> None:
-        """Refuse options that take more memory than there is; `options` is the method's dataclass.
+        """Refuse options that need more memory than there is; `options` is the method's dataclass.
 
-        The dimension is judged first, with the method's defaults, then one option after the other, so that the error
-        names what is too much. Raises TooLargeError.
+        The dimension is checked first, with the method's defaults, then one option after the other, so that the error
+        names the setting that is too large. Raises TooLargeError.
         """
         known = asdict(type(options)())
         number = f"{cls.name}: number of parameters"
@@ -131,7 +131,7 @@ class Optimizer(abc.ABC):
         return Need(float(cls.memory({**options, option: value}, size)))
 
     def attach(self, objective: Objective) -> None:
-        """Take the objective in hand, for methods that ask it for more; `search` calls it, after a restart too."""
+        """Attach the objective, for methods that need more than its points; `search` calls it, also after a restart."""
         self.objective = objective
 
     @final
@@ -141,7 +141,7 @@ class Optimizer(abc.ABC):
 
     @final
     def asking(self) -> Asking[Proposal]:
-        """Return what `ask` does, after it has yielded what has to be done before."""
+        """Return the result of `ask`, after yielding the computations it needs."""
         found = self._ask()
         proposal = found if isinstance(found, Proposal) else (yield from found)
         unit = (proposal.x.clamp(-1.0, 1.0) + 1.0) / 2.0
@@ -150,7 +150,7 @@ class Optimizer(abc.ABC):
 
     @final
     def tell(self, x: Float[Tensor, "count dim"], evaluation: Evaluation) -> None:
-        """Take what the points that were asked for came out as; `x` are all of them, in their order."""
+        """Take the results at the requested points; `x` are all of them, in their order."""
         ok = evaluation.has_loss.numpy()
         loss = np.where(ok, evaluation.loss.numpy(), math.inf)
         if ok.any():
@@ -163,7 +163,7 @@ class Optimizer(abc.ABC):
 
     @final
     def state(self) -> dict[str, Any]:
-        """Return all there is to continue from, as data that `optim.runs.store.encode` writes."""
+        """Return the complete state, as data that `optim.runs.store.encode` writes."""
         return {
             "method": self.name,
             "seed": self.seed,
@@ -177,9 +177,9 @@ class Optimizer(abc.ABC):
     @final
     @classmethod
     def from_state(cls, objective: Objective, state: Mapping[str, Any]) -> Self:
-        """Return the optimiser that had this state, attached to the objective.
+        """Return the optimiser with this state, attached to the objective.
 
-        What does not fit raises whatever it is stumbled upon: KeyError, TypeError, ValueError and others.
+        A state that does not fit raises KeyError, TypeError, ValueError or another error.
         """
         optimizer = cls.on(objective, seed=state["seed"], options=cls.Options(**state["options"]))
         optimizer.attach(objective)
@@ -189,51 +189,51 @@ class Optimizer(abc.ABC):
         return optimizer
 
     def penalise(self, loss: Points) -> Points:
-        """Return losses for models that take finite numbers only: a failure counts as the worst loss so far."""
+        """Return losses for models that need finite numbers: a failure counts as the worst loss so far."""
         return np.where(np.isfinite(loss), loss, self.worst)
 
     def _setup(self) -> None:  # noqa: B027 -- nothing, for the simplest methods
         """Prepare the first `_ask`."""
 
     def _state(self) -> dict[str, Any]:
-        """Return what the method itself continues from; `self.random` stands where it did after the last draw."""
+        """Return the state of the method itself; `self.random` is restored to its state after the last draw."""
         return {name: _to_data(value) for name, value in vars(self).items() if name not in COMMON}
 
     def _restore(self, own: Mapping[str, Any]) -> None:
-        """Take back what `_state` returned, after `_setup` and `attach`; draws are put back afterwards."""
+        """Restore a result of `_state`, after `_setup` and `attach`; the random state is restored afterwards."""
         for name, value in own.items():
             if hasattr(type(self), name):
-                raise ValueError(f"{name} is no attribute that {self.name} keeps")
+                raise ValueError(f"{name} is no attribute in the state of {self.name}")
             setattr(self, name, _from_data(value, getattr(self, name, None)))
 
     def learn(self, z: Points, loss: Points) -> None:  # noqa: B027 -- nothing, for a method that remembers nothing
-        """Take in points of the scaled box that were evaluated before the search, one of which has a loss.
+        """Take points of the scaled box that were evaluated before the search; at least one has a loss.
 
         Their shapes are (count, dim) and (count,); losses are +inf where an episode failed. A descent starts at the
-        best of them, a model is of all of them.
+        best of them, a model takes all of them.
         """
 
     @abc.abstractmethod
     def _ask(self) -> Proposal | Asking[Proposal]:
-        """Propose points of the scaled box; those beyond it are moved to its border before they are evaluated.
+        """Propose points of the scaled box; points outside it are moved to its border before evaluation.
 
-        A generator may yield requests before it returns the proposal: heavy computations, and looks at episodes.
+        A generator can yield requests before it returns the proposal: heavy computations, and observations of episodes.
         """
 
     @abc.abstractmethod
     def _tell(self, z: Points, loss: Points, grad: Points | None) -> None:
-        """Take in points as they were evaluated, with shapes (count, dim), (count,) and (count, dim)."""
+        """Take points as evaluated, with shapes (count, dim), (count,) and (count, dim)."""
 
 
 def _to_data(value: Any) -> Any:
-    """Return the state of a part, or of each part in a list, and any other value as it is."""
+    """Return the state of a part, or of each part in a list, and any other value unchanged."""
     if isinstance(value, list):
         return [_to_data(one) for one in value]
     return value.state() if isinstance(value, Part) else value
 
 
 def _from_data(data: Any, now: Any) -> Any:
-    """Return what `_to_data` made data of; `now` are the parts to restore, if any."""
+    """Return the original of a result of `_to_data`; `now` are the parts to restore, if any."""
     if isinstance(now, Part):
         now.restore(data)
         return now
@@ -243,6 +243,6 @@ def _from_data(data: Any, now: Any) -> Any:
 
 
 def tame(loss: Points) -> Points:
-    """Return finite losses as they are, or all divided by one power of two if the squares of some had no sum."""
+    """Return finite losses, divided by a common power of two if their sum of squares would overflow."""
     largest = float(np.abs(loss).max())
     return loss if largest < LARGE else np.ldexp(loss, -int(np.frexp(largest)[1]))

@@ -1,4 +1,4 @@
-"""What is claimed of methods, and what a race makes of it."""
+"""Claims about methods, and the verdict of a race on them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from .statistics import Difference, Superiority
 
 @dataclass(frozen=True)
 class Claim:
-    """Say that one method is claimed to be ahead of another, or neither ahead (`alike`), and where that stands."""
+    """Claim that one method is ahead of another, or that neither is (`alike`), with the source of the claim."""
 
     first: str
     second: str
@@ -24,14 +24,14 @@ class Claim:
 
 @dataclass(frozen=True)
 class Claims:
-    """What is claimed of an environment; `silence` says why that is nothing."""
+    """The claims about an environment; `silence` says why there is none."""
 
     claims: tuple[Claim, ...] = ()
     silence: str | None = None
 
 
 class ClaimVerdict(StrEnum):
-    """Say what a race makes of a claim."""
+    """The verdict of a race on a claim."""
 
     HOLDS = "holds"
     FAILS = "does not hold"
@@ -41,7 +41,7 @@ class ClaimVerdict(StrEnum):
 
 @dataclass(frozen=True)
 class ClaimFinding:
-    """A claim, what the race makes of it, and how the two compare, seen from the first; None where one was not run."""
+    """A claim, its verdict, and the comparison of the two methods from the first; None where one was not run."""
 
     claim: Claim
     verdict: ClaimVerdict
@@ -52,7 +52,7 @@ class ClaimFinding:
 def check_claims(
     claims: Sequence[Claim], differences: Sequence[Difference], superiorities: Sequence[Superiority]
 ) -> list[ClaimFinding]:
-    """Return what a race makes of each claim, by the rank tests of its methods, corrected for all pairs of the race."""
+    """Return the verdict of a race on each claim, by rank tests corrected for all pairs of the race."""
     means = {(found.first, found.second): found for one in differences for found in (one, one.reversed)}
     chances = {(found.first, found.second): found for one in superiorities for found in (one, one.reversed)}
     pairs = [(claim.first, claim.second) for claim in claims]
@@ -63,7 +63,7 @@ def check_claims(
 
 
 def judge(claim: Claim, superiority: Superiority | None) -> ClaimVerdict:
-    """Return what is to be made of a claim, by its two methods; that two are alike can be refuted, never shown."""
+    """Return the verdict on a claim about two methods; a claim that two are alike can be refuted, never confirmed."""
     if superiority is None:
         return ClaimVerdict.NOT_RUN
     if superiority.better is None:

@@ -1,4 +1,4 @@
-"""A league: what races of the same methods over several scenes say, a row for each scene and method."""
+"""A league: races of the same methods in several scenes, with a row for each scene and method."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class BestPoint:
 
     @classmethod
     def of(cls, race: Race) -> BestPoint | None:
-        """Return that of a race, None where no episode succeeded."""
+        """Return the best point of a race, None where no episode succeeded."""
         found = list[BestPoint]()
         for run in chain.from_iterable(race.runs.values()):
             loss = run.data["loss"].to_numpy()[: race.budget]
@@ -52,10 +52,10 @@ class BestPoint:
 
 @dataclass(frozen=True)
 class Standing:
-    """How a method came off in a scene: mean rank and mean best loss with their intervals over seeds.
+    """A method's result in a scene: mean rank and mean best loss with their intervals over seeds.
 
-    `unsuccessful` counts the seeds without a successful episode, `failed` the episodes that failed; `times` are the
-    expected running times for the scene's `goals` [episodes], None where no run reached one.
+    `unsuccessful` counts the seeds without a successful episode, `failed` the failed episodes. `times` are the expected
+    running times for the scene's `goals` [episodes], None where no run reached one.
     """
 
     method: str
@@ -71,19 +71,18 @@ class Standing:
 
     @classmethod
     def of(cls, rank: Rank, times: Sequence[float | None]) -> Standing:
-        """Return that of a method in a race, by its rank and its running times."""
+        """Return the result of a method in a race, from its rank and its running times."""
         kept = {name: getattr(rank, name) for name in cls.__dataclass_fields__ if name != "times"}
         return cls(**kept, times=tuple(times))
 
 
 @dataclass(frozen=True)
 class SceneStandings:
-    """What a race in one scene says: `standings`, the best mean rank first, and how every two methods stand (`pairs`).
+    """The result of a race in one scene: `standings`, the best mean rank first, and comparisons of all `pairs`.
 
-    Both are at equal episodes; `equal_cost` has ranks and pairs at equal forward equivalents.
-    `identity` decides the numbers: scene, its version, options, fidelity, device, engine. `goals` are some of the
-    race's targets, the hardest first, `best` is the best point that any run found. `left_out` says why methods did
-    not run.
+    Both are at equal episodes; `equal_cost` has ranks and pairs at equal forward equivalents. `identity` decides the
+    numbers: scene, its version, options, fidelity, device, engine. `goals` are some of the race's targets, the hardest
+    first. `best` is the best point of all runs. `left_out` gives the reason for each method that did not run.
     """
 
     env: str
@@ -108,7 +107,7 @@ class SceneStandings:
 
     @classmethod
     def of(cls, race: Race, *, left_out: Mapping[str, str] | None = None, command: str = "") -> SceneStandings:
-        """Return what a race says."""
+        """Return the result of a race."""
         identity = {name: value for name, value in race.identity.items() if name not in OF_METHOD}
         figures, some = race.statistics, race.statistics.targets.some
         times = {method: times_record(one[some]) for method, one in figures.running_times.items()}
@@ -141,12 +140,12 @@ class SceneStandings:
 
     @property
     def lead(self) -> Lead:
-        """Who leads after the whole budget of episodes."""
+        """The leader after the whole budget of episodes."""
         return Lead.of(self.methods, self.pairs)
 
     @property
     def moved_to(self) -> tuple[str, ...]:
-        """The methods that share the best mean rank at equal forward equivalents; none where it is the same method."""
+        """The methods with the best mean rank at equal forward equivalents; none if it is the same method."""
         best = self.equal_cost.ranks[0].rank
         found = tuple(one.method for one in self.equal_cost.ranks if one.rank == best)
         return () if found == (self.lead.method,) else found
@@ -161,21 +160,21 @@ class SceneStandings:
         return next(one for one in self.equal_cost.ranks if one.method == method)
 
     def describe_lead(self) -> str:
-        """Say in a sentence who leads, at equal episodes and at equal cost."""
+        """Name the leader in a sentence, at equal episodes and at equal cost."""
         at_cost = f"within {self.equal_cost.forwards:.0f} forward equivalents {self.equal_cost.lead.describe()}"
         return f"after {self.budget} episodes {self.lead.describe()}; {at_cost}"
 
     def findings(self, claims: Claims) -> list[ClaimFinding]:
-        """Return what the race makes of claims about its scene."""
+        """Return the verdicts of the race on claims about its scene."""
         return check_claims(claims.claims, (), self.pairs)
 
     def probabilities(self, method: str) -> dict[str, float]:
-        """Return the probability that a method ends with a lesser loss than each of the others."""
+        """Return the probability that a method ends with a lower loss than each of the others."""
         return {one.second: one.probability for one in seen_from(method, self.pairs)}
 
     @property
     def rows(self) -> list[dict[str, Any]]:
-        """What is known of each method, in one row each."""
+        """The results of each method, one row each."""
         about = {name: getattr(self, name) for name in ("env", "fidelity", "device", "loss_unit", "budget", "seeds")}
         return [
             {
@@ -202,14 +201,14 @@ class SceneStandings:
 
 @dataclass(frozen=True)
 class OverallRank(MeanRank):
-    """The mean of a method's mean ranks over the `scenes` it ran in, with its interval by resampling these."""
+    """The mean of a method's mean ranks over its `scenes`, with an interval by resampling the scenes."""
 
     scenes: int
 
 
 @dataclass(frozen=True, eq=False)
 class League:
-    """Hold what the races say, by scene; `failed` says why there is no race in others, `command` how it is made."""
+    """The results of races by scene; `failed` gives the reason for each missing race, `command` makes the league."""
 
     scenes: Sequence[SceneStandings]
     failed: Mapping[str, str]
@@ -259,7 +258,7 @@ class League:
         return league_figure(self._picture(), width=width)
 
     def _picture(self) -> xr.Dataset:
-        """Return what `league_figure` draws: ranks by scene and method, all scenes together last."""
+        """Return the input of `league_figure`: ranks by scene and method, all scenes together last."""
         ranks = {(scene.env, scene.fidelity): {one.method: one for one in scene.standings} for scene in self.scenes}
         rows = [[standings.get(method) for method in self.methods] for standings in ranks.values()]
         parts = {
@@ -299,6 +298,6 @@ def _overall(ranks: Iterable[Standing | MeanRank]) -> list[OverallRank]:
 
 
 def _range(values: Any) -> str:
-    """Return a number, or the least and the largest where they differ."""
+    """Return a number, or the smallest and the largest where they differ."""
     found = sorted(set(values))
     return str(found[0]) if len(found) == 1 else f"{found[0]} to {found[-1]}"

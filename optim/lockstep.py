@@ -1,7 +1,7 @@
-"""Searches in lockstep: all ask, what they ask for is done together, and all are told.
+"""Searches in lockstep: all ask, their requests are computed together, and all are told.
 
-A search is a generator. It yields a `Request` for whatever it needs done and is sent the `Answer`. Points that several
-searches want evaluated make one batch; computations run in worker processes, side by side.
+A search is a generator. It yields a `Request` for everything it needs and is sent the `Answer`. Points of several
+searches make one batch; computations run in parallel in worker processes.
 """
 
 from __future__ import annotations
@@ -40,13 +40,13 @@ class Evaluate:
         return objective.evaluate(x, grad=self.grad).rows
 
     def own(self, found: Evaluation) -> Evaluation:
-        """Return the part of an evaluation, which may have gradients, that was asked for."""
+        """Return the requested part of an evaluation, which can have gradients that were not requested."""
         return found if self.grad else found.without_gradients()
 
 
 @dataclass(frozen=True, eq=False)
 class Observe:
-    """Request what a policy sees at points, shape (count, dim), before a decision."""
+    """Request a policy's observations at points, shape (count, dim), before a decision."""
 
     x: Float[Tensor, "count dim"]
     decision: int
@@ -63,22 +63,22 @@ class Observe:
 
 @dataclass(frozen=True, eq=False)
 class Compute:
-    """Request what a function of a module returns, wherever it is computed."""
+    """Request the result of a function of a module, wherever it is computed."""
 
     function: Callable[..., Any]
     arguments: tuple[Any, ...]
 
     def result(self) -> tuple[Any, float]:
-        """Return what the function returns, and the seconds it took."""
+        """Return the result of the function, and its time in seconds."""
         began = time.perf_counter()
         found = self.function(*self.arguments)
         return found, time.perf_counter() - began
 
 
 class Answer(NamedTuple):
-    """What came of a request; `now` [s] is the search's own clock.
+    """The answer to a request; `now` [s] is the search's own clock.
 
-    It passes while the search itself works, while something is computed for it, and by its share of each batch.
+    It runs while the search itself works, while something is computed for it, and for its share of each batch.
     """
 
     value: Any
@@ -108,8 +108,8 @@ def _draw(
 class Lockstep:
     """Run searches of an objective, whose rows must not depend on their batch.
 
-    Computations are spread over `workers` processes, which begin as soon as a search asks, and done here if that is
-    one; results are the same to the last bit. `computed` counts the seconds that they took.
+    Computations are spread over `workers` processes, which start at the first request; with one worker they run here.
+    Results are the same to the last bit. `computed` counts the seconds that they took.
     """
 
     def __init__(self, objective: Objective, *, workers: int = 1) -> None:
@@ -117,7 +117,7 @@ class Lockstep:
         self._bound = MemoryBound(objective)
 
     def run(self, searches: Sequence[Asking[Any]]) -> list[Any]:
-        """Return what each search returns. Whatever a search or the objective raises ends all of them."""
+        """Return the result of each search. Any error of a search or of the objective ends all of them."""
         self._searches, self._clocks = searches, [0.0] * len(searches)
         self._asked: dict[int, Request] = {}
         self._results: dict[int, Any] = {}
@@ -149,7 +149,7 @@ class Lockstep:
         self._advance(number, Answer(value, self._clocks[number]))
 
     def _compute(self) -> None:
-        """Answer computations until none is asked for."""
+        """Answer computations until none is requested."""
         while computing := sorted(self._computing):
             for number in computing:
                 value, seconds = self._computing.pop(number)()
@@ -157,7 +157,7 @@ class Lockstep:
                 self._answer(number, value, seconds)
 
     def _evaluate(self) -> None:
-        """Answer what is asked of the objective, a batch for each kind, or losses with the gradients of others."""
+        """Answer requests to the objective, a batch for each kind, or losses with the gradients of others."""
         asked = {n: one for n, one in sorted(self._asked.items()) if not isinstance(one, Compute)}
         answers = dict[int, tuple[Any, float]]()
         for group in self._batches(asked):
@@ -172,9 +172,9 @@ class Lockstep:
             self._answer(number, *answers[number])
 
     def _batches(self, asked: Mapping[int, Evaluate | Observe]) -> list[dict[int, Evaluate | Observe]]:
-        """Return what makes a batch each: requests of a kind, and on a GPU that is not full all losses together.
+        """Return the requests of each batch: one kind, or on a GPU with free capacity all losses together.
 
-        There it takes one sequence of launches less, and gradients that nobody asked for take no time of their own.
+        On such a GPU that saves a sequence of launches, and gradients that nobody requested take no extra time.
         """
         evaluated = [one for one in asked.values() if isinstance(one, Evaluate)]
         rows = sum(len(one.x) for one in evaluated)
@@ -190,7 +190,7 @@ class Lockstep:
 
 
 def answer_alone(asking: Asking[Result], objective: Objective | None) -> Result:
-    """Return what a search returns that runs alone, its requests answered one by one."""
+    """Return the result of a search that runs alone, its requests answered one by one."""
     answer: Any = None
     while True:
         try:

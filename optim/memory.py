@@ -1,6 +1,6 @@
-"""What runs and methods take of this machine, by arithmetic: nothing is made to find out.
+"""Estimate the memory of runs and methods by arithmetic, without allocating anything.
 
-A method says by its `memory` what it takes itself (`Optimizer.memory`). Constants are what was measured, rounded up.
+A method estimates its own memory (`Optimizer.memory`). Constants are measurements, rounded up.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ def require_runs(dim: int, budget: int, seeds: int, folder: Path, *, abreast: in
 
 
 def run_need(dim: int, rows: int) -> Need:
-    """Return what a run of so many rows takes: columns, a copy of them in a table, and room that they grow into."""
+    """Return the memory of a run of this many rows: columns, a copy of them in a table, and room to grow."""
     row = FLOAT * (2 * dim + 5) + 2
     chunks = -(-rows // CHUNK)
     return Need(STORE.memory + 3.0 * row * rows, STORE.disk + float(row * rows + COLUMNS * BLOCK * chunks))

@@ -1,4 +1,4 @@
-"""The options of a method: a frozen dataclass whose numbers keep to ranges that their fields state."""
+"""The options of a method: a frozen dataclass whose numbers stay in the ranges that their fields give."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ OURS, PAPER, LIBRARY = "ours", "the paper's", "the library's ({})"  # whose choi
 
 
 def number(default: float, least: float, most: float, source: str = OURS) -> Any:
-    """Return the field of an option that takes numbers from `least` to `most`, whole ones where it is an int.
+    """Return the field of an option that takes numbers from `least` to `most`, integers where it is an int.
 
-    `source` says whose choice the default is.
+    `source` names who chose the default.
     """
     return field(default=default, metadata={"range": (least, most), "source": source})
 
 
 def choice(default: str, source: str = OURS) -> Any:
-    """Return the field of an option that is one of some words."""
+    """Return the field of an option that takes one of several words."""
     return field(default=default, metadata={"source": source})
 
 
 @dataclass(frozen=True)
 class Default:
-    """Say what the default of an option is, and whose choice."""
+    """The default of an option, and who chose it."""
 
     option: str
     value: str

@@ -16,9 +16,9 @@ MIN_EPISODES = 100  # left of a run; processes are not started for fewer
 
 
 class WorkerProcesses:
-    """Processes of one thread each, which start as they are needed; none where `count` is one.
+    """Single-threaded processes, started as needed; none if `count` is one.
 
-    A search always has the same process, which remembers what it has computed for it.
+    A search always has the same process, which remembers earlier computations for it.
     """
 
     def __init__(self, count: int) -> None:
@@ -37,7 +37,7 @@ class WorkerProcesses:
             pool.shutdown()
 
     def submit(self, search: int, function: Callable[[], Result]) -> Callable[[], Result]:
-        """Let a function be computed for a search; return what waits for its result, or computes it here."""
+        """Compute a function for a search; return a handle to wait for, or compute it here."""
         if not self._pools:
             return function
         turn = self._turns.setdefault(search, len(self._turns))
@@ -45,14 +45,14 @@ class WorkerProcesses:
 
 
 def workers_worth(workers: int, episodes: int) -> int:
-    """Return how many of so many workers are worth starting for runs that have so many episodes left at most."""
+    """Return how many of the workers are worth starting for runs with this many episodes left."""
     return workers if episodes > MIN_EPISODES else 1
 
 
 def prepare_process() -> None:
-    """Prepare a process: one thread, deaf to an interrupt, which its parent answers, and gone with its parent.
+    """Prepare a process: one thread, no reaction to interrupts (its parent handles them), and an end with its parent.
 
-    Linear algebra of scipy, not loaded yet, would wait for threads of its own at every step of L-BFGS.
+    Linear algebra of scipy, not loaded yet, would wait for its own threads at every step of L-BFGS.
     """
     os.environ["OPENBLAS_NUM_THREADS"] = "1"
     import torch

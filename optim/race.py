@@ -1,4 +1,4 @@
-"""Let methods compete: the same budget of episodes for each of them, with each of several seeds."""
+"""Compare methods: the same budget of episodes for each of them, with several seeds."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ MAX_ABREAST = 200  # runs that advance in lockstep: the folder of each is open
 
 @dataclass(frozen=True, eq=False)
 class Competitor:
-    """One method with one seed, and the run it fills; `make` returns the optimiser as it is at the start."""
+    """One method with one seed, and the run it fills; `make` returns the new optimiser."""
 
     method: str
     seed: int
@@ -52,13 +52,13 @@ def race(
     workers: int = 1,
     progress: Callable[[Competitor, SearchProgress], None] | None = None,
 ) -> None:
-    """Let every competitor search until its run holds `budget` episodes; runs that do already are not touched.
+    """Let every competitor search until its run has `budget` episodes; complete runs are not touched.
 
-    Runs advance in lockstep: all propose, what they propose is evaluated in one batch, and all are told. So a simulator
-    that is quicker at many points at once is used well, and what comes out is what each run gives alone but for the
-    seconds, given an objective whose rows do not depend on their batch. `MAX_ABREAST` runs advance at a time. Methods
-    compute in so many processes, `workers`. `gradient_cost`, what an episode with gradient costs in episodes without,
-    is measured if a run needs it. Stop it at any instant: the same call continues.
+    Runs advance in lockstep: all propose, one batch evaluates all proposals, and all are told. That suits simulators
+    that are faster on large batches. Except for the seconds, each run is the one it would be alone, if rows of the
+    objective do not depend on their batch. At most `MAX_ABREAST` runs advance at the same time. Methods compute in
+    `workers` processes. `gradient_cost`, the cost of an episode with gradient in episodes without, is measured if a run
+    needs it. You can stop it at any moment: the same call continues.
     """
     left = [one for one in competitors if one.run.count < budget]
     for start in range(0, len(left), MAX_ABREAST):
@@ -91,10 +91,10 @@ def _run_abreast(
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Race:
-    """Hold the runs of a race, method -> one run per seed, of which the first `budget` episodes count.
+    """The runs of a race, method -> one run per seed, truncated to `budget` episodes.
 
-    `folder` is where its files are, None of one in memory; `provenance` is how it came about, by default as its first
-    run did. `best_known` is the least loss that is known from elsewhere, down to which its targets go.
+    `folder` contains its files, None for one in memory. `provenance` records how it was made, by default that of its
+    first run. `best_known` is the lowest loss known from elsewhere, which the targets extend to.
     """
 
     runs: Mapping[str, Sequence[Run]]
@@ -110,7 +110,7 @@ class Race:
 
     @property
     def seeds(self) -> int:
-        """How many seeds each of them has."""
+        """The number of seeds of each method."""
         return len(self.runs[self.methods[0]])
 
     @property
@@ -120,16 +120,16 @@ class Race:
 
     @property
     def identity(self) -> dict[str, Any]:
-        """What decides the numbers of its first run, as plain JSON."""
+        """The settings that decide the numbers of its first run, as plain JSON."""
         return self.runs[self.methods[0]][0].identity
 
     @cached_property
     def statistics(self) -> RaceStatistics:
-        """Ranks, comparisons of every two methods, targets reached and curves, with intervals over the seeds."""
+        """Ranks, comparisons of all pairs of methods, targets reached and curves, with intervals over the seeds."""
         return RaceStatistics.of(self._tables, self.best_known)
 
     def table(self) -> pd.DataFrame:
-        """Return a row for each method, the best mean rank first, with 95 % intervals; columns name their units."""
+        """Return a row for each method, the best mean rank first, with 95 % intervals; column names contain units."""
         import pandas as pd
 
         unit = f" [{self.loss_unit}]" if self.loss_unit else ""
@@ -157,10 +157,10 @@ class Race:
         return pd.DataFrame(rows)
 
     def pairs(self) -> pd.DataFrame:
-        """Return a row for every two methods: the difference of their mean best losses, and who wins how often.
+        """Return a row for every pair of methods: the difference of their mean best losses, and how often each wins.
 
-        The probability is that the first has the lesser best loss, a tie half; p is that of Mann and Whitney's rank
-        test, corrected for all pairs by Holm's rule beside it; `better` is by that.
+        The probability is that the first has the lower best loss, a tie counting half. p is from Mann and Whitney's
+        rank test; the next column has it corrected for all pairs by Holm's rule, and decides `better`.
         """
         import pandas as pd
 
@@ -195,7 +195,7 @@ class Race:
     def plot(self, *, width: float | None = None) -> Picture:
         """Draw best losses against episodes, and the share of targets reached.
 
-        The picture is matplotlib's figure, shown by a notebook as it is; `width` draws it for a page so wide [mm].
+        It returns a matplotlib figure, which notebooks show. `width` draws it for a page of this width [mm].
         """
         from ..landscapes.draw.figures.search import race_figure
 
@@ -203,7 +203,7 @@ class Race:
 
     @cached_property
     def _tables(self) -> dict[str, list[xr.Dataset]]:
-        """The first `budget` rows of every run but for its points and gradients."""
+        """The first `budget` rows of every run, without points and gradients."""
         return {
             method: [run.data.drop_vars(["x", "grad"]).isel(evaluation=slice(self.budget)) for run in runs]
             for method, runs in self.runs.items()
@@ -231,7 +231,7 @@ class Race:
         )
 
     def __repr__(self) -> str:
-        """Return in a line what competed and what came out best."""
+        """Return the competitors and the best one in a line."""
         best = self.statistics.ranks[0].method
         where = f", in {self.folder}" if self.folder else ""
         return (
@@ -241,7 +241,7 @@ class Race:
 
 
 def picture(tables: Tables, figures: RaceStatistics) -> xr.Dataset:
-    """Return what `race_figure` draws of a race, its attributes aside."""
+    """Return the input of `race_figure` for a race, without its attributes."""
     curves = list(figures.curves["episodes"].values())
     steps = max(len(curve.cost) for curve in curves)
     padded = {

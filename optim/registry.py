@@ -1,6 +1,6 @@
-"""Find optimisers by name; import them only when one is made.
+"""Find optimisers by name; import each only when it is made.
 
-Another package registers its own by an entry point of the group `gradscape.optimizers`:
+Another package registers its own optimiser by an entry point of the group `gradscape.optimizers`:
 
     [project.entry-points."gradscape.optimizers"]
     my-search = "my_package.search:MySearch"
@@ -26,7 +26,7 @@ ALL = "all"  # methods that can search an environment here
 
 @dataclass(frozen=True)
 class Method:
-    """Say what an optimiser is without importing it; `target` is "module:Class", `extra` what must be installed."""
+    """Describe an optimiser without importing it; `target` is "module:Class", `extra` the extra it needs."""
 
     name: str
     target: str
@@ -40,19 +40,25 @@ def _own(name: str, target: str, summary: str, extra: str = "") -> Method:
 
 BUILTIN = (
     _own("random", "random:RandomSearch", "points drawn uniformly from the box"),
-    _own("cma-es", "cmaes:CMAES", "covariance matrix adaptation, restarted when it has converged"),
+    _own("cma-es", "cmaes:CMAES", "covariance matrix adaptation, restarted after convergence"),
     _own("descents", "descent:Descents", "gradient descents from random starts"),
     _own("bo", "bayes:BO", "Bayesian optimisation: the lower confidence bound of a Gaussian process"),
     _own("bo-descents", "bayes:BODescents", "Bayesian optimisation proposes, gradient descent refines"),
     _own("bo-leap", "bo_leap:BOLeap", "BO-Leap: Bayesian optimisation, then leaps of populations and descents"),
     _own("l-bfgs-b", "quasi_newton:LBFGSB", "L-BFGS-B from random starts"),
-    _own("basin-hopping", "quasi_newton:BasinHopping", "basin hopping: L-BFGS-B from minimum to minimum"),
+    _own("basin-hopping", "quasi_newton:BasinHopping", "basin hopping: L-BFGS-B and random hops between minima"),
     _own("adam", "descent:Adam", "Adam from random starts"),
-    _own("cma-es-gradient", "cmaes:CMAESGradient", "CMA-ES with a step down the gradient at its mean injected"),
-    _own("turbo", "bayes:TuRBO", "TuRBO-1: Bayesian optimisation in a trust region, restarted when it has shrunk"),
-    _own("continuation", "continuation:Continuation", "descents on a smoothed loss, strong to weak, then L-BFGS-B"),
-    _own("bo-gradient", "bayes:BOGradient", "Bayesian optimisation by a Gaussian process of losses and slopes"),
-    _own("auto", "auto:Auto", "measures the landscape, then takes the method that is advised for such a one"),
+    _own("cma-es-gradient", "cmaes:CMAESGradient", "CMA-ES that injects a gradient step from its mean"),
+    _own(
+        "turbo", "bayes:TuRBO", "TuRBO-1: Bayesian optimisation in a trust region, restarted when the region has shrunk"
+    ),
+    _own(
+        "continuation",
+        "continuation:Continuation",
+        "descents on a smoothed loss, from strong to weak smoothing, then L-BFGS-B",
+    ),
+    _own("bo-gradient", "bayes:BOGradient", "Bayesian optimisation by a Gaussian process of losses and gradients"),
+    _own("auto", "auto:Auto", "measures the landscape, then uses the method advised for such landscapes"),
     _own("ppo", "policy:PPO", "proximal policy optimisation of a neural policy", "rl"),
     _own("sac", "policy:SAC", "soft actor-critic for a neural policy", "rl"),
 )
@@ -60,7 +66,7 @@ BUILTIN = (
 
 @cache
 def methods() -> dict[str, Method]:
-    """Return every registered optimiser by name, ours before other packages'.
+    """Return every registered optimiser by name, ours before those of other packages.
 
     Raises ValueError where two have the same name.
     """
@@ -68,8 +74,8 @@ def methods() -> dict[str, Method]:
 
 
 def find_method(name: str) -> Method:
-    """Return what is registered under a name. Raises ValueError, with the names there are, where nothing is."""
-    return registry.find(methods(), name, "method", f"there are {', '.join(methods())}")
+    """Return the method registered by a name. Raises ValueError, with all names, for an unknown one."""
+    return registry.find(methods(), name, "method", f"the methods are {', '.join(methods())}")
 
 
 def check_methods(names: Sequence[str]) -> list[str]:
@@ -81,8 +87,8 @@ def check_methods(names: Sequence[str]) -> list[str]:
 def optimizer_class(name: str) -> type[Optimizer]:
     """Import and return the class of a method.
 
-    Raises ValueError where no method has the name, where its extra is not installed, and where another package's entry
-    point leads nowhere or to an optimiser of another name.
+    Raises ValueError for an unknown name, where its extra is not installed, and where another package's entry point
+    leads nowhere or to an optimiser with another name.
     """
     method = find_method(name)
     try:
@@ -94,7 +100,7 @@ def optimizer_class(name: str) -> type[Optimizer]:
         raise
     if getattr(kind, "name", None) != name:
         raise ValueError(
-            f"{name} is registered as {method.target}, whose name is {getattr(kind, 'name', None)!r}; "
-            "give entry point and class the same name"
+            f"{name} is registered as {method.target}, whose name is {getattr(kind, 'name', None)!r}; give entry "
+            "point and class the same name"
         )
     return kind

@@ -19,7 +19,7 @@ from .runs.store import RunStore
 
 @dataclass(frozen=True)
 class SearchProgress:
-    """Say how far a run is: `done` of `total` episodes, `resumed` of them before; `best` is NaN before a success."""
+    """The progress of a run: `done` of `total` episodes, `resumed` of them before; `best` is NaN before a success."""
 
     done: int
     total: int
@@ -37,15 +37,14 @@ def search(
     gradient_cost: float | None = None,
     progress: Callable[[SearchProgress], None] | None = None,
 ) -> RunStore:
-    """Let a method evaluate `budget` episodes, not one more, and return the run; what it holds already is not repeated.
+    """Let a method evaluate exactly `budget` episodes, and return the run; existing episodes are not repeated.
 
-    A method is an optimiser or the name of one, made with the run's seed. Without a run one is made in memory. Stop it
-    at any moment: the same call continues. The rows are those of an uninterrupted one but for their `seconds`, given an
-    objective whose rows do not depend on their batch. A proposal that does not fit into the budget is cut short.
-    `gradient_cost` is what an episode with gradient costs in episodes without; it is measured if not given.
-
-    Raises ValueError for a budget, a method or a gradient cost that cannot be, and StoreError where the run on disk
-    cannot be gone on from.
+    A method is an optimiser or the name of one, made with the run's seed. Without a run, one is made in memory. You can
+    stop it at any moment: the same call continues. Its rows are those of an uninterrupted run, except for their
+    `seconds`, if rows of the objective do not depend on their batch. A proposal that exceeds the budget is cut short.
+    `gradient_cost` is the cost of an episode with gradient in episodes without; it is measured if not given. Raises
+    ValueError for an invalid budget, method or gradient cost, and StoreError for a run on disk that cannot be
+    continued.
     """
     budget = as_whole(budget, "a budget", least=1)
     run = _in_memory(objective, method, budget) if run is None else run
@@ -88,7 +87,7 @@ def _in_memory(objective: Objective, method: Optimizer | str, budget: int) -> Ru
 
 
 def _fill(optimizer: Optimizer | None, run: RunStore, budget: int, report: Callable[[], None]) -> Asking[None]:
-    """Ask, have the points evaluated, tell and keep them; there is nothing to do without an optimiser."""
+    """Ask, have the points evaluated, tell and store them; without an optimiser there is nothing to do."""
     mark, complete, largest = 0.0, True, 0
     if optimizer is None:
         return
@@ -111,7 +110,7 @@ def _fill(optimizer: Optimizer | None, run: RunStore, budget: int, report: Calla
 
 
 def _begin(objective: Objective, method: Optimizer | str, run: RunStore, gradient_cost: float | None) -> Optimizer:
-    """Return the optimiser that the run continues with, the one it kept or a new one, and take the run back to it."""
+    """Return the optimiser with which the run continues, stored or new, and return the run to its state."""
     state = run.state()
     if state is not None:
         optimizer = _restore_optimizer(objective, method, run, state)
@@ -131,23 +130,24 @@ def _begin(objective: Objective, method: Optimizer | str, run: RunStore, gradien
 def _restore_optimizer(
     objective: Objective, method: Optimizer | str, run: RunStore, state: dict[str, Any]
 ) -> Optimizer:
-    """Return the optimiser that a run kept, of the class of `method`."""
+    """Return the stored optimiser of a run, of the class of `method`."""
     kind = optimizer_class(method) if isinstance(method, str) else type(method)
     if state.get("method") != kind.name:
         raise ValueError(
-            f"{run.path} holds a run of {state.get('method')}, not of {kind.name}; give each a run of its own"
+            f"{run.path} contains a run of {state.get('method')}, not of {kind.name}; use another folder for "
+            f"{kind.name}"
         )
     try:
         return kind.from_state(objective, state)
     except Exception as error:  # whatever the method stumbles upon
         raise StoreError(
-            f"{run.path} keeps no state of {kind.name} that can be gone on from ({type(error).__name__}: {error}); "
-            "begin the run again in another folder"
+            f"{run.path} has no state of {kind.name} that can be continued ({type(error).__name__}: {error}); start "
+            "the run again in another folder"
         ) from error
 
 
 def _check(optimizer: Optimizer, count: int, *, grad: bool) -> None:
     if not count:
-        raise ValueError(f"{optimizer.name} proposed no point; a proposal holds at least one")
+        raise ValueError(f"{optimizer.name} proposed no point; a proposal needs at least one")
     if grad and not optimizer.needs_grad:
-        raise ValueError(f"{optimizer.name} asks for gradients, so its class must say needs_grad = True")
+        raise ValueError(f"{optimizer.name} requests gradients, so its class must set needs_grad = True")

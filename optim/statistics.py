@@ -1,18 +1,18 @@
-"""What a race's runs say: ranks, who is ahead of whom, best loss against cost, targets reached, and what that took.
+"""Statistics of a race's runs: ranks, who is ahead of whom, best loss against cost, targets reached, and running times.
 
-Everything is over the seeds of a method. A failed episode costs what any other does and improves nothing. Before its
-first success a run has no best loss (NaN), so a mean over seeds begins where the last of them has had a success.
+Everything is over the seeds of a method. A failed episode costs as much as any other and improves nothing. Before its
+first success a run has no best loss (NaN), so a mean over seeds begins when the last of them has succeeded.
 
 Intervals are 95 % percentile intervals by the bootstrap: the percentiles 2.5 and 97.5 of the means of 10 000 resamples
-of the seeds (Efron & Tibshirani 1993, section 13.3). There is none for a single seed. They are too narrow where seeds
-are few: of normal samples of 3, 5, 10 and 30 they cover the true mean in about 75, 84, 91 and 93 % of cases. So no
-interval decides who is better: that is for the rank test alone, corrected for all pairs of the race.
+of the seeds (Efron & Tibshirani 1993, section 13.3). There is none for a single seed. With few seeds they are too
+narrow: of normal samples of 3, 5, 10 and 30 they cover the true mean in about 75, 84, 91 and 93 % of cases. So no
+interval decides who is better. Only the rank test does, corrected for all pairs of the race.
 
-A gradient costs more than a loss. So everything about ranks is there twice: after the same number of episodes, and
-within the same cost in forward equivalents, which is the least that a run of the race spent in all.
+A gradient costs more than a loss. So ranks exist twice: after the same number of episodes, and within the same cost in
+forward equivalents, the smallest total of any run of the race.
 
-Targets are 51 losses between the best that is known and the median of random points, spaced by their logarithms, as
-COCO spaces 51 precisions between 10^-8 and 10^2 (Hansen et al. 2021, section 3).
+Targets are 51 losses between the best known loss and the median of random points, spaced by their logarithms, as COCO
+spaces 51 precisions between 10^-8 and 10^2 (Hansen et al. 2021, section 3).
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ Tables = Mapping[str, Sequence[xr.Dataset]]  # method -> one run's table per see
 
 
 def interval(values: Array) -> tuple[Array, Array]:
-    """Return the interval of the mean over the first axis (seeds), NaN for a single seed or where a value is."""
+    """Return the interval of the mean over the first axis (seeds), NaN for a single seed or where a value is NaN."""
     return percentiles(values, weights(len(values), np.random.default_rng(0)))
 
 
@@ -53,7 +53,7 @@ def weights(seeds: int, random: np.random.Generator) -> Array:
 
 
 def percentiles(values: Array, weights: Array) -> tuple[Array, Array]:
-    """Return the ends of the interval of weighted sums over the first axis (seeds), NaN where a value is."""
+    """Return the ends of the interval of weighted sums over the first axis (seeds), NaN where a value is NaN."""
     columns = values.reshape(len(values), -1)
     ends = np.full((2, columns.shape[1]), np.nan)
     known = np.flatnonzero(np.isfinite(columns).all(axis=0)) if len(values) > 1 else np.empty(0, int)
@@ -74,12 +74,12 @@ class Curve:
 
 
 def best_so_far(loss: Array) -> Array:
-    """Return the least loss up to each episode, NaN before the first success."""
+    """Return the lowest loss up to each episode, NaN before the first success."""
     return np.fmin.accumulate(loss)
 
 
 def final_losses(tables: Tables, forwards: float = np.inf) -> Array:
-    """Return the best loss of every run within a cost [forward equivalents], shape (method, seed), NaN where none."""
+    """Return the best loss of every run within a cost [forward equivalents], shape (method, seed), NaN for none."""
     return np.array([[_best_within(run, forwards) for run in runs] for runs in tables.values()])
 
 
@@ -89,12 +89,12 @@ def _best_within(run: xr.Dataset, forwards: float) -> float:
 
 
 def least_spent(tables: Tables) -> float:
-    """Return the least that a run spent in all [forward equivalents], which every run can be held to."""
+    """Return the smallest total cost of any run [forward equivalents], up to which all runs can be compared."""
     return min(float(run["forwards"][-1]) for runs in tables.values() for run in runs)
 
 
 def curve(runs: Sequence[xr.Dataset], cost: str) -> Curve:
-    """Return a method's curve against one of `COSTS`, from its first value to where the first run ends."""
+    """Return a method's curve against one of `COSTS`, from its first value to the end of the shortest run."""
     spent = [run[cost].to_numpy().astype(float) for run in runs]
     best = [best_so_far(run["loss"].to_numpy()) for run in runs]
     changes = [s[np.flatnonzero(np.diff(b, prepend=np.nan) != 0)] for s, b in zip(spent, best, strict=True)]
@@ -107,16 +107,16 @@ def curve(runs: Sequence[xr.Dataset], cost: str) -> Curve:
 
 
 def _first(spent: Array, best: Array) -> float:
-    """Return what the first success had cost, infinity without one."""
+    """Return the cost of the first success, infinity without one."""
     successes = np.flatnonzero(np.isfinite(best))
     return float(spent[successes[0]]) if len(successes) else np.inf
 
 
 @dataclass(frozen=True)
 class Difference:
-    """The mean final loss of `first` less that of `second`, with its interval, which says how large it is.
+    """The mean final loss of `first` minus that of `second`, with its interval, which shows its size.
 
-    Whether one of them is better is for `Superiority`.
+    `Superiority` decides whether one of them is better.
     """
 
     first: str
@@ -133,10 +133,10 @@ class Difference:
 
 @dataclass(frozen=True)
 class Superiority:
-    """The probability that `first` ends with a lesser loss than `second`, each with a seed of its own; a tie is half.
+    """The probability that `first` ends with a lower loss than `second`, each with its own seed; a tie counts half.
 
-    A run without success ends behind all others. `p` is that of the rank test of Mann and Whitney that neither is
-    ahead, `corrected` the same after Holm's correction for all pairs of the race.
+    A run without success ends behind all others. `p` is that of Mann and Whitney's rank test that neither is ahead;
+    `corrected` is the same after Holm's correction for all pairs of the race.
     """
 
     first: str
@@ -149,7 +149,7 @@ class Superiority:
 
     @property
     def better(self) -> str | None:
-        """The method that is ahead at a level of 5 % over all pairs of the race together; None: not distinguishable."""
+        """The method that is ahead at a level of 5 % over all pairs of the race; None: not distinguishable."""
         if not self.corrected < LEVEL:
             return None
         return self.first if self.probability > 0.5 else self.second
@@ -161,7 +161,7 @@ class Superiority:
 
 
 def differences(tables: Tables) -> list[Difference]:
-    """Return the difference of every two methods; seeds are resampled apart, since they are not pairs."""
+    """Return the difference of all pairs of methods; seeds are resampled independently, because they are not pairs."""
     pairs = itertools.combinations(zip(tables, final_losses(tables), strict=True), 2)
     return [difference(first, a, second, b) for (first, a), (second, b) in pairs]
 
@@ -178,9 +178,9 @@ def difference(first: str, a: Array, second: str, b: Array) -> Difference:
 
 @dataclass(frozen=True)
 class Lead:
-    """Say who leads a race: the method of the best mean rank, and the others that it is not ahead of (`rivals`).
+    """The leader of a race: the method with the best mean rank, and the others that it is not ahead of (`rivals`).
 
-    It is first only where there are none; `p` is the largest corrected p of its comparisons, NaN of one method alone.
+    It is first only if there are none. `p` is the largest corrected p of its comparisons, NaN for a single method.
     """
 
     method: str
@@ -203,7 +203,7 @@ class Lead:
         return not self.rivals and not np.isnan(self.p)
 
     def describe(self) -> str:
-        """Say who is first, or who cannot be told from the method of the best mean rank."""
+        """Name the first method, or those not distinguishable from the method with the best mean rank."""
         if np.isnan(self.p):
             return f"{self.method} raced alone"
         if self.is_first:
@@ -214,7 +214,7 @@ class Lead:
         )
 
     def summarise(self) -> str:
-        """Say the same in one line, for a picture."""
+        """Give the same in one line, for a picture."""
         if self.is_first or not self.rivals:
             return self.describe()
         others = f"{len(self.rivals)} others" if len(self.rivals) > 1 else self.rivals[0]
@@ -222,12 +222,12 @@ class Lead:
 
 
 def seen_from(method: str, pairs: Sequence[Superiority]) -> list[Superiority]:
-    """Return how a method stands to each of the others."""
+    """Return the comparison of a method with each of the others."""
     return [one for pair in pairs for one in (pair, pair.reversed) if one.first == method]
 
 
 def not_told_from(method: str, methods: Sequence[str], pairs: Sequence[Superiority]) -> tuple[str, ...]:
-    """Return which of the methods are not distinguishable from one after the correction, in their order."""
+    """Return the methods that are not distinguishable from one after the correction, in their order."""
     undecided = {one.second for one in seen_from(method, pairs) if one.better is None}
     return tuple(other for other in methods if other in undecided)
 
@@ -257,7 +257,7 @@ class EqualCost:
 
     @classmethod
     def of(cls, tables: Tables) -> EqualCost:
-        """Compare runs within the least that one of them spent in all."""
+        """Compare runs within the smallest total cost of any of them."""
         forwards = least_spent(tables)
         return cls.within(forwards, list(tables), final_losses(tables, forwards))
 
@@ -273,12 +273,12 @@ class EqualCost:
 
     @property
     def lead(self) -> Lead:
-        """Who leads at this cost."""
+        """The leader at this cost."""
         return Lead.of([one.method for one in self.ranks], self.pairs)
 
 
 def superiorities(final: Mapping[str, Array]) -> list[Superiority]:
-    """Return how every two methods stand to each other by their final losses, in the order of `differences`."""
+    """Return the comparison of all pairs of methods by their final losses, in the order of `differences`."""
     pairs = list(itertools.combinations(final.items(), 2))
     ps = [rank_test(a, b) for (_, a), (_, b) in pairs]
     return [
@@ -321,7 +321,7 @@ def seed_ranks(final: Array) -> Array:
 
 
 def holm(ps: Sequence[float]) -> list[float]:
-    """Return p-values corrected for that there are several of them (Holm 1979): the chance of one error in all."""
+    """Return p-values corrected for multiple tests (Holm 1979): the chance of a single error among all."""
     order = np.argsort(ps, kind="stable")
     scaled = np.array(ps)[order] * np.arange(len(ps), 0, -1)
     found = np.empty(len(ps))
@@ -330,15 +330,15 @@ def holm(ps: Sequence[float]) -> list[float]:
 
 
 def _placed(losses: Array) -> NDArray[np.float64]:
-    """Return losses to be ordered, infinite where a run had no success."""
+    """Return losses for ordering, infinite where a run had no success."""
     return np.where(np.isfinite(losses), losses, np.inf)
 
 
 @dataclass(frozen=True, eq=False)
 class Targets:
-    """Losses to reach, the hardest first; `easiest` says what the last one is, `spacing` is log or linear.
+    """Losses to reach, the hardest first; `easiest` describes the last one, `spacing` is log or linear.
 
-    `best_known` is the least loss that is known, of the race or from elsewhere, NaN where no episode succeeded.
+    `best_known` is the lowest known loss, of the race or from elsewhere, NaN where no episode succeeded.
     """
 
     loss: Array
@@ -348,7 +348,7 @@ class Targets:
 
     @property
     def some(self) -> list[int]:
-        """The numbers of those that are shown where there is no room for all: every tenth, both ends among them."""
+        """The numbers of the targets to show where there is no room for all: every tenth, with both ends."""
         return list(range(0, len(self.loss), EVERY))
 
 
@@ -361,18 +361,18 @@ class Shares:
 
     @classmethod
     def of(cls, hits: Array) -> Shares:
-        """Return the share of hits, NaN where there is none, that had come by each episode."""
+        """Return the share of hits reached by each episode, NaN where there is none."""
         reached = np.sort(hits[np.isfinite(hits)])
         return cls(reached.tolist(), (np.arange(1, len(reached) + 1) / hits.size).tolist())
 
 
 def targets(tables: Tables, best_known: float | None = None) -> Targets:
-    """Return 51 losses from the best that is known to the median of random points, spaced by their logarithms.
+    """Return 51 losses from the best known to the median of random points, spaced by their logarithms.
 
-    The best known is the least of the race, or `best_known` where that is less. Without the method `random` the easiest
-    is the median of the first loss of each run. The hardest is the best known, or 10^-8 of the easiest where the best
-    known is less than that and not negative. Where a loss is negative or the easiest zero, there are no logarithms,
-    and they are spaced evenly. There is none where every episode failed.
+    The best known is the lowest of the race, or `best_known` if that is lower. Without the method `random`, the easiest
+    is the median of the first loss of each run. The hardest is the best known loss. If that is not negative but below
+    10^-8 of the easiest, the hardest is 10^-8 of the easiest. If a loss is negative or the easiest is zero, there are
+    no logarithms, and the targets are spaced evenly. There is none where every episode failed.
     """
     losses = np.concatenate([run["loss"].to_numpy() for runs in tables.values() for run in runs])
     if not np.isfinite(losses).any():
@@ -387,7 +387,7 @@ def targets(tables: Tables, best_known: float | None = None) -> Targets:
 
 
 def hits(runs: Sequence[xr.Dataset], goals: Targets) -> Array:
-    """Return the episodes after which each target was first reached, shape (seed, target), NaN where it never was."""
+    """Return the episodes after which each target was first reached, shape (seed, target), NaN if never."""
     found = np.full((len(runs), len(goals.loss)), np.nan)
     for row, run in zip(found, runs, strict=True):
         best, episodes = best_so_far(run["loss"].to_numpy()), run["episodes"].to_numpy()
@@ -400,8 +400,8 @@ def hits(runs: Sequence[xr.Dataset], goals: Targets) -> Array:
 def running_times(runs: Sequence[xr.Dataset], goals: Targets) -> Array:
     """Return a method's expected running time (ERT) for each target [episodes], infinite where no run reached it.
 
-    ERT is what all runs spent before they reached the target, or in vain, for each run that reached it: what restarts
-    would spend until the first success (Hansen et al. 2021, section 4).
+    ERT is the total cost of all runs until the target, successful or not, divided by the number of runs that reached
+    it: the cost of restarts until the first success (Hansen et al. 2021, section 4).
     """
     reached = hits(runs, goals)
     spent = np.array([[float(run["episodes"][-1])] for run in runs])
@@ -412,7 +412,7 @@ def running_times(runs: Sequence[xr.Dataset], goals: Targets) -> Array:
 
 
 def times_record(times: Array) -> list[float | None]:
-    """Return running times as JSON has them, to six digits; None for what was never reached."""
+    """Return running times as JSON numbers with six digits; None for targets that were never reached."""
     return [finite(float(f"{one:.6g}")) for one in times]
 
 
@@ -428,11 +428,10 @@ def _easiest(tables: Tables) -> tuple[float, str]:
 
 @dataclass(frozen=True)
 class Rank:
-    """How a method came off in the end: ranks are 1 for the best, ties share theirs; NaN where there is none.
+    """A method's final result: ranks are 1 for the best, ties share theirs; NaN where there is none.
 
-    `wins` counts the seeds in which no method was better; `unsuccessful` those without one successful episode; `failed`
-    the episodes that failed; `forwards` (forward equivalents) and
-    `seconds` are the mean cost of a run.
+    `wins` counts the seeds in which no method was better, `unsuccessful` those without a successful episode, and
+    `failed` the failed episodes. `forwards` (forward equivalents) and `seconds` are the mean cost of a run.
     """
 
     method: str
@@ -452,11 +451,11 @@ class Rank:
 
 @dataclass(frozen=True, eq=False)
 class RaceStatistics:
-    """All figures of a race: ranks, the best first, how every two methods compare, targets, and by method curves.
+    """All figures of a race: ranks, the best first, comparisons of all pairs of methods, targets, and curves by method.
 
-    `equal_cost` has ranks and comparisons at equal forward equivalents; all others are at equal episodes.
-    `ecdf` is the share of pairs of target and seed reached, `running_times` the expected running time for each target
-    [episodes], `curves` the mean best loss against each of `COSTS`.
+    `equal_cost` has ranks and comparisons at equal forward equivalents; all others are at equal episodes. `ecdf` is the
+    share of pairs of target and seed reached, `running_times` the expected running time for each target [episodes],
+    `curves` the mean best loss against each of `COSTS`.
     """
 
     ranks: list[Rank]
@@ -472,7 +471,7 @@ class RaceStatistics:
 
     @classmethod
     def of(cls, tables: Tables, best_known: float | None = None) -> RaceStatistics:
-        """Compute the figures of runs; `best_known` is the least loss that is known from elsewhere."""
+        """Compute the figures of runs; `best_known` is the lowest loss known from elsewhere."""
         goals = targets(tables, best_known)
         return cls(
             ranks=ranks(tables),
@@ -487,12 +486,12 @@ class RaceStatistics:
 
     @property
     def lead(self) -> Lead:
-        """Who leads after the whole budget of episodes."""
+        """The leader after the whole budget of episodes."""
         return Lead.of([one.method for one in self.ranks], self.superiorities)
 
 
 def ranks(tables: Tables) -> list[Rank]:
-    """Return how every method came off, the best mean rank first; within a seed, runs without success are last."""
+    """Return each method's final result, the best mean rank first; within a seed, runs without success are last."""
     final = final_losses(tables)
     comparable, places = _placed(final), seed_ranks(final)
     won = np.isfinite(final) & (comparable == comparable.min(axis=0))

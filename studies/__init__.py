@@ -12,16 +12,16 @@ KINDS = ("fidelity", "convergence", "model", "mixed", "extremes", "symmetry", "u
 
 
 def study_class(kind: str) -> type[Study]:
-    """Return the class of a kind of study. Raises ValueError where there is no such kind."""
+    """Return the class of a kind of study. Raises ValueError for an unknown kind."""
     return _find(kind, "Study")  # type: ignore[no-any-return]
 
 
 def record_class(kind: str) -> type[StudyRecord]:
-    """Return the class of what a kind of study measured. Raises ValueError where there is no such kind."""
+    """Return the class of the record of a kind of study. Raises ValueError for an unknown kind."""
     return _find(kind, "Record")  # type: ignore[no-any-return]
 
 
 def _find(kind: str, what: str) -> Any:
     if kind not in KINDS:
-        raise ValueError(f"a study is one of {', '.join(KINDS)}; got {kind!r}")
+        raise ValueError(f"study takes {', '.join(KINDS)}; got {kind!r}")
     return getattr(import_module(f".{kind}", __name__), kind.capitalize() + what)

@@ -1,7 +1,7 @@
-"""What a fidelity's name promises, how far a measured variant falls short of that, and the variant to give it to.
+"""The claim of a fidelity's name, the shortfall of a measured variant, and the variant that should have the name.
 
-Every promise is a lack that is allowed: of rank correlation 1 - rank, of gradients 1 - cosine, of losses the error. A
-variant's shortfall is the largest of its lacks, each as a ratio to what is allowed: it keeps the claim up to 1.
+Every claim limits a shortfall: 1 - rank for the rank correlation, 1 - cosine for gradients, the error for losses. A
+variant's shortfall is the largest of these, each relative to its limit: it keeps the claim up to 1.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Claim:
-    """Say what a named fidelity promises of its losses and gradients, compared with the reference's at the same points.
+    """The claim of a named fidelity on its losses and gradients, compared with the reference's at the same points.
 
-    `rank` is the least Spearman's correlation of losses, `cosine` the least median cosine of gradients, `error` the
-    largest 95th percentile of loss errors as a share of their spread; no point may fail.
+    `rank` is the smallest Spearman's correlation of losses, `cosine` the smallest median cosine of gradients, `error`
+    the largest 95th percentile of loss errors as a share of their spread; no point may fail.
     """
 
     name: str
@@ -32,7 +32,7 @@ class Claim:
     error: float
 
     def limits(self, *, chaotic: bool = False) -> dict[str, float]:
-        """Return what may be lacking, by what lacks it; of a chaotic motion gradients promise nothing."""
+        """Return the limit of each shortfall, by name; gradients of a chaotic motion have none."""
         found = {"rank": 1 - self.rank, "cosine": 1 - self.cosine, "error": self.error}
         return {what: limit for what, limit in found.items() if not (chaotic and what == "cosine")}
 
@@ -42,10 +42,10 @@ CLAIMS = (Claim("draft", rank=0.95, cosine=0.9, error=0.1), Claim("standard", ra
 
 @dataclass(frozen=True)
 class Shortfall:
-    """Hold the largest lack of a variant as a ratio to what a claim allows, with the ends of its 95 % interval.
+    """The largest shortfall of a variant, relative to its limit in a claim, with the ends of its 95 % interval.
 
-    `by` names what lacks most. All are infinite where a point failed or lacks its gradient, or where something is not
-    known.
+    `by` names the worst quantity. All are infinite where a point failed or lacks its gradient, or where something is
+    unknown.
     """
 
     value: float
@@ -55,7 +55,7 @@ class Shortfall:
 
     @classmethod
     def of(cls, found: Comparison, claim: Claim, *, chaotic: bool = False) -> Shortfall:
-        """Hold what was measured of a variant against a claim; an interval's end is the largest of the parts' ends."""
+        """Compare the measurements of a variant with a claim; an interval's end is the largest of the parts' ends."""
         if found.diverged is None or found.diverged > 0:
             return cls(math.inf, math.inf, math.inf, "failed")
         if found.missing:
@@ -72,7 +72,7 @@ class Shortfall:
 
 
 def _lacks(found: Comparison, what: str) -> tuple[float, float, float]:
-    """Return a lack and the ends of its interval, infinite where it is not known."""
+    """Return a shortfall and the ends of its interval, infinite where unknown."""
     if what == "error":
         return _known(found.loss_error.p95_relative, 0.0, 1.0)
     value, low, high = _known(found.spearman if what == "rank" else found.gradient.cosine, 1.0, -1.0)
@@ -92,9 +92,9 @@ def fronts(
     *,
     chaotic: bool = False,
 ) -> list[str]:
-    """Return the variants that for some claim no other beats in both cost and shortfall, the cheapest first.
+    """Return the variants that no other beats in both cost and shortfall for some claim, the cheapest first.
 
-    `costs` are those that count for a claim, by the names of claim and variant.
+    `costs` are the relevant ones for a claim, by the names of claim and variant.
     """
     best = dict[str, float]()
     for claim in claims:
@@ -105,7 +105,7 @@ def fronts(
 
 
 def nearness(found: Comparison, claims: Iterable[Claim] = CLAIMS, *, chaotic: bool = False) -> float:
-    """Return how many times a variant misses the limit of the nearest claim, upwards or downwards, as a logarithm."""
+    """Return by how many times a variant misses the limit of the nearest claim, up or down, as a logarithm."""
     values = (Shortfall.of(found, claim, chaotic=chaotic).value for claim in claims)
     return min(abs(math.log(max(value, 1e-12))) for value in values)
 
@@ -117,7 +117,7 @@ def surely_beaten(
     *,
     chaotic: bool = False,
 ) -> bool:
-    """Say whether for every claim a quicker variant falls short by less, beyond the intervals of both."""
+    """Return whether for every claim a faster variant has a smaller shortfall, beyond both intervals."""
 
     def shortfall(one: MeasuredVariant, claim: Claim) -> Shortfall:
         return Shortfall.of(one.comparison, claim, chaotic=chaotic)
@@ -128,12 +128,12 @@ def surely_beaten(
 
 @dataclass(frozen=True)
 class Choice:
-    """Say which variant a fidelity's name should mean: the cheapest that keeps the claim, or the nearest to keeping it.
+    """The variant that a fidelity's name should mean: the cheapest that keeps the claim, or the nearest.
 
-    `today_seconds` is what the variant costs that bears the name [s per episode with gradient], and `today_shortfall`
-    how far it falls short, None where that is not finite. `variant`, `seconds` and `shortfall` are of the chosen one,
-    None where no variant answers at every point within the limit of the cost, and `lacking` names what it lacks. It is
-    one of so many `candidates`.
+    `today_seconds` is the cost of the variant that has the name now [s per episode with gradient], and
+    `today_shortfall` its shortfall, None where not finite. `variant`, `seconds` and `shortfall` are those of the chosen
+    one, None where no variant within the cost limit succeeds at every point. `lacking` names its worst quantity. There
+    were `candidates` to choose from.
     """
 
     claim: Claim
@@ -147,7 +147,7 @@ class Choice:
 
     @property
     def kept(self) -> bool:
-        """Whether the chosen variant keeps the claim; else it is the nearest to that."""
+        """Whether the chosen variant keeps the claim; otherwise it is the nearest."""
         return self.shortfall is not None and self.shortfall <= 1
 
 
@@ -159,10 +159,10 @@ def choose(
     max_cost: float,
     chaotic: bool = False,
 ) -> Choice:
-    """Choose the variant that a claim's name should mean, of those within `max_cost` times what it costs today.
+    """Choose the variant for a claim's name, among those within `max_cost` times the present cost.
 
-    It is the cheapest that keeps the claim; where none does, the one whose shortfall is the smallest, the cheaper one
-    of two that are equal in two digits. `cost` is by name; the variant of the claim's own name is among the variants.
+    It is the cheapest that keeps the claim. If none does, it is the one with the smallest shortfall, the cheaper of two
+    that are equal in two digits. `cost` is by name; the variant with the claim's own name is among the variants.
     """
     short = {one.name: Shortfall.of(one.comparison, claim, chaotic=chaotic) for one in variants}
     limit, today = max_cost * cost[claim.name], finite(short[claim.name].value)

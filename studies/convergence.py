@@ -1,7 +1,7 @@
 """The study `convergence`: whether the reference is converged.
 
-Each setting of the reference is refined; the levels show the order of convergence and how far the reference is from its
-limit. Neighbours are followed too, since a chaotic motion has no limit point by point.
+Each setting of the reference is refined. The levels show the order of convergence and the distance of the reference
+from its limit. Neighbouring motions are simulated too, because a chaotic motion has no limit point by point.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ ALLOWED = 0.1  # of what standard is off: a reference that moves by less is conv
 
 @dataclass(frozen=True)
 class Level:
-    """Hold one level of a setting: its `width`, which refinement lowers, and what an episode takes [s]."""
+    """One level of a setting: its `width`, which refinement lowers, and the time of an episode [s]."""
 
     name: str
     width: float
@@ -49,10 +49,10 @@ class Level:
 
 @dataclass(frozen=True)
 class Move:
-    """Hold how losses and gradients move from a level to the next finer one.
+    """The change of losses and gradients from a level to the next finer one.
 
     `median` and `p95` of |difference|, as shares of the spread; medians of the gradients' `cosine` and relative error;
-    so many points are `compared`. `width` is that of the coarser level.
+    at `compared` points. `width` is that of the coarser level.
     """
 
     coarse: str
@@ -67,12 +67,12 @@ class Move:
 
 @dataclass(frozen=True)
 class SettingConvergence:
-    """Hold what the levels of one setting show, from coarse to fine.
+    """The levels of one setting, from coarse to fine.
 
-    `order` is the observed one, `per_point` each point's, `designed` the one that the scene is built for. `moved` is
-    the 95th percentile of what refining the reference once moves, as a share of the spread, and `met` whether that is
-    rounding or within a tenth of standard's error; `met_from` names the first level from which it is. `floor` is what
-    the median of |difference| does not fall below, None where it still falls.
+    `order` is the observed one, `per_point` each point's, `designed` the one of the scene's method. `moved` is the 95th
+    percentile of the change by refining the reference once, as a share of the spread. `met`: that is rounding or within
+    a tenth of standard's error; `met_from` names the first level where it is. `floor` is the lower limit of the median
+    of |difference|, None where it still falls.
     """
 
     setting: str
@@ -89,7 +89,7 @@ class SettingConvergence:
     met_from: str | None
 
     def sentence(self) -> str:
-        """Say by which order it converges, or that it does not."""
+        """Give the order of convergence, or say that it does not converge."""
         said = [f"{self.setting}: {self.verdict}"]
         if self.verdict == "too few levels" and self.moves:
             said.append(f"losses move by {percent(self.moves[-1].p95.value)} (95 % of points) to the finest")
@@ -108,7 +108,7 @@ class SettingConvergence:
 
     @property
     def as_designed(self) -> bool | None:
-        """Whether the interval of the observed order holds the designed one, None where one of both is not known."""
+        """Whether the interval of the observed order contains the designed one, None where one of them is unknown."""
         if self.designed is None or self.order.low is None or self.order.high is None:
             return None
         return self.order.low <= self.designed <= self.order.high
@@ -116,7 +116,7 @@ class SettingConvergence:
 
 @dataclass(frozen=True)
 class Remainder:
-    """Hold how far a named fidelity is from Richardson's limit, as shares of the spread."""
+    """The distance of a named fidelity from Richardson's limit, as shares of the spread."""
 
     name: str
     median: Bootstrap
@@ -125,10 +125,10 @@ class Remainder:
 
 @dataclass(frozen=True)
 class ConvergenceRule:
-    """Say whether the reference is converged: refining it moves losses by rounding or a tenth of standard's error.
+    """Whether the reference is converged: refining it changes losses by rounding or a tenth of standard's error.
 
-    `off` is that error. Both are 95th percentiles, as shares of the spread; `moved` is by the `setting` that moves them
-    most, and `failing` are the settings that move them by more.
+    `off` is that error. Both are 95th percentiles, as shares of the spread. `moved` is by the `setting` with the
+    largest change, and `failing` are the settings above the limit.
     """
 
     off: Bootstrap
@@ -138,25 +138,25 @@ class ConvergenceRule:
     failing: tuple[str, ...]
 
     def sentence(self) -> str:
-        """Say it in a sentence."""
+        """Give the result in a sentence."""
         off, moved = (percent(one.value if one else None) for one in (self.off, self.moved))
         if self.met is None:
-            return f"whether the reference is converged is not known: it moves by {moved}, standard is off by {off}"
+            return f"the convergence of the reference is unknown: it moves by {moved}, standard is off by {off}"
         if self.met and self.moved is not None and (self.moved.value or 0.0) <= UNMOVED:
-            return f"the reference is converged to rounding: it moves by {moved} at most"
+            return f"the reference is converged to rounding: it moves by at most {moved}"
         if self.met:
-            return f"the reference is converged: it moves by {moved} at most where standard is off by {off}"
-        said = f"the reference is not converged: refining its {self.setting} moves it by {moved} where standard is off"
-        return f"{said} by {off}, and a tenth of that is allowed; it fails in {', '.join(self.failing)}"
+            return f"the reference is converged: it moves by at most {moved}, while standard is off by {off}"
+        said = f"the reference is not converged: refining its {self.setting} moves it by {moved}, while standard is off"
+        return f"{said} by {off} and a tenth of that is allowed; it fails in {', '.join(self.failing)}"
 
 
 @dataclass(frozen=True, kw_only=True)
 class ConvergenceRecord(StudyRecord):
-    """Hold the self-convergence of a scene about its reference, at the same points.
+    """The self-convergence of a scene about its reference, at the same points.
 
     `spread` is the 5th to 95th percentile of the reference's losses [`loss_unit`], None where they are all equal:
     differences are in the loss's unit then. `remainders` are empty where some setting has no limit. `divergence` is
-    None of a scene without a motion, `distributions` of one whose motion is not chaotic.
+    None for a scene without a motion, `distributions` for one whose motion is not chaotic.
     """
 
     kind: ClassVar[str] = "convergence"
@@ -171,7 +171,7 @@ class ConvergenceRecord(StudyRecord):
     distributions: Distributions | None
 
     def rows(self) -> Iterator[dict[str, Any]]:
-        """Yield a row for each setting and refinement, told apart by `setting`, `coarse` and `fine`.
+        """Yield a row for each setting and refinement, identified by `setting`, `coarse` and `fine`.
 
         Columns: `median` and `p95` of |difference| and the latter's interval, as shares of the spread; `cosine` and
         `relative_error` of gradients; `compared` points; of the setting, `order` with its interval, `designed`,
@@ -188,15 +188,15 @@ class ConvergenceRecord(StudyRecord):
                 }
 
     def sentences(self) -> list[str]:
-        """Say what was found: by which order settings converge, whether the reference does, what is left to win."""
+        """Return the results: the orders of convergence, whether the reference is converged, the remaining errors."""
         said = [*(one.sentence() for one in self.settings), self.rule.sentence(), *self.remainder_sentences()]
         return said + [one.sentence() for one in (self.divergence, self.distributions) if one]
 
     def remainder_sentences(self) -> list[str]:
-        """Say how far named fidelities are from Richardson's limit, or which settings have none."""
+        """Return the distances of named fidelities from Richardson's limit, or the settings without one."""
         if not self.remainders:
             without = [one.setting for one in self.settings if one.verdict == "does not converge"] or ["too few levels"]
-            return [f"there is no limit to extrapolate to, because of {', '.join(without)}"]
+            return [f"there is no limit for extrapolation, because of {', '.join(without)}"]
         return [
             f"{one.name} is {percent(one.median.value)} (median) and {percent(one.p95.value)} (95 % of points, "
             f"{percent(one.p95.low)} to {percent(one.p95.high)}) from Richardson's limit"
@@ -208,10 +208,10 @@ Refinements = dict[str, list[tuple[Variant, float]]]  # variants and widths by s
 
 
 def find_refinements(env: Environment, settings: Sequence[str] = ()) -> Refinements:
-    """Return what can be refined of a scene at its reference, by default every setting that it has.
+    """Return the refinable settings of a scene at its reference, by default all of them.
 
-    Steps that do not fill a control step, and grids that the scene has no other of, are left out. Raises ValueError for
-    a setting that there is not, and where the scene has none of those asked for.
+    Steps that do not divide a control step, and grids that the scene does not have, are left out. Raises ValueError for
+    an unknown setting, and where the scene has none of the requested ones.
     """
     refuse_settings(settings, SETTINGS, " in a study of convergence")
     reference, found = Variant.of(env), Refinements()
@@ -221,12 +221,12 @@ def find_refinements(env: Environment, settings: Sequence[str] = ()) -> Refineme
         if len(levels) > 1:
             found[setting] = sorted(levels, key=lambda level: -level[1])
     if not found:
-        raise ValueError(f"{env.name} has nothing of {', '.join(settings or SETTINGS)} to refine")
+        raise ValueError(f"{env.name} has none of {', '.join(settings or SETTINGS)} to refine")
     return found
 
 
 def _width(fidelity: Fidelity, reference: Fidelity, setting: str) -> float:
-    """Return the time step [s], or the width of a cell or the distance of particles as a share of the reference's."""
+    """Return the time step [s], or the width of a cell or the distance of particles relative to the reference's."""
     if setting == "dt":
         return fidelity.dt
     if setting == PRECISION:
@@ -260,8 +260,8 @@ class ConvergenceStudy(VariantStudy):
     takes = ("settings",)
     what = "levels"
     advice = (
-        "compiling kernels, and distributions where it is chaotic, come on top; --points (16 are enough) and "
-        "--settings lower it"
+        "plus compiling kernels, and distributions if it is chaotic; fewer --points (16 are enough) or --settings "
+        "take less"
     )
 
     def __init__(self, env: Environment, options: StudyOptions) -> None:
@@ -270,12 +270,12 @@ class ConvergenceStudy(VariantStudy):
         self.refinements = find_refinements(env, options.settings)
 
     def identity(self) -> dict[str, Any]:
-        """Return what decides the numbers."""
+        """Return the settings that decide the numbers."""
         return {**super().identity(), "settings": list(self.refinements)}
 
     @cached_property
     def variants(self) -> list[Variant]:
-        """What is simulated: the reference, the named fidelities, then what is refined."""
+        """The simulations: the reference, the named fidelities, then the refinements."""
         levels = [variant for one in self.refinements.values() for variant, _ in one]
         unique: dict[str, Variant] = {}
         for variant in (Variant.of(self.env), *Variant.all_named(self.env), *levels):
@@ -283,14 +283,14 @@ class ConvergenceStudy(VariantStudy):
         return list(unique.values())
 
     def _make(self, variant: Variant) -> Environment:
-        """Make a variant's environment. Raises TooLargeError for what a CPU has no memory for."""
+        """Make a variant's environment. Raises TooLargeError where it does not fit into a CPU's memory."""
         env = variant.make(self.env)
         if env.device == "cpu":
             require("episodes", 1, lambda count: Need(float(count * env.memory())))
         return env
 
     def expected(self) -> Iterator[Expected]:
-        """Yield the variants that are not measured yet and not refused, and the neighbours."""
+        """Yield the variants that are neither measured nor refused, and the neighbours."""
         yield from super().expected()
         if count := self._neighbours(1.0).count_left():
             yield Expected("the divergence of neighbours", self.env, count)
@@ -299,7 +299,7 @@ class ConvergenceStudy(VariantStudy):
         return Neighbours(self.env, self.x, self.seed, self.checkpoint, spread)
 
     def run(self, watch: Watch, provenance: Mapping[str, Any], command: str) -> ConvergenceRecord:
-        """Measure what is missing and return the record."""
+        """Measure the missing parts and return the record."""
         samples = samples_of(self.measure_all(watch))
         name = self.variants[0].name
         reference = samples[name].loss
@@ -340,9 +340,9 @@ class ConvergenceStudy(VariantStudy):
             yield Levels(setting, levels, np.array(losses), gradients, self.env.designed_order.get(setting))
 
     def _compared(self) -> list[Variant]:
-        """Return what is compared with the reference by distributions: named fidelities, and what is refined.
+        """Return the variants to compare with the reference by distributions: named fidelities, and refinements.
 
-        Of a setting it is the one step that is finer than the reference; what was refused is left out.
+        Of a setting it is the step just finer than the reference; refused ones are left out.
         """
         found = [one for one in self.variants[1:] if one.name in self.env.fidelities]
         for levels in self.refinements.values():
@@ -354,7 +354,7 @@ class ConvergenceStudy(VariantStudy):
 
 @dataclass(frozen=True, eq=False)
 class Levels:
-    """Hold the levels of one setting, from coarse to fine, what they return, and the order that the scene is built for.
+    """The levels of one setting, from coarse to fine, their results, and the order of the scene's method.
 
     `losses`, shape (level, point), NaN where a point failed; `gradients`, shape (point, dim) each.
     """
@@ -373,14 +373,14 @@ class Levels:
 
 @dataclass(frozen=True)
 class Scale:
-    """Say how differences are told: as shares of the `spread` of losses, from a `seed`; `off` is standard's error."""
+    """The scale of differences: shares of the `spread` of losses, from a `seed`; `off` is standard's error."""
 
     spread: float
     off: Bootstrap
     seed: int
 
     def meets(self, moved: float | None) -> bool | None:
-        """Say whether a movement is rounding or within a tenth of standard's error, None where one is not known."""
+        """Return whether a change is rounding or within a tenth of standard's error, None where one is unknown."""
         if self.off.value is None:
             return None
         return moved is not None and moved <= max(ALLOWED * self.off.value, UNMOVED)
@@ -399,7 +399,7 @@ def sum_up(errors: Array, spread: float, seed: int) -> tuple[Bootstrap, Bootstra
 
 
 def conclude(levels: Levels, reference: str, scale: Scale) -> SettingConvergence:
-    """Say what a setting's levels show; one of them is the `reference`."""
+    """Return the results of a setting's levels; one of them is the `reference`."""
     order = measure_order(levels.widths, levels.losses, scale=scale.spread, seed=scale.seed)
     moves = [_move(levels, place, scale) for place in range(len(levels.levels) - 1)]
     place = [level.name for level in levels.levels].index(reference)
@@ -432,7 +432,7 @@ def _move(found: Levels, place: int, scale: Scale) -> Move:
 
 
 def judge(settings: Sequence[SettingConvergence], scale: Scale) -> ConvergenceRule:
-    """Apply the rule: refining a reference moves losses by rounding, or by less than a tenth of standard's error."""
+    """Apply the rule: refining a reference changes losses by rounding, or by less than a tenth of standard's error."""
     known = [one for one in settings if one.setting != PRECISION and one.moved is not None]
     worst = max(known, key=_moved, default=None)
     met = [one.met for one in known]
@@ -454,7 +454,7 @@ Refined = Sequence[tuple[Levels, SettingConvergence]]
 
 
 def joint_or_single(refined: Refined) -> Refined:
-    """Return the settings whose limits add up to that of the scene: the joint one alone where there is one."""
+    """Return the settings whose corrections add up to the scene's limit: only the joint one where there is one."""
     joint = [pair for pair in refined if pair[0].setting == JOINT]
     return joint or [pair for pair in refined if pair[0].setting != PRECISION]
 
@@ -462,10 +462,10 @@ def joint_or_single(refined: Refined) -> Refined:
 def estimate_remainders(
     refined: Refined, named: Mapping[str, Array], reference: Array, scale: Scale
 ) -> tuple[Remainder, ...]:
-    """Estimate how far `named` losses are from Richardson's limit, shape (point,) each.
+    """Estimate the distance of `named` losses from Richardson's limit, shape (point,) each.
 
-    Corrections of the settings add up to leading order. Orders are measured again for each draw of the bootstrap, but
-    where the designed ones are taken. Empty where some setting has no limit.
+    Corrections of the settings add up to leading order. Each draw of the bootstrap measures the orders again, unless
+    designed ones are used. Empty where some setting has no limit.
     """
     corrections = [_Correction.of(levels, found, reference) for levels, found in refined]
     every = [one for one in corrections if one is not None]
@@ -496,7 +496,7 @@ def _left(
 
 @dataclass(frozen=True, eq=False)
 class _Correction:
-    """Hold what leads from the reference to the limit of one setting; `by` is a fixed order, None to measure it."""
+    """The correction from the reference to the limit of one setting; `by` is a fixed order, None to measure it."""
 
     levels: Levels
     by: float | None
@@ -511,7 +511,7 @@ class _Correction:
         return None if by is None else cls(levels, by if by == levels.designed else None, False, reference)
 
     def at(self, rows: NDArray[np.int64], drawn: NDArray[np.int64]) -> Array:
-        """Return the correction at points, by the order that the points `drawn` show."""
+        """Return the correction at points, by the order from the `drawn` points."""
         losses, widths = self.levels.losses, self.levels.widths
         if self.still:
             return np.asarray(losses[-1][rows] - self.reference[rows])

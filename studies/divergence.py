@@ -1,9 +1,9 @@
-"""Divergence of neighbours: how fast motions that begin almost alike part, whether that is chaos, and what holds then.
+"""Divergence of neighbours: how fast similar motions separate, whether that is chaos, and how to compare then.
 
-A chaotic motion has no reference that others converge to point by point: every error, of a step as of a digit, grows
+A chaotic motion has no reference to which others converge point by point: every error, of a step or of a digit, grows
 until it is as large as the motion itself. Its fidelities are compared by the distributions of their losses over
-neighbourhoods. Two samples of the same distribution differ, too: that is the noise, and no fidelity can be told from
-the reference by less.
+neighbourhoods. Two samples of the same distribution differ, too. That is the noise, and a smaller difference does not
+distinguish a fidelity from the reference.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ PLACES, AROUND, RADIUS = 8, 64, 0.02  # neighbourhoods, points of each, how far 
 
 @dataclass(frozen=True)
 class DivergenceRate:
-    """Hold how a distance grows: `rate` [1/s], over `duration` [s]."""
+    """The growth of a distance: `rate` [1/s], over `duration` [s]."""
 
     rate: float
     duration: float
@@ -58,11 +58,11 @@ class DivergenceRate:
 
 
 def fit_rate(time: Array, distance: Array, *, extent: float) -> DivergenceRate:
-    """Fit log distance ~ rate x time, over the latter half of the time in which a distance can grow.
+    """Fit log distance ~ rate x time, over the second half of the time in which a distance can grow.
 
-    The first half is left out because powers of time grow quickly at first, which is no chaos: a distance like t^n
-    gains a factor of 2^n in the latter half. Growth ends where the distance is a tenth of the `extent` of the motion. A
-    rate is NaN where fewer than five instants are left.
+    The first half is left out because powers of time grow quickly at first, which is not chaos: a distance like t^n
+    grows by a factor of 2^n in the second half. Growth ends where the distance is a tenth of the `extent` of the
+    motion. A rate is NaN where fewer than five instants remain.
     """
     known = np.flatnonzero(distance > 0)
     whole = float(time[-1] - time[0])
@@ -79,7 +79,7 @@ def fit_rate(time: Array, distance: Array, *, extent: float) -> DivergenceRate:
 
 @dataclass(frozen=True)
 class Response:
-    """Say how far losses move for a perturbation of a `size`, as a share of the box: the median, in spreads."""
+    """The median change of losses by a perturbation of a `size`, as a share of the box, in spreads."""
 
     size: float
     loss: float | None
@@ -87,11 +87,11 @@ class Response:
 
 @dataclass(frozen=True)
 class Divergence:
-    """Hold how neighbours part in a scene.
+    """The divergence of neighbours in a scene.
 
-    `rate` [1/s] is the mean over `points` with Student's interval, `chaotic` how many of them are; `size` is what was
-    perturbed, as a share of the box. `responses` are those of losses; `saturates_at` is the smallest size at which they
-    move by a tenth of their spread, None where none does.
+    `rate` [1/s] is the mean over `points` with Student's interval, `chaotic` the number of chaotic points; `size` is
+    the perturbation, as a share of the box. `responses` are those of losses. `saturates_at` is the smallest size that
+    moves them by a tenth of their spread, None where none does.
     """
 
     points: int
@@ -104,7 +104,7 @@ class Divergence:
 
     @classmethod
     def of(cls, found: Sequence[DivergenceRate], responses: Sequence[Response], *, size: float) -> Divergence:
-        """Sum up what points show."""
+        """Summarise the points."""
         rates = np.array([one.rate for one in found])
         whole = mean(rates)
         large = [one.size for one in responses if one.loss is None or one.loss >= LARGE_RESPONSE]
@@ -119,24 +119,24 @@ class Divergence:
         )
 
     def sentence(self) -> str:
-        """Say how neighbours part."""
+        """Describe the divergence of neighbours."""
         moved = "no perturbation up to a thousandth of the box moves"
         if self.saturates_at is not None:
             moved = f"a perturbation of {self.saturates_at:g} of the box moves"
         return (
-            f"neighbours part at {self.rate} 1/s; {self.chaotic} of {self.points} points are chaotic; "
-            f"{moved} losses by a tenth of their spread"
+            f"neighbours diverge at {self.rate} 1/s; {self.chaotic} of {self.points} points are chaotic; {moved} "
+            "losses by a tenth of their spread"
         )
 
     @property
     def is_chaos(self) -> bool:
-        """Whether half of the points or more are chaotic: then a scene is judged by distributions."""
+        """Whether at least half of the points are chaotic: then a scene is judged by distributions."""
         return self.points > 0 and 2 * self.chaotic >= self.points
 
 
 @dataclass(frozen=True)
 class Distance:
-    """Hold how far two distributions are apart: `kolmogorov` in 0 to 1, `wasserstein` in spreads of the losses."""
+    """The distance of two distributions: `kolmogorov` in 0 to 1, `wasserstein` in spreads of the losses."""
 
     kolmogorov: Bootstrap
     wasserstein: Bootstrap
@@ -144,10 +144,9 @@ class Distance:
 
 @dataclass(frozen=True)
 class ComparedDistribution:
-    """Say how far the losses of a fidelity are from those of the reference, means over the neighbourhoods.
+    """The distance of a fidelity's losses from those of the reference, means over the neighbourhoods.
 
-    `told` says by which of the two distances it can be told from the reference: they are beyond the 95th percentile of
-    the noise.
+    `told` names the distances that distinguish it from the reference, those above the 95th percentile of the noise.
     """
 
     name: str
@@ -157,9 +156,9 @@ class ComparedDistribution:
 
 @dataclass(frozen=True)
 class Distributions:
-    """Hold the losses of fidelities over neighbourhoods of so many `points`, of `radius` (a share of the box) each.
+    """The losses of fidelities over neighbourhoods of `points`, each of `radius` (a share of the box).
 
-    `noise` is the distance of two samples of the reference; `noise_limit` what it stays below in 95 % of cases.
+    `noise` is the distance of two samples of the reference; `noise_limit` is its 95th percentile.
     """
 
     neighbourhoods: int
@@ -170,12 +169,16 @@ class Distributions:
     compared: tuple[ComparedDistribution, ...]
 
     def sentence(self) -> str:
-        """Say which fidelities can be told from the reference."""
+        """Name the fidelities that are distinguishable from the reference."""
         told = [f"{one.name} (by {' and '.join(one.told)})" for one in self.compared if one.told]
         others = [one.name for one in self.compared if not one.told]
         said = [f"over {self.neighbourhoods} neighbourhoods of {self.points} points the losses of"]
-        said += [", ".join(told), "are distributed otherwise than the reference's"] if told else []
-        said += [*(["and those of"] if told else []), ", ".join(others), "are not told from it"] if others else []
+        said += [", ".join(told), "have another distribution than the reference's"] if told else []
+        said += (
+            [*(["and those of"] if told else []), ", ".join(others), "are not distinguishable from the reference's"]
+            if others
+            else []
+        )
         return " ".join(said)
 
 
@@ -184,9 +187,9 @@ def compare_distributions(
 ) -> Distributions:
     """Compare losses over neighbourhoods, shape (neighbourhood, point), NaN where an episode failed.
 
-    `reference` is two independent samples of the reference, `others` are losses at the points of the second: so what is
-    the same as the reference is exactly as far from the first as the second is. Noise is what dividing both samples of
-    the reference again gives.
+    `reference` is two independent samples of the reference, `others` are losses at the points of the second. So a
+    variant equal to the reference is exactly as far from the first as the second is. Noise comes from dividing both
+    samples of the reference again.
     """
     first, second = reference
     generator = np.random.default_rng(seed)
@@ -212,7 +215,7 @@ def compare_distributions(
 def distances(a: Array, b: Array, scale: float) -> Float[NDArray[np.float64], " distance"]:
     """Return Kolmogorov's distance of two samples and Wasserstein's, the latter in units of `scale`.
 
-    Episodes that failed are left out; both distances are NaN where all did.
+    Failed episodes are left out; both distances are NaN where all failed.
     """
     a, b = a[np.isfinite(a)], b[np.isfinite(b)]
     if not (a.size and b.size):
@@ -244,7 +247,7 @@ RESPONSES = "responses"  # the part with the losses of neighbours
 class Neighbours:
     """The neighbours of the points `x` of a scene at its reference `env`, shape (point, dim); parts of a checkpoint.
 
-    Losses are told in units of their `spread`.
+    Losses are in units of their `spread`.
     """
 
     env: Environment
@@ -254,17 +257,17 @@ class Neighbours:
     spread: float
 
     def count_left(self) -> float:
-        """Count the episodes with gradients that following neighbours takes as long as; 0 where that is done."""
+        """Return the remaining cost of simulating neighbours, in episodes with gradients; 0 where that is done."""
         if self.checkpoint.load(RESPONSES) is not None:
             return 0.0
         alone = self.env.threads * (1 + NEIGHBOURS) * len(self.x[:FOLLOWED_POINTS])
         return alone + (1 + len(SIZES)) * len(self.x) / 2  # a loss takes about half of a gradient
 
     def measure_divergence(self, watch: Watch) -> Divergence | None:
-        """Follow neighbours at some points, and say how they part; None where a scene shows no motion."""
+        """Simulate neighbours at some points, and return how they diverge; None where a scene shows no motion."""
         some, rates = self.x[:FOLLOWED_POINTS], list[DivergenceRate]()
         try:
-            with watch.progress(len(some), "points whose neighbours are followed") as advance:
+            with watch.progress(len(some), "points with neighbours") as advance:
                 for number in range(len(some)):
                     advance(number)
                     rates.append(self._follow(number))
@@ -294,10 +297,10 @@ class Neighbours:
         )
 
     def _follow(self, number: int) -> DivergenceRate:
-        """Return how neighbours of a point part: the growth of the distance between their points, a root mean square.
+        """Return the divergence of a point's neighbours: the growth of the root mean square distance of all points.
 
-        Only the first decision is perturbed, so that what grows later is the motion's. The distances of several
-        neighbours are put together as their geometric mean.
+        Only the first decision is perturbed, so that later growth is the motion's. The distances of several neighbours
+        are combined by their geometric mean.
         """
         arrays = self.checkpoint.load_or_compute(f"divergence-{number}", lambda: self._part(self.x[number], number))
         with np.errstate(divide="ignore"):
@@ -316,7 +319,7 @@ class Neighbours:
         return {"time": times, "distance": np.array(distances), "extent": np.array(extent)}
 
     def _responses(self) -> list[Response]:
-        """Return how far losses move for perturbations of each size, in one batch of all points."""
+        """Return the changes of losses for perturbations of each size, in one batch of all points."""
         space = self.env.space
         turns = _directions(len(self.x), space.dim, seed=self.seed)
         every = torch.cat([self.x, *(self.x + size * turns * (space.upper - space.lower) for size in SIZES)])
@@ -345,7 +348,7 @@ class Neighbours:
 
 
 def _motion(env: Environment, x: Float[Tensor, " dim"]) -> tuple[Array, Array]:
-    """Return the times of an episode [s] and the places of all its bodies' points [m], shape (frame, point, axis)."""
+    """Return the times of an episode [s] and the positions of all bodies' points [m], shape (frame, point, axis)."""
     episode = env.episode(x)
     places = torch.cat([episode.points[name].double() for name in sorted(episode.points)], dim=1)
     return episode.time.double().numpy(), places.numpy()

@@ -1,4 +1,4 @@
-"""The study `extremes`: how far each setting of a scene can be changed before it fails, and maps of pairs of them."""
+"""The study `extremes`: how far each setting of a scene can be changed before it fails, and maps of setting pairs."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ Changes = Sequence[tuple[Setting, float]]
 
 @dataclass(frozen=True)
 class Limit:
-    """Hold how far one setting can be changed, in one precision, from `base`, where the scene has it.
+    """How far one setting can be changed, in one precision, from its value `base` in the scene.
 
-    `end` says which way: largest or smallest. `stable` is the last value before the first failure, `failed` the first
-    one that was seen to fail, either None where there is none; `islands` are stable stretches beyond that. In the same
-    way losses are right up to `accurate` and no more at `wrong`: bisected of a setting that the reference does not
-    share, else by what was scanned. `scanned` are the values that were, in order, whatever happened at them; `skipped`
-    counts those left out as too dear.
+    `end` is the direction: largest or smallest. `stable` is the last value before the first failure, `failed` the first
+    value that failed, either None where there is none; `islands` are stable ranges beyond it. In the same way losses
+    are right up to `accurate` and wrong at `wrong`: by bisection for a setting that the reference does not share, else
+    from the scan. `scanned` are the scanned values, in order, with any outcome; `skipped` counts those left out as too
+    expensive.
     """
 
     setting: str
@@ -59,7 +59,7 @@ class Limit:
     def margin(self) -> float | None:
         """The base as a share of the largest stable value, or of the smallest one its inverse; None without one.
 
-        Below one the scene is stable; where nothing failed it is that share of the farthest value that was tried.
+        Below one the scene is stable; if nothing failed, it is relative to the farthest tested value.
         """
         return self._share(self.stable)
 
@@ -75,7 +75,7 @@ class Limit:
 
     @property
     def last_error(self) -> float | None:
-        """The loss error at the last value before the first failure: how wrong losses get while they are finite."""
+        """The loss error at the last value before the first failure: the largest error of finite losses."""
         error = None
         for cell in self.scanned:
             if not cell.stable:
@@ -84,7 +84,7 @@ class Limit:
         return error
 
     def sentence(self) -> str:
-        """Say where it lies, what happens beyond it, how wrong losses get before, and up to where they are right."""
+        """Give the limit, the failure beyond it, the largest error before it, and the limit of right losses."""
         if self.stable is None:
             said = [f"none is stable: {self.scanned[0].outcome}"]
         elif self.failed is None:
@@ -92,22 +92,22 @@ class Limit:
         else:
             said = [f"{self.stable:.4g} ({self.stable / self.base:.3g}x), then {self.beyond}"]
         said += [f"stable again {low:.4g} to {high:.4g}" for low, high in self.islands]
-        said += [f"{self.skipped} values too dear"] if self.skipped else []
+        said += [f"{self.skipped} values too expensive"] if self.skipped else []
         if self.last_error is not None:
             right = "not accurate" if self.accurate is None else f"accurate to {self.accurate:.4g}"
             right += f", not at {self.wrong:.4g}" if self.accurate is not None and self.wrong is not None else ""
-            said.append(f"{right}, at last {100 * self.last_error:.2g} % off")
+            said.append(f"{right}, finally {100 * self.last_error:.2g} % off")
         return "; ".join(said)
 
 
 @dataclass(frozen=True)
 class StabilityMap:
-    """Hold how a scene ended at a grid of two settings, in one precision.
+    """The outcomes of a scene on a grid of two settings, in one precision.
 
     `cells` go along `x` first, then along `y`. `boundary` has for values of `y` the last stable value along x and the
-    first that failed, between which the limit lies; values of y at which nothing or all of x failed have none.
-    `accurate_boundary` is the same of the last accurate value and the first that is not, where the reference does not
-    share x.
+    first that failed, which enclose the limit; values of y without any failure, or without any success, have none.
+    `accurate_boundary` is the same for the last accurate value and the first inaccurate one, where the reference does
+    not share x.
     """
 
     x: str
@@ -124,10 +124,10 @@ class StabilityMap:
 
 @dataclass(frozen=True, kw_only=True)
 class ExtremesRecord(StudyRecord):
-    """Hold what a scene does where its settings are changed far, at the same points everywhere.
+    """The behaviour of a scene under extreme settings, at the same points everywhere.
 
-    `fidelity` is what the settings are changed from, `reference` the one whose losses tell whether finite ones are
-    right, within `tolerance` of their spread; limits are known to a relative `width`.
+    `fidelity` is the starting point of the changes. `reference` is the fidelity whose losses decide whether finite ones
+    are right, within `tolerance` of their spread; limits are known to a relative `width`.
     """
 
     kind: ClassVar[str] = "extremes"
@@ -143,15 +143,15 @@ class ExtremesRecord(StudyRecord):
 
     @property
     def precisions(self) -> list[str]:
-        """The precisions that were tried, in order."""
+        """The tested precisions, in order."""
         return list(dict.fromkeys(one.precision for one in self.limits))
 
     def rows(self) -> Iterator[dict[str, Any]]:
-        """Yield a row for each end of each setting in each precision, told apart by `setting`, `end` and `precision`.
+        """Yield a row for each end of each setting in each precision, identified by `setting`, `end` and `precision`.
 
-        Columns: `base`; `stable` and `failed`, between which the limit lies; `margin`; `beyond`, what happens there;
-        `accurate` and `wrong`, up to where losses are right and where no more; `islands`; `error`, at the last stable
-        value.
+        Columns: `base`; `stable` and `failed`, which enclose the limit; `margin`; `beyond`, the failure there;
+        `accurate` and `wrong`, the last value with right losses and the first without; `islands`; `error`, at the last
+        stable value.
         """
         names = (*self.index, "base", "stable", "failed", "margin", "beyond", "accurate", "wrong", "islands")
         for one in self.limits:
@@ -162,18 +162,18 @@ class ExtremesRecord(StudyRecord):
         return [f"{one.setting}, {one.end}, {one.precision}: {one.sentence()}" for one in self.limits]
 
     def to_keep(self) -> ExtremesRecord | None:
-        """Return the record where it says something of the step."""
+        """Return the record if it has a result on the step."""
         return self if any(limit.setting == DT for limit in self.limits) else None
 
     def margin_sentences(self, env: Environment) -> Iterator[str]:
-        """Yield how the step stands to its limit in each precision, and where and of what settings that was measured.
+        """Yield the step relative to its limit in each precision, with device, engine and settings of the measurement.
 
         `env` is the scene as it is now.
         """
         known, now = self.identity, env.fidelities.get(self.fidelity)
         of = f"{known['engine']} on {known['device']}, {self.points} points, {self.provenance['created']}"
         if (theirs := known[MODEL_VERSION]) != (ours := env.version_on(known["engine"])):
-            of += f", by {env.name} model {theirs}, this is model {ours}"
+            of += f", with {env.name} model {theirs}; this is model {ours}"
         if now is not None and (others := now.changes_from(known["settings"])):
             of += f", when {self.fidelity} had {', '.join(f'{name} {value}' for name, (value, _) in others.items())}"
         for limit in self.limits:
@@ -183,7 +183,7 @@ class ExtremesRecord(StudyRecord):
 
     def _margin(self, limit: Limit) -> str:
         if limit.stable is None:
-            return f"no step as long as {self.fidelity}'s was stable, nor a shorter one that was tried"
+            return f"{self.fidelity}'s step was not stable, and neither was any shorter one that was tried"
         if limit.failed is None:
             return f"{self.fidelity}'s step is stable, and so is one {limit.stable / limit.base:.3g} times as long"
         share = "" if limit.stable == limit.base else f"{limit.margin:.2g} of "
@@ -196,14 +196,17 @@ class ExtremesRecord(StudyRecord):
             return f"its losses are not {of}"
         if limit.wrong is None:
             return f"all losses are {of}"
-        return f"losses are {of} up to {limit.accurate:.3g} s, of which it is {limit.accurate_margin:.2g}"
+        return (
+            f"losses are {of} up to a step of {limit.accurate:.3g} s; {self.fidelity}'s step is "
+            f"{limit.accurate_margin:.2g} of that"
+        )
 
 
 class ExtremesStudy(Study):
-    """Settings of a scene that are scanned and bisected, and maps of pairs of them.
+    """Scan and bisect settings of a scene, and map pairs of them.
 
-    The points are `unit`, shape (point, dim) [of the box]. `reference` is the fidelity that says whether finite losses
-    are right.
+    The points are `unit`, shape (point, dim) [of the box]. `reference` is the fidelity that decides whether finite
+    losses are right.
     """
 
     kind = "extremes"
@@ -212,7 +215,8 @@ class ExtremesStudy(Study):
     default_points = 16
     copies = 20
     advice = (
-        "less where steps are longer; compiling kernels comes on top; --points, --settings, --pairs and --grid lower it"
+        "less if steps are longer, plus compiling kernels; fewer --points, --settings, --pairs or a smaller --grid "
+        "take less"
     )
 
     def __init__(self, env: Environment, options: StudyOptions) -> None:
@@ -220,21 +224,21 @@ class ExtremesStudy(Study):
         self.width = WIDTH if options.width is None else options.width
         self.tolerance = TOLERANCE if options.tolerance is None else options.tolerance
         if not 0 < self.width < 1:
-            raise ValueError(f"--width takes a share between 0 and 1, as 0.05; got {self.width:g}")
+            raise ValueError(f"--width takes a share between 0 and 1, such as 0.05; got {self.width:g}")
         if not 0 <= self.tolerance < math.inf:
-            raise ValueError(f"--tolerance takes a share of the losses' spread, as 0.1; got {self.tolerance:g}")
+            raise ValueError(f"--tolerance takes a share of the losses' spread, such as 0.1; got {self.tolerance:g}")
         super().__init__(env, options)
         self.settings = SceneSettings(env)
         self.changed = self.settings.pick(options.settings)
         if not self.changed:
             raise ValueError(
-                f"{env.name} has nothing to change: no time step, no grid, no option that is a number above 0 and no "
-                "horizon, and it is undefined outside its bounds; a function takes options=, fidelities= and horizon="
+                f"{env.name} has nothing to change: no time step, no grid, no option with a number above 0 and no "
+                "horizon, and it is undefined outside its bounds; give a function options=, fidelities= or horizon="
             )
         self.reference = options.reference or list(env.fidelities)[-1]
         if self.reference not in env.fidelities:
             raise ValueError(
-                f"{env.name} has fidelities {', '.join(env.fidelities)} to be judged by; got {self.reference!r}"
+                f"{env.name} has fidelities {', '.join(env.fidelities)} as its reference; got {self.reference!r}"
             )
         usual = [] if options.settings else self.settings.usual_pairs
         self.pairs = usual if options.pairs is None else self.settings.pick_pairs(options.pairs)
@@ -243,26 +247,26 @@ class ExtremesStudy(Study):
 
     @classmethod
     def choose_fidelity(cls, scene: Environment | type[Environment], given: Fidelity | str | None) -> Fidelity | str:
-        """Return the fidelity that settings are changed from: the one given, else standard, or the scene's first."""
+        """Return the fidelity at which the changes start: the given one, else standard, or the scene's first."""
         return given or ("standard" if "standard" in scene.fidelities else next(iter(scene.fidelities)))
 
     def identity(self) -> dict[str, Any]:
-        """Return what decides the numbers."""
+        """Return the settings that decide the numbers."""
         return {**super().identity(), "reference": self.reference}
 
     def folder_parts(self) -> list[object]:
-        """Return what the study's folder is named after."""
+        """Return the parts of the name of the study's folder."""
         return [self.kind, self.env.name, self.env.fidelity.name, len(self.x)]
 
     def describe_left(self) -> str:
-        """Say how much there is to measure."""
-        kept = f", {self.checkpoint.count()} are there already" if self.checkpoint.count() else ""
-        return f"some {self._count()} settings to measure{kept}"
+        """Describe the remaining measurements."""
+        kept = f", {self.checkpoint.count()} already stored" if self.checkpoint.count() else ""
+        return f"about {self._count()} settings to measure{kept}"
 
     def expected(self) -> Iterator[Expected]:
-        """Yield all settings as one, the references among them, in episodes of the fidelity that they are changed from.
+        """Yield all settings as one, including the references, in episodes of the fidelity at the start.
 
-        What is kept already is not taken off.
+        Stored results are not subtracted.
         """
         judged = self.settings.make({}, "", self.reference)
         own = precision_cost(self.env.fidelity.precision)
@@ -272,12 +276,12 @@ class ExtremesStudy(Study):
         yield Expected(f"{self._count()} settings", self.env, len(self.x) * (sum(works) * slower + references * dearer))
 
     def _count(self) -> int:
-        """Return about how many settings will be tried, with the references."""
+        """Return the approximate number of settings to try, with the references."""
         works, references = self._expected()
         return round(len(works) * len(self.precisions) + references)
 
     def _expected(self) -> tuple[list[float], float]:
-        """Return the work of each setting that is tried in a precision, in that of the base, and that of references."""
+        """Return the work of each setting in a precision, in units of the base, and that of references."""
         bisections = math.ceil(math.log2(math.log(4.0) / math.log1p(self.width)))
         ends = [(setting, end) for setting in self.changed for end in setting.ends]
         works = [self.settings.work(setting, value) for setting, end in ends for value in setting.grid(end)]
@@ -292,7 +296,7 @@ class ExtremesStudy(Study):
         return works, references + sum(self.grid for pair in self.pairs for name in pair if not _is_fidelity(name))
 
     def run(self, watch: Watch, provenance: Mapping[str, Any], command: str) -> ExtremesRecord:
-        """Try what is missing and return the record."""
+        """Try the missing settings and return the record."""
         count = self._count()
         with watch.progress(count, self.what) as self._advance:
             limits = [
@@ -314,7 +318,7 @@ class ExtremesStudy(Study):
         )
 
     def _limit(self, setting: Setting, end: str, precision: str) -> Limit:
-        """Scan a setting towards an end, then bisect the first failure: what is stable beyond is not hidden by that."""
+        """Scan a setting towards an end, then bisect the first failure; the scan also finds stable ranges beyond it."""
         axis = self.settings.axis(setting)
         wanted = list(dict.fromkeys(map(axis.settle, setting.grid(end))))
         scanned = [value for value in wanted if self.settings.work(setting, value) <= MAX_WORK]
@@ -350,7 +354,7 @@ class ExtremesStudy(Study):
     ) -> tuple[float | None, float | None]:
         """Return the last value of a setting at which it is `what` (stable, accurate), and the first at which not.
 
-        They are bisected, accuracy only where no other reference is needed for that.
+        They are bisected, accuracy only if that needs no other reference.
         """
         setting = changed[0][0]
         last, first = bracket([value for _, value in changed], [getattr(cell, what) for cell in cells])
@@ -363,7 +367,7 @@ class ExtremesStudy(Study):
         return bisect(last, first, holds, self.settings.axis(setting), self.width)
 
     def _map(self, pair: Pair, precision: str) -> StabilityMap:
-        """Try a grid of two settings around their base and their limits; then bisect where each row ends."""
+        """Try a grid of two settings around their base and their limits; then bisect the end of each row."""
         x, y = (self.settings.all[name] for name in pair)
         xs, ys = (self._map_values(setting, precision) for setting in (x, y))
         rows = [[self._cell([(x, a), (y, b)], precision) for a in xs] for b in ys]
@@ -387,7 +391,7 @@ class ExtremesStudy(Study):
         )
 
     def _map_values(self, setting: Setting, precision: str) -> list[float]:
-        """Return the values of a setting that a map has: from below its base to beyond its limit."""
+        """Return the values of a setting in a map: from below its base to beyond its limit."""
         axis = self.settings.axis(setting)
         if setting.linear:
             return axis.spread(setting.least, setting.most, self.grid)
@@ -403,7 +407,7 @@ class ExtremesStudy(Study):
         return axis.spread(max(low, setting.least), min(high, setting.most, dearest), self.grid)
 
     def _cell(self, changed: Changes, precision: str) -> Cell:
-        """Say how values of settings ended, against the reference of the same scene."""
+        """Return the outcome at values of settings, compared with the reference of the same scene."""
         values = {setting.name: value for setting, value in changed if value != setting.base}
         self._advance(
             len(self.answers), ", ".join([precision, *(f"{name} {value:.4g}" for name, value in values.items())])
@@ -414,7 +418,7 @@ class ExtremesStudy(Study):
         return judge([value for _, value in changed], answer, reference, tolerance=self.tolerance)
 
     def _answer(self, values: Values, precision: str, fidelity: str | None = None) -> Sample:
-        """Return what the scene returns at values of settings, from memory, from disk, or from the scene."""
+        """Return the scene's results at values of settings, from memory, from disk, or from the scene."""
         how, known = fidelity or precision, values_key(values)
         name = " ".join([how, *(f"{key}={value}" for key, value in known)])
         if name not in self.answers:
@@ -438,17 +442,17 @@ class ExtremesStudy(Study):
         return spread_points(self.env.space.dim, points, self.seed)
 
     def _beyond(self, values: Values) -> Tensor:
-        """Return the points, as far beyond the box as values of settings say."""
+        """Return the points, extended beyond the box according to values of settings."""
         return self.env.space.from_unit(0.5 + values.get(BOX, 1.0) * (self.x - 0.5))
 
 
 def _is_fidelity(setting: str) -> bool:
-    """Say whether a setting is one of the fidelity, which the reference has of its own."""
+    """Return whether a setting belongs to the fidelity, and so has its own value in the reference."""
     return setting in (DT, RESOLUTION)
 
 
 def spread_points(dim: int, points: int, seed: int) -> Tensor:
-    """Return points of the unit cube: corners, half of the points at most, and Sobol points."""
+    """Return points of the unit cube: corners, at most half of the points, and Sobol points."""
     import torch
 
     from ..landscapes.checks.extremes import corners

@@ -1,4 +1,4 @@
-"""The study `fidelity`: accuracy against speed of a scene's fidelities, and of what can be changed about them."""
+"""The study `fidelity`: accuracy against speed of a scene's fidelities, and of changes to them."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ OUT_OF_REACH = 3.0  # times the reference's time: a variant that takes more is m
 
 @dataclass(frozen=True)
 class MeasuredVariant:
-    """Hold one way to simulate a scene and what was measured of it.
+    """One way to simulate a scene and its measurements.
 
-    `changed` names the setting that differs from a named fidelity, "named" where none does; `memory` is what an episode
-    takes [bytes] as the scene estimates it. What takes far longer than the reference is `given_up` after that many
-    points, 0 of others.
+    `changed` names the setting that differs from a named fidelity, "named" where none does; `memory` is the scene's own
+    estimate for an episode [bytes]. A variant that takes far longer than the reference is `given_up` after that many
+    points, 0 for others.
     """
 
     name: str
@@ -52,7 +52,7 @@ class MeasuredVariant:
 
     @property
     def seconds(self) -> float:
-        """What an episode with gradient takes [s]."""
+        """Time of an episode with gradient [s]."""
         return self.comparison.seconds.with_gradient
 
     def p95(self, *, relative: bool) -> float | None:
@@ -61,7 +61,7 @@ class MeasuredVariant:
         return (error.p95_relative if relative else error.p95).value
 
     def differs_beyond_dt(self, other: MeasuredVariant) -> bool:
-        """Say whether they differ in more than time step and precision."""
+        """Return whether they differ in more than time step and precision."""
         return self._others() != other._others()
 
     def _others(self) -> tuple[Any, ...]:
@@ -71,7 +71,7 @@ class MeasuredVariant:
 
 @dataclass(frozen=True)
 class ConvergenceOrder:
-    """Hold p of error ~ dt^p, fitted to some variants, with its standard error."""
+    """The order p of error ~ dt^p, fitted to some variants, with its standard error."""
 
     variants: tuple[str, ...]
     order: float
@@ -80,10 +80,10 @@ class ConvergenceOrder:
 
 @dataclass(frozen=True, kw_only=True)
 class FidelityRecord(StudyRecord):
-    """Hold the variants of a scene at the same points, all compared with the first of them, the reference.
+    """The variants of a scene at the same points, all compared with the first of them, the reference.
 
     `spread` is the 5th to 95th percentile of the reference's losses [`loss_unit`], None where they are all equal;
-    `reference_failed` counts points that are left out, as the reference fails there.
+    `reference_failed` counts points that are left out because the reference fails there.
     """
 
     kind: ClassVar[str] = "fidelity"
@@ -96,12 +96,12 @@ class FidelityRecord(StudyRecord):
 
     @property
     def by_time(self) -> list[MeasuredVariant]:
-        """The variants, the quickest first."""
+        """The variants, the fastest first."""
         return sorted(self.variants, key=lambda one: one.seconds)
 
     @property
     def front(self) -> list[str]:
-        """The Pareto front: the variants quicker than the reference that no other beats in both, quickest first."""
+        """The Pareto front: the variants faster than the reference that no other beats in both, fastest first."""
         rows = self.by_time
         others = rows[: [row.name for row in rows].index(self.reference)]  # a slower one is beaten by it
         errors = [math.inf if (off := row.p95(relative=False)) is None else off for row in others]
@@ -112,12 +112,12 @@ class FidelityRecord(StudyRecord):
         return next(one for one in self.variants if one.name == name)
 
     def cheapest(self, tolerance: float) -> MeasuredVariant | None:
-        """Return the quickest of the variants but the reference that is within a share of the spread, None if none."""
+        """Return the fastest variant except the reference within a share of the spread, None if none."""
         others = [row for row in self.by_time if row.name != self.reference and not row.given_up]
         return next((row for row in others if (off := row.p95(relative=True)) is not None and off <= tolerance), None)
 
     def rows(self) -> Iterator[dict[str, Any]]:
-        """Yield a row for each variant, the quickest first.
+        """Yield a row for each variant, the fastest first.
 
         Columns: `changed`; `median` and `p95`, loss errors as shares of the spread, with the ends of the latter's 95 %
         interval; `spearman`, `cosine`, `relative_error`, `diverged`; `forward` and `with_gradient` [s per episode];
@@ -131,9 +131,9 @@ class FidelityRecord(StudyRecord):
             }
 
     def sentences(self) -> list[str]:
-        """Return the orders of convergence in dt, and what was given up."""
+        """Return the orders of convergence in dt, and the abandoned variants."""
         lost = [f"{one.name} after {one.given_up} of {self.points}" for one in self.variants if one.given_up]
-        said = [f"given up, more than {OUT_OF_REACH:g} times the reference's time: {', '.join(lost)} points"]
+        said = [f"abandoned, at more than {OUT_OF_REACH:g} times the reference's time: {', '.join(lost)} points"]
         return said * bool(lost) + [
             f"error ~ dt^{fit.order:z.2f} ± {fit.standard_error:.2f}: {', '.join(fit.variants)}" for fit in self.orders
         ]
@@ -147,7 +147,7 @@ class FidelityStudy(VariantStudy):
 
     kind = "fidelity"
     takes: ClassVar[tuple[str, ...]] = ("settings",)
-    advice = "compiling kernels comes on top, minutes for taichi; --points and --settings lower it"
+    advice = "plus compiling kernels, minutes for taichi; fewer --points or --settings take less"
 
     def __init__(self, env: Environment, options: StudyOptions) -> None:
         super().__init__(env, options)
@@ -160,7 +160,7 @@ class FidelityStudy(VariantStudy):
 
     @property
     def variants(self) -> list[Variant]:
-        """The reference, the named fidelities, and what is changed of them."""
+        """The reference, the named fidelities, and their changes."""
         return self._variants
 
     def measure(self, variant: Variant, follow: Follow) -> Mapping[str, Any]:
@@ -178,13 +178,13 @@ class FidelityStudy(VariantStudy):
         return Expected(variant.name, env, len(self.x), partial(samples.repeat_seconds, env, len(self.x)))
 
     def run(self, watch: Watch, provenance: Mapping[str, Any], command: str) -> FidelityRecord:
-        """Measure what is missing and return the record."""
+        """Measure the missing parts and return the record."""
         with sparing_collections():
             found = self._time_in_turn(samples_of(self.measure_all(watch)), watch)
         return self.conclude(found, provenance, command)
 
     def _time_in_turn(self, found: Mapping[str, Sample], watch: Watch) -> dict[str, Sample]:
-        """Time quick variants again, all in each turn, so that what else keeps the machine busy hits not one alone."""
+        """Time fast variants again, all in each turn, so that other load on the machine affects all of them."""
         kept, quick = self.checkpoint.load(IN_TURN), [one for one in self.variants if self._is_quick(found, one)]
         names, times = [one.name for one in quick], ("forward", "with_gradient")
         if kept is None or kept["names"].tolist() != names:
@@ -203,7 +203,7 @@ class FidelityStudy(VariantStudy):
         return variant.device == "cpu" and variant.name in found and found[variant.name].quick
 
     def _remade(self, variant: Variant) -> Environment:
-        """Return the environment that was measured, which is made again where an earlier process has done that."""
+        """Return the measured environment, made again if an earlier process measured it."""
         if variant.name not in self._made:
             self._made[variant.name] = self._make(variant)
         return self._made[variant.name]
@@ -240,11 +240,11 @@ class FidelityStudy(VariantStudy):
 
 
 def list_variants(env: Environment, settings: Sequence[str]) -> list[Variant]:
-    """Return the variants of a scene, the reference first, without those that only bear another name.
+    """Return the variants of a scene, the reference first, without duplicates under other names.
 
-    `env` is the reference, the last of the named fidelities: each of them is a variant, with its engine, device and
-    options, and all settings are changed of the others, but precision and device of the reference too. Raises
-    ValueError for a setting that there is not.
+    `env` is the reference, the last of the named fidelities. Each named fidelity is a variant, with its engine, device
+    and options. All settings of the others are changed, and precision and device of the reference too. Raises
+    ValueError for an unknown setting.
     """
     refuse_settings(settings, SETTINGS)
     named = Variant.all_named(env)
@@ -272,9 +272,9 @@ def _changes(base: Variant, setting: str, env: Environment) -> Iterator[Variant]
 
 
 def fit_orders(variants: tuple[MeasuredVariant, ...]) -> tuple[ConvergenceOrder, ...]:
-    """Fit the order of convergence in dt of the variants that differ in it, and in precision at most, from the first.
+    """Fit the order of convergence in dt of the variants that differ from the first in it, and at most in precision.
 
-    With another resolution the errors would level off at that of the resolution.
+    With another resolution the errors would level off at the error of the resolution.
     """
     reference, found = variants[0], list[ConvergenceOrder]()
     for precision in ("float32", "float64"):

@@ -1,4 +1,4 @@
-"""Measured studies that other verbs read: the user's own, and those that are shipped with the gallery."""
+"""Stored studies for other commands: the user's own, and those shipped with the gallery."""
 
 from __future__ import annotations
 
@@ -28,27 +28,27 @@ DEVICES = ("cpu", "cuda")
 
 
 def keep(found: StudyRecord) -> Path | None:
-    """Keep a study in the user's data folder, which replaces an earlier one of the same settings.
+    """Store a study in the user's data folder; it replaces an earlier one with the same settings.
 
-    None where other verbs have no use for it, or nothing says when its scene has changed.
+    None where no other command uses it, or changes of its scene cannot be detected.
     """
     kept = found.to_keep()
     if kept is None:
         return None
     settings = digest([kept.identity[name] for name in kept.kept_by])
     path = own_folder() / file_name(kept.env, kept.device, kept.kind, settings)
-    with moved_by("XDG_DATA_HOME", "what was measured"):
+    with moved_by("XDG_DATA_HOME", "the measurements"):
         write_record(path, to_json(kept))
     return path
 
 
 def file_name(env: str, device: str, kind: str, of: str = "") -> str:
-    """Return what the file of a study is called, with a digest of its settings unless it is the only one."""
+    """Return the file name of a study, with a digest of its settings unless it is the only one."""
     return f"{env}-{device}{f'-{of}' if of else ''}.{kind}.json"
 
 
 def read_study(path: Path, kind: str) -> StudyRecord:
-    """Return the study of a kind in a file. Raises DamagedError for what is none."""
+    """Return the study of a kind in a file. Raises DamagedError for an invalid file."""
     env = re.split(r"-(?:cpu|cuda)\b", path.name)[0]
     with reading(path, f"delete it, and `landscape study {kind} {env}` measures it again"):
         found = read_json(path)
@@ -61,7 +61,7 @@ def read_study(path: Path, kind: str) -> StudyRecord:
 
 
 def kept_studies(kind: type[Record], env: str) -> Iterator[tuple[Path, Record]]:
-    """Yield the studies of a kind that are kept of a scene, the user's own before the gallery's."""
+    """Yield the stored studies of a kind for a scene, the user's own before the gallery's."""
     for folder in (own_folder(), Path(str(resources.files("gradscape.gallery"))) / "data" / STUDIES):
         for device in DEVICES:
             for path in sorted(folder.glob(f"{env}-{device}*.{kind.kind}.json")):
@@ -69,9 +69,9 @@ def kept_studies(kind: type[Record], env: str) -> Iterator[tuple[Path, Record]]:
 
 
 def find_fidelity(env: Environment, device: str) -> tuple[FidelityRecord, Path] | None:
-    """Return the study of fidelities that is kept of a scene with the same options, and its file.
+    """Return the stored study of fidelities of a scene with the same options, and its file.
 
-    One of the device is preferred among the user's own, and then among the gallery's.
+    One of the same device is preferred among the user's own, and then among the gallery's.
     """
     from .fidelity import FidelityRecord
 
@@ -86,7 +86,7 @@ def find_fidelity(env: Environment, device: str) -> tuple[FidelityRecord, Path] 
 
 
 def find_convergence(of: FidelityRecord) -> ConvergenceRecord | None:
-    """Return the study of convergence that is kept of the same scene and model as a study of fidelities."""
+    """Return the stored study of convergence with the same scene and model as a study of fidelities."""
     from .convergence import ConvergenceRecord
 
     same = ("engine", "options", MODEL_VERSION)
@@ -99,7 +99,7 @@ def find_convergence(of: FidelityRecord) -> ConvergenceRecord | None:
 
 
 def describe_margins(env: Environment) -> list[str]:
-    """Return a line for each kept study of a scene's extremes with these options: its step against its limit."""
+    """Return a line for each stored study of a scene's extremes with these options: its step and the limit."""
     from .extremes import ExtremesRecord
 
     said, seen = list[str](), set[str]()

@@ -1,9 +1,9 @@
 """The study `mixed`: what draft and standard should be, by a search in which all settings change together.
 
-It looks for the cheapest variant that keeps what a fidelity's name promises. From the named fidelities on, the front is
-walked: the neighbours of its members are measured, those of the member next to a claim's limit first, until no
-neighbour of any member is left. On a CPU a variant is first tried at a few points, and given up where it fails or is
-surely beaten there.
+It searches for the cheapest variant that keeps the claim of a fidelity's name. Starting at the named fidelities, it
+walks along the front. The neighbours of its members are measured, beginning with the member closest to a claim's limit,
+until no member has an unmeasured neighbour. On a CPU a variant is first tried at a few points, and abandoned where it
+fails or is certainly beaten there.
 """
 
 from __future__ import annotations
@@ -46,13 +46,13 @@ Costs = dict[str, dict[str, float]]
 
 @dataclass(frozen=True, kw_only=True)
 class MixedRecord(StudyRecord):
-    """Hold a search of the front on mixed variants, and what is chosen from it.
+    """A search of the front on mixed variants, and the choices from it.
 
-    `measured` holds the variants that were measured at all points, `dismissed` those that were given up after the first
-    points, and why. `choices` are among variants with the scene's own options, `with_options` those that another
-    option would make cheaper or nearer. `cost_device` is where a claim's costs count, by its name; `lines` are of
-    Python. The search is `complete` where no neighbour of the front was left; else it ended after `time_limit` seconds.
-    Where the motion is `chaotic`, gradients are no criterion.
+    `measured` are the variants measured at all points, `dismissed` those abandoned after the first points, with the
+    reason. `choices` are among variants with the scene's own options, `with_options` those that another option would
+    make cheaper or more accurate. `cost_device` is the device of a claim's costs, by its name; `lines` are of Python.
+    `complete`: no neighbour of the front was left; otherwise the search ended after `time_limit` seconds. If the motion
+    is `chaotic`, gradients are no criterion.
     """
 
     kind: ClassVar[str] = MIXED
@@ -71,7 +71,7 @@ class MixedRecord(StudyRecord):
     chaotic: bool
 
     def to_keep(self) -> StudyRecord | None:
-        """Return what was measured of the variants."""
+        """Return the measurements of the variants."""
         return self.measured.to_keep()
 
     def variant(self, name: str) -> MeasuredVariant:
@@ -79,11 +79,11 @@ class MixedRecord(StudyRecord):
         return self.measured.variant(name)
 
     def rows(self) -> Iterator[dict[str, Any]]:
-        """Yield two rows for each claim: the variant that bears its name `today`, and the one `chosen`.
+        """Yield two rows for each claim: the variant with its name `today`, and the one `chosen`.
 
         Columns: `variant`; `rank`, `cosine` and `error`, the 95th percentile of loss errors as a share of the spread,
         each with the ends of its 95 % interval; `seconds` per episode with gradient, on `device`; `shortfall`, the
-        largest lack as a ratio to what the claim allows, and `kept`, whether that is at most 1.
+        largest shortfall relative to the claim's limit, and `kept`, whether that is at most 1.
         """
         for one in self.choices:
             yield from self._rows(one)
@@ -104,11 +104,11 @@ class MixedRecord(StudyRecord):
 
     @property
     def chosen(self) -> dict[str, str]:
-        """The chosen variants, by the names of fidelities that should be theirs."""
+        """The chosen variants, by the names of their fidelities."""
         return {one.claim.name: one.variant for one in self.choices if one.variant is not None}
 
     def sentences(self) -> list[str]:
-        """Say how the variants were chosen, what was not found, and the lines of Python."""
+        """Describe the choice of the variants, the missing ones, and the lines of Python."""
         said = [self._sentence(one) for one in self.choices]
         own = self.identity["options"]
         for one in self.with_options:
@@ -117,7 +117,7 @@ class MixedRecord(StudyRecord):
             said.append(f"with {others} {one.claim.name} would be {one.variant}, {1e3 * (one.seconds or 0):.3g} ms")
         if self.chaotic:
             said.append("the motion is chaotic: gradients are no criterion")
-        end = "no neighbour of the front is left" if self.complete else f"its {self.time_limit:g} s are spent"
+        end = "no neighbour of the front is left" if self.complete else f"its limit is {self.time_limit:g} s"
         return [*said, f"the search ended after {self.spent:.3g} s: {end}", *self.lines]
 
     def _sentence(self, one: Choice) -> str:
@@ -126,25 +126,26 @@ class MixedRecord(StudyRecord):
         what = f"{claim.name} ({wanted}95 % error {claim.error:.0%}; ms on {device})"
         within = f"{self.max_cost:g} times today's cost"
         if one.variant is None:
-            return f"{what}: no variant within {within} answers at every point"
+            return f"{what}: no variant within {within} succeeds at every point"
         if one.kept:
             return f"{what}: the cheapest that keeps it; {one.candidates} variants are within {within}"
         return (
-            f"{what}: none of {one.candidates} within {within} keeps it, so the nearest; it lacks most in {one.lacking}"
+            f"{what}: none of {one.candidates} within {within} keeps it, so this is the nearest; its largest "
+            f"shortfall is in {one.lacking}"
         )
 
 
 class MixedStudy(FidelityStudy):
-    """A search of the front of a scene's variants in which several settings change together.
+    """Search the front of a scene's variants in which several settings change together.
 
-    Nothing is measured that should cost more than `max_cost` times what standard does, and nothing more once measuring
-    took `time_limit` seconds.
+    A variant expected to cost more than `max_cost` times standard is not measured, and nothing is measured after
+    `time_limit` seconds.
     """
 
     kind = MIXED
     describe_kept = Study.describe_kept  # nobody knows how many there will be
     takes = ("max_cost", "time_limit", "chaotic")
-    advice = "and then a search among their neighbours, of --time-limit seconds at most"
+    advice = "plus a search among their neighbours, of at most --time-limit seconds"
 
     def __init__(self, env: Environment, options: StudyOptions) -> None:
         self.max_cost = read_positive("--max-cost", options.max_cost, MAX_COST)
@@ -162,12 +163,12 @@ class MixedStudy(FidelityStudy):
         return [Variant.of(self.env), *(named_variant(self.env, claim) for claim in CLAIMS)]
 
     def identity(self) -> dict[str, Any]:
-        """Return what decides the numbers."""
+        """Return the settings that decide the numbers."""
         limits = {"max_cost": self.max_cost, "time_limit": self.time_limit, "chaotic": self.chaotic}
         return {**super().identity(), **limits}
 
     def run(self, watch: Watch, provenance: Mapping[str, Any], command: str) -> MixedRecord:  # type: ignore[override]
-        """Measure what is missing, the reference and the named fidelities first, and return the record.
+        """Measure the missing parts, the reference and the named fidelities first, and return the record.
 
         Raises ValueError where a named fidelity cannot be measured.
         """
@@ -198,12 +199,12 @@ class MixedStudy(FidelityStudy):
 
     @property
     def spent(self) -> float:
-        """How long the variants took that the search has measured so far [s], in all runs of it."""
+        """Time of the variants measured by the search so far [s], in all its runs."""
         return sum(self.took.values())
 
     @property
     def _measured(self) -> list[MeasuredVariant]:
-        """What is measured of all variants but the reference."""
+        """The measurements of all variants but the reference."""
         return [self.rows[variant.name] for variant in self.variants[1:]]
 
     def _measure_named(self, variant: Variant, say: Callable[[str], None]) -> None:
@@ -224,12 +225,12 @@ class MixedStudy(FidelityStudy):
                 if self.spent >= self.time_limit:
                     return False
                 seen.add(variant.key())
-                say(f"{len(self.samples)} measured, {len(self.dismissed)} given up; {variant.name}")
+                say(f"{len(self.samples)} measured, {len(self.dismissed)} abandoned; {variant.name}")
                 self._try(variant)
         return True
 
     def _ahead(self, seen: set[tuple[Any, ...]]) -> list[Variant]:
-        """Return what to measure next: the affordable neighbours of the front's member next to a claim's limit."""
+        """Return the variants to measure next: affordable neighbours of the member closest to a claim's limit."""
         found = {variant.name: variant for variant in self.variants[1:]}
         limit = self.max_cost * self.rows["standard"].seconds
         members = self._members()
@@ -262,7 +263,7 @@ class MixedStudy(FidelityStudy):
         return next(variant for variant in self.variants if variant.name == name)
 
     def _work(self, variant: Variant) -> float:
-        """Return what an episode of a variant is expected to cost, infinitely much where the scene refuses it."""
+        """Return the expected cost of an episode of a variant, infinite where the scene refuses it."""
         if variant.key() not in self.works:
             self.works[variant.key()] = math.inf
             with self.refusing(variant.name):
@@ -270,7 +271,7 @@ class MixedStudy(FidelityStudy):
         return self.works[variant.key()]
 
     def _try(self, variant: Variant) -> None:
-        """Measure a variant at a few points, and if it is worth it at the others."""
+        """Measure a variant at a few points, and if it is promising at the others."""
         few = len(self.x) if self.env.device == "cuda" else min(FIRST_POINTS, len(self.x))
         sample = self._load(variant) or self._take(variant, self.x[:few])
         if sample is not None and len(sample.loss) < len(self.x):
@@ -283,7 +284,7 @@ class MixedStudy(FidelityStudy):
             self._accept(variant, sample)
 
     def _hopeless(self, variant: Variant, sample: Sample) -> str:
-        """Say why a variant is given up after its first points, nothing where it is not."""
+        """Explain why a variant is abandoned after its first points, empty where it is not."""
         points = len(sample.loss)
         row = self.compare(variant, sample, self._reference.first(points))
         if (failed := row.comparison.diverged) != 0:
@@ -295,11 +296,11 @@ class MixedStudy(FidelityStudy):
             and (self._has_own_options(one) or not self._has_own_options(variant))
         ]
         if surely_beaten(row, others, chaotic=self.chaotic):
-            return f"quicker ones are surely nearer at {points} points"
+            return f"faster ones are certainly closer at {points} points"
         return ""
 
     def _begun(self, variant: Variant, points: int) -> MeasuredVariant:
-        """Return what is known of a measured variant from its first points alone."""
+        """Return the results of a measured variant at its first points alone."""
         if variant.name not in self.begun:
             sample = self.samples[variant.name].first(points)
             self.begun[variant.name] = self.compare(variant, sample, self._reference.first(points))
@@ -316,7 +317,7 @@ class MixedStudy(FidelityStudy):
         return Sample.of_arrays(arrays)
 
     def _take(self, variant: Variant, x: Tensor, before: Sample | None = None) -> Sample | None:
-        """Measure a variant at some of the points, and keep that with those `before`; None where that cannot be."""
+        """Measure a variant at some of the points, and store that with those `before`; None if impossible."""
         started, sample = time.perf_counter(), None
         free_memory()
         with self.refusing(variant.name):
@@ -333,9 +334,9 @@ class MixedStudy(FidelityStudy):
         self.rows[variant.name] = self.compare(variant, sample, self._reference)
 
     def _costs(self) -> Costs:
-        """Return what counts as cost for each claim: standard's is that of the device, a draft's that of a CPU.
+        """Return the cost for each claim: standard's is that of the device, a draft's that of a CPU.
 
-        On a GPU a draft's is the work of an episode, in the seconds of today's draft there.
+        On a GPU a draft's cost is the work of an episode, in the seconds of today's draft there.
         """
         here = {name: row.seconds for name, row in self.rows.items()}
         if self.env.device == "cpu":
@@ -345,14 +346,14 @@ class MixedStudy(FidelityStudy):
         return {"draft": {name: rate * count for name, count in work.items()}, "standard": here}
 
     def _time_again(self, say: Callable[[str], None]) -> None:
-        """Time those in turn that may be chosen, and the named ones, so that no busy moment decides between them."""
+        """Time the candidates and the named variants in turn, so that no busy moment decides between them."""
         names = sorted({name for claim in CLAIMS for name in self._contenders(claim, self._costs())})
         for name, seconds in self._keep_seconds(TIMED_AGAIN, names, lambda: self._rounds(names, say)).items():
             sample = self.samples[name]
             self._accept(self._named(name), replace(sample, with_gradient=min(seconds, sample.with_gradient)))
 
     def _contenders(self, claim: Claim, costs: Costs) -> list[str]:
-        """Return the named variants and those that keep a claim at about the least cost."""
+        """Return the named variants and those that keep a claim at about the lowest cost."""
         kept = {
             name: costs[claim.name][name]
             for name, row in self.rows.items()
@@ -382,7 +383,7 @@ class MixedStudy(FidelityStudy):
     def _keep_seconds(
         self, part: str, names: Sequence[str], time_them: Callable[[], dict[str, float]]
     ) -> dict[str, float]:
-        """Return the seconds of variants by name that a part keeps; they are timed where it is of others."""
+        """Return the stored seconds of variants by name; they are timed again if the part is for others."""
         arrays = self.checkpoint.load(part)
         if arrays is not None and set(map(str, arrays["names"])) == set(names):
             return dict(zip(map(str, arrays["names"]), map(float, arrays["seconds"]), strict=True))
@@ -391,9 +392,9 @@ class MixedStudy(FidelityStudy):
         return found
 
     def _final_costs(self, say: Callable[[str], None]) -> Costs:
-        """Return the costs that decide: a draft's, measured on a GPU, are timed on the CPU of those that may be it.
+        """Return the deciding costs: on a GPU, candidates for a draft are timed on the CPU.
 
-        Those of the others are by their work, in the seconds of today's draft on the CPU.
+        Costs of the others are their work, in the seconds of today's draft on the CPU.
         """
         costs = self._costs()
         if self.env.device == "cpu" or "cpu" not in self.env.devices:
@@ -417,10 +418,10 @@ class MixedStudy(FidelityStudy):
 
 
 def named_variant(env: Environment, claim: Claim) -> Variant:
-    """Return the variant that bears a claim's name. Raises ValueError where there is none but the reference."""
+    """Return the variant with a claim's name. Raises ValueError where there is only the reference."""
     if claim.name not in env.fidelities or claim.name == env.fidelity.name:
         raise ValueError(
-            f"a study of mixed variants is for scenes with {' and '.join(one.name for one in CLAIMS)} beside their "
+            f"a study of mixed variants needs scenes with {' and '.join(one.name for one in CLAIMS)} besides their "
             f"reference; {env.name} has {', '.join(env.fidelities)}"
         )
     return replace(Variant.of(env), name=claim.name, fidelity=env.fidelities[claim.name])
@@ -440,10 +441,10 @@ def fidelity_line(fidelity: Fidelity, name: str, control_step: float) -> str:
 
 
 def neighbours(of: Variant, standard: Variant, env: Environment) -> list[Variant]:
-    """Return the variants that differ from one in a single setting, the next value of whose grid they have.
+    """Return the variants that differ in a single setting, by one value of its grid.
 
     `env` is any environment of the scene. The values of a setting are a geometric series through that of the scene's
-    standard, so that from wherever the same values are reached it is the same variant.
+    standard, so different paths lead to the same variants.
     """
     found = [(fidelity, of.options) for fidelity in _next_fidelities(of.fidelity, standard.fidelity, env)]
     found += [(of.fidelity, options) for options in _next_options(of.options, standard.options, env)]
@@ -451,7 +452,7 @@ def neighbours(of: Variant, standard: Variant, env: Environment) -> list[Variant
 
 
 def _with_name(standard: Variant, fidelity: Fidelity, options: dict[str, Any]) -> Variant:
-    """Name a variant by its settings, which are all that it is."""
+    """Name a variant by its settings, which identify it."""
     words = [f"dt {1e3 * fidelity.dt:.4g} ms"]
     words += [f"{fidelity.resolution} cells"] if fidelity.resolution else []
     words += [f"{fidelity.particles} particles"] if fidelity.particles else []
@@ -480,7 +481,7 @@ def _next_fidelities(of: Fidelity, standard: Fidelity, env: Environment) -> Iter
 
 
 def _next_options(of: dict[str, Any], standard: dict[str, Any], env: Environment) -> Iterator[dict[str, Any]]:
-    """Yield the options of which one, that makes a scene stiff or accurate, has its next value up or down."""
+    """Yield the options in which one that makes a scene stiff or accurate has its next value up or down."""
     if option := env.contact_stiffness:
         middle = standard[option]
         ends = {"least": middle / MAX_STIFFNESS_FACTOR, "most": middle * MAX_STIFFNESS_FACTOR}
@@ -507,7 +508,7 @@ def next_values(
 
 
 def _two_digits(value: float) -> int:
-    """Round to two digits: so many steps per second fill an episode whose length is a round number."""
+    """Round to two digits, so that an episode of round length takes a whole number of steps."""
     size = 10 ** max(0, math.floor(math.log10(value)) - 1) if value >= 1 else 1
     return round(value / size) * size
 

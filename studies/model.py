@@ -1,6 +1,6 @@
-"""The study `model`: what each part of a scene's model is for.
+"""The study `model`: the effect of each part of a scene's model.
 
-Every part is changed, left out or put in, at the same points as the full model and timed in turn with it.
+Every part is changed, left out or added, at the same points as the full model and timed in turn with it.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ FULL, AGAIN, PART = "full", "full-again", "part"
 
 
 class Effect(StrEnum):
-    """Say what a part does to the landscape, in the words of its verdict."""
+    """The effect of a part on the landscape, in the words of its verdict."""
 
     NOTHING = "moves nothing beyond the noise"
     GRADIENTS = "changes gradients, not losses"
@@ -44,7 +44,7 @@ class Effect(StrEnum):
 
 
 class Price(StrEnum):
-    """Say what a changed part does to the time of an episode."""
+    """The effect of a changed part on the time of an episode."""
 
     SAVES = "saves time"
     NOTHING = "costs nothing measurable"
@@ -53,7 +53,7 @@ class Price(StrEnum):
 
 @dataclass(frozen=True)
 class Noise:
-    """Hold the full model, evaluated again with parameters moved by their last digit, against itself.
+    """The full model compared with itself, with parameters moved by their last digit.
 
     `comparison` is over all repeats; `largest` is the largest difference of losses and `digit` the last digit of the
     largest loss [loss unit], `rounding` the relative precision of the engine. A model that is not deterministic, or
@@ -67,7 +67,7 @@ class Noise:
 
     @classmethod
     def of(cls, repeats: Sample, full: Sample, *, rounding: float, seed: int) -> Noise:
-        """Compare repeats of the full model with it, point by point; those where either fails are no difference."""
+        """Compare repeats of the full model with it, point by point; failed ones are left out."""
         fine = has_loss(repeats.status) & has_loss(full.status)
         largest = np.abs(repeats.loss - full.loss)[fine].max(initial=0.0)
         digit = rounding * np.abs(full.loss)[fine].max(initial=0.0)
@@ -76,11 +76,11 @@ class Noise:
 
 @dataclass(frozen=True)
 class MeasuredPart:
-    """Hold what changing a part of the model does: `change` says how it is changed, by which `options`.
+    """The effect of changing a part of the model; `change` describes the change, by which `options`.
 
-    A `missing` part is one that the full model leaves out, and that its options put in. `moved` is the share of points
-    whose loss moves beyond the noise; `cost` and `cost_forward` are the time of an episode with and without gradient,
-    as ratios to the full model's, measured in turn with it.
+    A `missing` part is one that the full model leaves out, and its options add. `moved` is the share of points whose
+    loss changes beyond the noise. `cost` and `cost_forward` are the time of an episode with and without gradient,
+    relative to the full model's, measured in turn with it.
     """
 
     name: str
@@ -96,16 +96,16 @@ class MeasuredPart:
 
     @property
     def verdict(self) -> str:
-        """What is found of the part, in words."""
+        """The verdict on the part, in words."""
         return f"{self.effect}; {self.price}"
 
 
 @dataclass(frozen=True, kw_only=True)
 class ModelRecord(StudyRecord):
-    """Hold the parts of a scene's model at the same points, all compared with the full model at one fidelity.
+    """The parts of a scene's model at the same points, all compared with the full model at one fidelity.
 
-    `spread` is the 5th to 95th percentile of the full model's losses [`loss_unit`], None where they are all equal;
-    `failed` points are left out, it fails there; `seconds` is what an episode of it takes.
+    `spread` is the 5th to 95th percentile of the full model's losses [`loss_unit`], None where they are all equal.
+    `failed` points are left out, because the full model fails there; `seconds` is the time of its episode.
     """
 
     kind: ClassVar[str] = "model"
@@ -120,7 +120,7 @@ class ModelRecord(StudyRecord):
 
     @property
     def present(self) -> tuple[MeasuredPart, ...]:
-        """The parts that the full model has."""
+        """The parts of the full model."""
         return tuple(part for part in self.parts if not part.missing)
 
     @property
@@ -129,11 +129,11 @@ class ModelRecord(StudyRecord):
         return tuple(part for part in self.parts if part.missing)
 
     def rows(self) -> Iterator[dict[str, Any]]:
-        """Yield a row for each part, those that the model has first.
+        """Yield a row for each part, those of the model first.
 
-        Columns: `change`, `missing`; `median` and `p95`, of how far losses move as shares of the spread, with the ends
-        of the latter's 95 % interval; `moved`, the share of points beyond the noise; `spearman`, `cosine`,
-        `relative_error`, `diverged`; `cost`, the time of an episode with gradient as a ratio to the full model's, with
+        Columns: `change`, `missing`; `median` and `p95` of the loss changes as shares of the spread, with the ends of
+        the latter's 95 % interval; `moved`, the share of points beyond the noise; `spearman`, `cosine`,
+        `relative_error`, `diverged`; `cost`, the time of an episode with gradient relative to the full model's, with
         the ends of its interval; `effect` and `price`, the verdict.
         """
         for part in (*self.present, *self.missing):
@@ -155,11 +155,11 @@ class ModelStudy(VariantStudy):
     kind = "model"
     what = "models"
     about_last = False
-    advice = "compiling kernels comes on top; --points and a cheaper --fidelity lower it"
+    advice = "plus compiling kernels; fewer --points or a cheaper --fidelity take less"
 
     def __init__(self, env: Environment, options: StudyOptions) -> None:
         if not env.model_parts:
-            raise ValueError(f"{env.name} names no parts of its model; its class lists them as `model_parts`")
+            raise ValueError(f"{env.name} names no parts of its model; list them in its class as `model_parts`")
         super().__init__(env, options)
         self._parts = {part.name: part for part in env.model_parts}
         self._rounding = float(torch.finfo(getattr(torch, env.fidelity.precision)).eps)
@@ -175,23 +175,23 @@ class ModelStudy(VariantStudy):
         return [replace(own, name=FULL), replace(own, name=AGAIN), *parts]
 
     def part(self, variant: Variant) -> str:
-        """Return the name of a variant's part of the checkpoint: another change of the same part is another one."""
+        """Return the name of a variant's part of the checkpoint; another change of the same part has another name."""
         if variant.changed != PART:
             return variant.name
         return part_name("part", variant.name, dict(self._parts[variant.name].options))
 
     def _make(self, variant: Variant) -> Environment:
-        """Make the model; raises ValueError where a changed part is the full model, or the scene refuses it."""
+        """Make the model; raises ValueError where a changed part equals the full model, or the scene refuses it."""
         if variant.changed != PART:
             return self.env
         part = self._parts[variant.name]
         env = self.env.remake(**part.options)
         if env.options == self.env.options:
-            raise ValueError(f"the full model's options are those of {part.change!r} already")
+            raise ValueError(f"the full model already has the options of {part.change!r}")
         return env
 
     def measure(self, variant: Variant, follow: Follow) -> Mapping[str, Any]:
-        """Return the arrays of a model's sample, and of one with a part changed the times in turn with the full one."""
+        """Return the arrays of a model's sample, and for a changed part the times in turn with the full model."""
         if variant.changed != PART:
             x = self._moved() if variant.name == AGAIN else self.x
             return evaluate_points(self.env, x, follow, by=self.evaluates(variant)).arrays()
@@ -204,14 +204,14 @@ class ModelStudy(VariantStudy):
         return {**sample.arrays(), "batch": turns.batch, "full_seconds": turns.first, "part_seconds": turns.second}
 
     def _moved(self) -> torch.Tensor:
-        """Return the points again and again, each moved within its last digit, so that rounding goes other ways."""
+        """Return the points repeatedly, each moved within its last digit, so that rounding differs."""
         generator, box = torch.Generator().manual_seed(self.seed), self.env.space
         x = self.x.repeat(REPEATS, 1)
         moves = 2 * torch.rand(x.shape, generator=generator, dtype=torch.float64) - 1
         return torch.clamp(x + moves * self._rounding * (box.upper - box.lower), box.lower, box.upper)
 
     def _make_room(self, env: Environment) -> None:
-        """Let an environment take no more rows than are timed: two share a GPU, whose memory a solver takes whole."""
+        """Limit an environment's rows to the timed ones: two share a GPU, and a solver takes all its memory."""
         if env.device == "cuda" and env.preferred_batch > self._timed_rows:
             env.shrink(self._timed_rows)
 
@@ -226,7 +226,7 @@ class ModelStudy(VariantStudy):
         return Expected(variant.name, env, len(self.x) + timed, lambda each: samples.MIN_SECONDS)
 
     def run(self, watch: Watch, provenance: Mapping[str, Any], command: str) -> ModelRecord:
-        """Measure what is missing and return the record. Raises ValueError where the full model cannot be measured."""
+        """Measure the missing parts and return the record. Raises ValueError where the full model cannot be run."""
         arrays = self.measure_all(watch)
         if AGAIN not in arrays:
             raise ValueError(f"{self.env.name} cannot be repeated: {self.refused[AGAIN]}")
@@ -271,19 +271,19 @@ class ModelStudy(VariantStudy):
 
 
 def share_moved(part: Sample, full: Sample, noise: Noise) -> float | None:
-    """Return the share of points whose loss moves by more than twice the largest noise; None without points."""
+    """Return the share of points whose loss changes by more than twice the largest noise; None without points."""
     fine = has_loss(part.status) & has_loss(full.status)
     limit = NOISE_FACTOR * max(noise.largest, noise.digit)
     return float((np.abs(part.loss - full.loss)[fine] > limit).mean()) if fine.any() else None
 
 
 def judge_effect(found: Comparison, noise: Noise, moved: float | None) -> Effect:
-    """Say by fixed rules what a part does.
+    """Return the effect of a part, by fixed rules.
 
-    It fails where more than one point in twenty fails. It moves losses where one of them moves by more than twice the
-    largest noise, or their median or 95th percentile by more than twice that of the noise; and their order where the
-    rank correlation is below 0.99 and below the interval of the noise's own. It moves gradients where their median
-    relative error is more than twice the noise's, or where more than one point in twenty has lost its own.
+    It fails where more than one point in twenty fails. It changes losses where one of them changes by more than twice
+    the largest noise, or their median or 95th percentile by more than twice that of the noise. It changes their order
+    where the rank correlation is below 0.99 and below the interval of the noise's own. It changes gradients where their
+    median relative error is more than twice the noise's, or where more than one point in twenty has lost its own.
     """
     if found.diverged is None or round(found.diverged, 9) > FAILING_SHARE:
         return Effect.FAILURE
@@ -308,7 +308,7 @@ def _size(found: Bootstrap) -> float:
 
 
 def judge_price(cost: Bootstrap) -> Price:
-    """Say whether the interval of a ratio of times excludes 1."""
+    """Return whether the interval of a ratio of times excludes 1."""
     if cost.high is not None and cost.high < 1:
         return Price.SAVES
     return Price.COSTS if cost.low is not None and cost.low > 1 else Price.NOTHING

@@ -1,7 +1,7 @@
-"""The order of convergence of losses as one setting is refined, their limit, and the floor they do not fall below.
+"""The order of convergence of losses as one setting is refined, their limit, and the floor of their differences.
 
-Levels are ordered from coarse to fine, each with a width h > 0 (a time step, the width of a cell). Where the error has
-an order p, L(h) = L + a h^p, three levels say p, and two say L (Richardson 1911). Nothing is said where they do not.
+Levels are ordered from coarse to fine, each with a width h > 0 (a time step, the width of a cell). If the error has an
+order p, L(h) = L + a h^p, three levels give p, and two give L (Richardson 1911). Otherwise there is no result.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ MIN_POINTS = 3  # points that an interval needs
 
 @dataclass(frozen=True)
 class Shapes:
-    """Count how the last two differences of points go, by their ratio R (Stern et al. 2001).
+    """Count the behaviour of the last two differences of points, by their ratio R (Stern et al. 2001).
 
     `monotone`: 0 < R < 1; `oscillating`: -1 < R < 0; `growing`: |R| at least 1; `still`: the finer one is zero.
     """
@@ -44,10 +44,10 @@ class Shapes:
 
 @dataclass(frozen=True, eq=False)
 class Order:
-    """Hold what three levels or more say of the order of convergence.
+    """The order of convergence from three levels or more.
 
     `pooled` is the order of the medians of |difference| over the points with its bootstrap interval, `per_point` the
-    order that each point's last three levels show, NaN where they show none, shape (point,).
+    order from each point's last three levels, NaN where they have none, shape (point,).
     """
 
     verdict: Verdict
@@ -59,14 +59,13 @@ class Order:
 def measure_order(widths: Sequence[float], losses: Array, *, scale: float, seed: int) -> Order:
     """Measure the order of `losses`, shape (level, point), NaN where a point failed.
 
-    Counted are the points that succeed in the finest three levels, and the levels at which these points all do. `scale`
-    is what differences are shares of, the spread of the losses. Intervals are percentile bootstraps over the points. It
-    converges where the whole interval is above zero; where all differences are rounding, it is unmoved.
-
-    Raises ValueError where the widths do not fall from level to level.
+    It uses the points that succeed in the finest three levels, and the levels at which all these points succeed.
+    `scale` is the reference of differences, the spread of the losses. Intervals are percentile bootstraps over the
+    points. Losses converge if the whole interval is above zero; if all differences are rounding, they are unmoved.
+    Raises ValueError where the widths do not decrease from level to level.
     """
     if any(fine >= coarse for coarse, fine in pairwise(widths)) or min(widths) <= 0:
-        raise ValueError(f"levels come from coarse to fine, with positive widths; got {list(widths)}")
+        raise ValueError(f"levels must go from coarse to fine, with positive widths; got {list(widths)}")
     losses = losses[:, np.isfinite(losses[-3:]).all(axis=0)]
     first = next(k for k in range(len(losses)) if np.isfinite(losses[k:]).all())
     widths, losses = widths[first:], losses[first:]
@@ -83,13 +82,13 @@ def measure_order(widths: Sequence[float], losses: Array, *, scale: float, seed:
 
 
 def point_order(widths: Sequence[float], losses: Array) -> float:
-    """Return the order that three levels of one point show, by the sizes of their two differences; NaN for none."""
+    """Return the order from three levels of one point, by the sizes of their two differences; NaN for none."""
     coarse, fine = np.abs(np.diff(losses))
     return solve_order(widths, float(coarse), float(fine))
 
 
 def solve_order(widths: Sequence[float], coarse: float, fine: float) -> float:
-    """Return p with (h0^p - h1^p) / (h1^p - h2^p) = coarse / fine, the widths' ratios being what they are.
+    """Return p with (h0^p - h1^p) / (h1^p - h2^p) = coarse / fine, for any ratios of the widths.
 
     NaN where a difference is not positive; negative where differences grow.
     """
@@ -110,8 +109,8 @@ def solve_order(widths: Sequence[float], coarse: float, fine: float) -> float:
 def fit_order(widths: Sequence[float], moves: Array) -> Array:
     """Fit the order p of moves a (h_k^p - h_k+1^p), shape (move, *batch), by least squares of logarithms.
 
-    Where all levels are as far apart, that is the slope of the moves over the widths; elsewhere the slope is corrected
-    until it stays. NaN where a move is not positive. Two moves give the order of `solve_order`.
+    With equal ratios of widths, that is the slope of the moves over the widths. Otherwise the slope is corrected until
+    it is stable. NaN where a move is not positive. Two moves give the order of `solve_order`.
     """
     steps = np.log(np.asarray(widths[:-1]) / np.asarray(widths[1:]))
     at = np.log(np.asarray(widths[:-1]))
@@ -133,15 +132,15 @@ def extrapolate(widths: Sequence[float], losses: Array, order: float) -> Array:
     Raises ValueError where the order is not positive: then there is no limit.
     """
     if not order > 0:
-        raise ValueError(f"what converges has a positive order; got {order}")
+        raise ValueError(f"extrapolation needs a positive order; got {order}")
     limits: Array = losses[-1] + (losses[-1] - losses[-2]) / np.expm1(order * math.log(widths[-2] / widths[-1]))
     return limits
 
 
 def find_floor(differences: Sequence[float | None], verdict: Verdict) -> float | None:
-    """Return the size that differences from level to level do not fall below, None where they still fall.
+    """Return the lower limit of the differences from level to level, None where they still fall.
 
-    It is the least of them, where nothing converges, or where the last two refinements together win less than a fifth.
+    It is the least of them, where nothing converges, or where the last two refinements together gain less than a fifth.
     """
     known = [one for one in differences if one is not None]
     if not known or verdict == "too few levels":
@@ -151,7 +150,7 @@ def find_floor(differences: Sequence[float | None], verdict: Verdict) -> float |
 
 
 def choose_order(verdict: Verdict, found: Bootstrap, designed: float | None) -> float | None:
-    """Return the order to extrapolate by: the designed one where the interval holds it, else the observed one.
+    """Return the order for extrapolation: the designed one where the interval contains it, else the observed one.
 
     None where nothing converges.
     """
@@ -175,7 +174,7 @@ def _log_move(order: float, step: float) -> float:
 
 
 def _bootstrap_order(widths: Sequence[float], moves: Array, seed: int) -> Bootstrap:
-    """Return the order of the medians of `moves`, shape (move, point), and of those of points drawn again."""
+    """Return the order of the medians of `moves`, shape (move, point), and those of resampled points."""
     rows = np.random.default_rng(seed).integers(moves.shape[1], size=(RESAMPLES, moves.shape[1]))
     again = fit_order(widths, np.median(moves[:, rows], axis=-1))
     value = float(fit_order(widths, np.median(moves, axis=-1)))

@@ -1,4 +1,4 @@
-"""Where the user's own measurements are kept."""
+"""The folder of the user's own measurements."""
 
 from __future__ import annotations
 
@@ -10,5 +10,5 @@ STUDIES = "studies"
 
 
 def own_folder() -> Path:
-    """Return where the user's own studies are kept."""
+    """Return the folder of the user's own studies."""
     return user_data_path("gradscape") / STUDIES

@@ -1,7 +1,7 @@
-"""The reference of a scene at the points of a study: evaluated once, and kept for every study of the same points.
+"""The reference of a scene at the points of a study: evaluated once, and stored for every study of the same points.
 
-What is kept is named after all that decides it: what the environment says of itself, the points, and the machine, whose
-seconds are kept, too. A few of its points are evaluated again before it is taken; where they differ, so are the others.
+The file name contains everything that decides it: the environment's identity, the points, and the machine, because
+seconds are stored, too. A few of its points are evaluated again before it is used; if they differ, so are the others.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ FOLDER = "references"
 def evaluate_reference(
     objective: Objective, x: Float[Tensor, "point dim"], follow: Follow, *, by: Evaluate = evaluate_parts
 ) -> Parts:
-    """Return what a reference returns at points with what an episode took: what is kept of it, or what it is now.
+    """Return a reference's results at points with the cost of an episode, stored or new.
 
-    Nothing is kept of a function, of which nothing says when it changes. Raises UnwritableError where nothing can be
-    kept.
+    Nothing is stored for a function, because its changes cannot be detected. Raises UnwritableError where nothing can
+    be stored.
     """
     if not objective.identity().get(MODEL_VERSION):
         return by(objective, x, follow)
@@ -45,25 +45,25 @@ def evaluate_reference(
         return found, float(kept["seconds"])
     found, seconds = by(objective, x, follow)
     arrays = {part: getattr(found, part).numpy() for part in ("loss", "grad", "status")}
-    with moved_by("XDG_DATA_HOME", "what was measured"):
+    with moved_by("XDG_DATA_HOME", "the measurements"):
         store.save(name, **arrays, error=np.array(found.error), seconds=np.array(seconds))
     return found, seconds
 
 
 def is_kept(objective: Objective, x: Float[Tensor, "point dim"]) -> bool:
-    """Say whether what a reference returns at points is kept."""
+    """Return whether a reference's results at points are stored."""
     store, name = _place(objective, x)
     return name in store.names()
 
 
 def _place(objective: Objective, x: Tensor) -> tuple[Checkpoint, str]:
-    """Return what holds all references, and the name of one there."""
+    """Return the folder of all references, and the name of one there."""
     of = digest([objective.identity(), x.tolist(), _machine(objective)])
     return Checkpoint(own_folder() / FOLDER), f"{objective.name}-{objective.device}-{of}"
 
 
 def _machine(objective: Objective) -> list[object]:
-    """Return what else decides how long an episode takes."""
+    """Return further settings that decide the time of an episode."""
     if objective.device == "cpu":
         return [platform.node(), objective.threads]
     from ..envs.engines.runtime import device_names
@@ -72,7 +72,7 @@ def _machine(objective: Objective) -> list[object]:
 
 
 def _verified(objective: Objective, x: Tensor, kept: Mapping[str, Any], path: Path) -> Evaluation | None:
-    """Return what is kept of a reference, None with a warning where it says other numbers now."""
+    """Return the stored results of a reference, None with a warning where its numbers differ now."""
     loss, grad, status = (torch.from_numpy(kept[part]) for part in ("loss", "grad", "status"))
     found = Evaluation(loss, grad, status, str(kept["error"]))
     try:

@@ -1,4 +1,4 @@
-"""Which remedy helps a search: descents from the same starts at the same cost, with each remedy and without."""
+"""Compare remedies for a search: descents from the same starts at the same cost, with each remedy and without."""
 
 from __future__ import annotations
 
@@ -38,14 +38,14 @@ WITHOUT = "none"  # the name of the row without a remedy
 
 @dataclass(frozen=True)
 class RemedyRow:
-    """Say how far descents get with a remedy, by the losses of the environment without it.
+    """The result of descents with a remedy, by the losses of the environment without it.
 
-    `points` is what each descent could evaluate, each of `episodes_per_point`. `reached` is the median over the starts
-    [loss unit], `better` the share of starts from which it got farther than without, and `p` that of Wilcoxon's
-    signed-rank test of this, corrected for the number of remedies (Holm 1979). `falls` are the shares of the starts at
-    which a step of `STEPS` along the gradient lowers the loss. `moved` is how far a descent with the remedy leads away
+    `points` is the number of points of each descent, each of `episodes_per_point`. `reached` is the median over the
+    starts [loss unit]. `better` is the share of starts from which it got farther than without, and `p` that of
+    Wilcoxon's signed-rank test, corrected for the number of remedies (Holm 1979). `falls` are the shares of starts
+    where a step of `STEPS` along the gradient lowers the loss. `moved` is how far a descent with the remedy leads away
     from the lowest point without it, as a share of the box in the parameter that moves most. `losses` has the end of
-    every descent. `words` are those for the landscape on the plane.
+    every descent. `words` are those of the landscape on the plane.
     """
 
     remedy: str
@@ -62,11 +62,11 @@ class RemedyRow:
 
 @dataclass(frozen=True)
 class RemedyStudy:
-    """Hold what each remedy does for descents from the same `starts`; the first row is without a remedy.
+    """The effect of each remedy on descents from the same `starts`; the first row is without a remedy.
 
-    `budget` is the episodes with gradient that a descent without a remedy could take, and `gradient_cost` what such an
-    episode costs in episodes without gradient: all rows cost the same in these. `dims` label the plane through the
-    centre of the box that `maps` are of, the losses with each remedy, and that the words are of.
+    `budget` is the number of episodes with gradient of a descent without a remedy, and `gradient_cost` the cost of such
+    an episode in episodes without gradient: all rows have the same total. `dims` are the labels of the plane through
+    the centre of the box. `maps` are the losses on it with each remedy, and the words describe them.
     """
 
     env: str
@@ -91,27 +91,27 @@ class RemedyStudy:
 
     @property
     def helpful(self) -> tuple[RemedyRow, ...]:
-        """The remedies that get descents farther beyond chance, the lowest median first."""
+        """The remedies that improve descents beyond chance, the lowest median first."""
         found = [row for row in self.rows[1:] if row.p < SIGNIFICANT and row.reached.value < self.plain.reached.value]
         return tuple(sorted(found, key=lambda row: row.reached.value))
 
     @property
     def harmful(self) -> tuple[RemedyRow, ...]:
-        """The remedies with which descents end higher beyond chance."""
+        """The remedies that worsen descents beyond chance."""
         return tuple(
             row for row in self.rows[1:] if row.p < SIGNIFICANT and row.reached.value > self.plain.reached.value
         )
 
     @property
     def sentence(self) -> str:
-        """Say which remedy helps and by how much, or that none does."""
+        """Name the helpful remedy and its gain, or say that there is none."""
         unit = f" {self.loss_unit}" if self.loss_unit else ""
         without = f"{_median(self.plain)}{unit} without"
         if not self.helpful:
             tried = len(self.rows) - 1
-            return f"none of the {tried} remedies gets descents farther beyond chance: they reach {without}"
+            return f"none of the {tried} remedies improves descents beyond chance: descents reach {without} one"
         best = self.helpful[0]
-        said = f"{best.remedy} helps: descents reach {_median(best)}{unit}, and {without} (p = {best.p:.2g})"
+        said = f"{best.remedy} helps: descents reach {_median(best)}{unit}, against {without} (p = {best.p:.2g})"
         return f"{said}; the minimum moves by {best.moved:.1%} of the box"
 
     def plot(self, *, width: float | None = None) -> Picture:
@@ -127,7 +127,7 @@ def _median(row: RemedyRow) -> str:
 
 
 def candidates(env: Environment) -> list[str]:
-    """Return the remedies that an environment can take, as the command line spells them, in several strengths."""
+    """Return the possible remedies of an environment, in the command line's spelling, in several strengths."""
     found = [f"smooth:{100 * width:g}%" for width in WIDTHS]
     found += ["smooth:2%:first", "smooth:2%:zeroth", f"clip:{_typical_gradient(env):.3g}"]
     found += ["average"] if env.replicas() else []
@@ -139,7 +139,7 @@ def candidates(env: Environment) -> list[str]:
 
 
 def _typical_gradient(env: Environment) -> float:
-    """Return the median length of gradients that are not zero but for rounding [loss unit per side of the box]."""
+    """Return the median length of gradients above rounding [loss unit per side of the box]."""
     found = evaluate(env, env.space.sobol(32, seed=1), grad=True)
     assert found.grad is not None  # as it was asked for
     sizes = (found.grad * (env.space.upper - env.space.lower)).norm(dim=1)
@@ -149,7 +149,7 @@ def _typical_gradient(env: Environment) -> float:
 
 @dataclass(frozen=True)
 class Ends:
-    """Hold where descents ended: points of the environment without a remedy and its losses there."""
+    """The ends of descents: points of the environment without a remedy and its losses there."""
 
     x: Float[Tensor, "start dim"]
     loss: Float[Tensor, " start"]
@@ -164,7 +164,7 @@ class Ends:
 
 
 def treat(env: Environment, text: str) -> Environment:
-    """Return an environment with a remedy, or as it is for the row without one."""
+    """Return an environment with a remedy, or unchanged for the row without one."""
     return env if text == WITHOUT else remedied(env, text)
 
 
@@ -180,8 +180,8 @@ def descend(
 ) -> Ends:
     """Descend from starts in the unit cube of `env` with a remedy, by L-BFGS-B, at the cost of `budget` gradients each.
 
-    A descent that ends goes on from its best point, as long as that gets it anywhere. What it found is evaluated
-    without the remedy. One more descent starts at the `lowest` point without a remedy, to see how far that moves.
+    A descent that ends continues from its best point, as long as it improves. Its result is evaluated without the
+    remedy. One more descent starts at the `lowest` point without a remedy, to see how far that moves.
     """
     cost = treated.episodes_per_point / (gradient_cost if treated.gradients_from_losses else 1.0)
     points = max(1, int(budget / cost))
@@ -202,7 +202,7 @@ def descend(
 
 
 def _rescaled(env: Environment, treated: Environment, unit: Float[Tensor, "some dim"]) -> Float[Tensor, "some dim"]:
-    """Return points of the unit cube as those of the same values with a remedy, which may change scales."""
+    """Return points of the unit cube as those with the same values with a remedy, which can change scales."""
     if treated.space.scales == env.space.scales:
         return unit
     values = env.space.to_values(env.space.from_unit(unit))
@@ -212,7 +212,7 @@ def _rescaled(env: Environment, treated: Environment, unit: Float[Tensor, "some 
 def _descent(
     env: Environment, start: Float[Tensor, " dim"], points: int, advance: Callable[[], None]
 ) -> Asking[Float[Tensor, " dim"]]:
-    """Return the best point that L-BFGS-B finds from a start with so many evaluations."""
+    """Return the best point of L-BFGS-B from a start with this many evaluations."""
     sides, left = env.space.upper - env.space.lower, points
     best, best_loss = 2 * start.numpy() - 1, np.inf
     while left:
@@ -233,7 +233,7 @@ def _descent(
 
 
 def _falls(env: Environment, treated: Environment, starts: Float[Tensor, "start dim"]) -> NDArray[np.float64]:
-    """Say whether steps along the gradients of an environment with a remedy lower the losses without it."""
+    """Return whether steps along the gradients of an environment with a remedy lower the losses without it."""
     sides = treated.space.upper - treated.space.lower
     x = treated.space.from_unit(starts)
     found = evaluate(treated, x, grad=True)
@@ -278,13 +278,13 @@ def _median_of(losses: NDArray[np.float64]) -> Estimate:
 
 
 def _share_better(losses: NDArray[np.float64], plain: NDArray[np.float64]) -> Estimate:
-    """Return the share of the starts that differ at which losses are lower."""
+    """Return the share of lower losses among the starts that differ."""
     differ = losses != plain
     return share(int((losses < plain)[differ].sum()), int(differ.sum()))
 
 
 def _signed_rank(losses: NDArray[np.float64], plain: NDArray[np.float64]) -> float:
-    """Return the two-sided p of Wilcoxon's signed-rank test of pairs; 1 where all are the same."""
+    """Return the two-sided p of Wilcoxon's signed-rank test of pairs; 1 where all are equal."""
     from scipy.stats import wilcoxon
 
     both = np.isfinite(losses) & np.isfinite(plain)

@@ -1,4 +1,4 @@
-"""Samples: what variants of a scene return at the same points, how long they take, and one held against another."""
+"""Samples: the results of a scene's variants at the same points, their times, and comparisons of two of them."""
 
 from __future__ import annotations
 
@@ -35,16 +35,16 @@ Evaluate = Callable[[Objective, Tensor, Follow], Parts]  # with gradients
 
 
 def ignore(done: int) -> None:
-    """Take no notice."""
+    """Do nothing."""
 
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """Hold what one variant returns at the points of a study, and what that costs.
+    """The results of one variant at the points of a study, and their cost.
 
-    `loss` [objective's unit], shape (point,), NaN where it failed; `grad` [loss unit / width of the box], shape
-    (point, dim); `status`, shape (point,); `forward` and `with_gradient` [s per episode], at best, in batches of
-    `batch`. Where the variant was refused `refused` says why; `error` is what the first point that raised said.
+    `loss` [objective's unit], shape (point,), NaN where it failed; `grad` [loss unit / width of the box], shape (point,
+    dim); `status`, shape (point,). `forward` and `with_gradient` [s per episode] are the best times, in batches of
+    `batch`. `refused` is the reason for a refused variant; `error` is the message of the first point that raised.
     """
 
     loss: Array
@@ -63,7 +63,7 @@ class Sample:
         return cls(found.loss.numpy(), grad.numpy(), found.status.numpy().astype(np.int8), **more)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Return what `of_arrays` takes, for a file."""
+        """Return the input of `of_arrays`, for a file."""
         return {name: np.asarray(getattr(self, name)) for name in self.__dataclass_fields__}
 
     @classmethod
@@ -74,7 +74,7 @@ class Sample:
         return cls(**known)
 
     def first(self, points: int) -> Sample:
-        """Return what it holds at the first points."""
+        """Return the results at the first points."""
         return replace(self, loss=self.loss[:points], grad=self.grad[:points], status=self.status[:points])
 
     def join(self, more: Sample) -> Sample:
@@ -90,7 +90,7 @@ class Sample:
 
     @property
     def quick(self) -> bool:
-        """Whether it was timed, and in so little time that what else kept the machine busy can have disturbed it."""
+        """Whether it was timed so briefly that other load on the machine can have disturbed it."""
         return self.forward > 0 and self.batch * self.with_gradient < DISTURBED
 
     @property
@@ -101,7 +101,7 @@ class Sample:
 
 
 def evaluate_parts(objective: Objective, x: Float[Tensor, "point dim"], follow: Follow = ignore) -> Parts:
-    """Evaluate points in the batches that an objective prefers."""
+    """Evaluate points in the objective's preferred batches."""
     objective.prepare()
     parts, each, done = list[Evaluation](), math.inf, 0
     for part in torch.split(x, objective.preferred_batch):
@@ -115,7 +115,7 @@ def evaluate_parts(objective: Objective, x: Float[Tensor, "point dim"], follow: 
 def evaluate_points(
     objective: Objective, x: Float[Tensor, "point dim"], follow: Follow = ignore, *, by: Evaluate = evaluate_parts
 ) -> Sample:
-    """Evaluate losses and gradients in the batches that an objective prefers; seconds are those of the best batch."""
+    """Evaluate losses and gradients in the objective's preferred batches; seconds are those of the best batch."""
     found, each = by(objective, x, follow)
     return Sample.of(found, objective, with_gradient=each)
 
@@ -132,8 +132,8 @@ def measure(
     """Evaluate an objective at the points of a study, then time it.
 
     Seconds are the best of repetitions, of batches as large as saves time: both take at most `patience` [s] beyond one
-    evaluation, where that is given. What takes more than `limit` [s per episode] for its first points, at best, is
-    given up there: the sample is that of these points.
+    evaluation, if that is given. A variant that takes more than `limit` [s per episode] for its first points, at best,
+    is abandoned there: the sample is that of these points.
     """
     alone = REPETITION * (1 if objective.device == "cpu" else TURNS)  # a GPU is nobody else's, and takes no turns
     repetition, largest = (alone, LARGEST) if patience is None else (patience, patience)
@@ -155,12 +155,12 @@ def measure(
 
 
 def _whole(objective: Objective) -> bool:
-    """Say whether a part of a batch takes as long as all of it."""
+    """Return whether a part of a batch takes as long as all of it."""
     return objective.device == "cuda" or objective.whole_batches
 
 
 def _slow_start(objective: Objective, x: Tensor, limit: float) -> Sample | None:
-    """Return the sample of as many points as are computed at once, if even so one takes more than `limit` [s]."""
+    """Return the sample of the first batch, if even so an episode takes more than `limit` [s]."""
     most = objective.preferred_batch if _whole(objective) else objective.threads
     found, each = evaluate_parts(objective, x[:most])
     rows = len(found.loss)
@@ -169,15 +169,15 @@ def _slow_start(objective: Objective, x: Tensor, limit: float) -> Sample | None:
 
 
 def _timed_rows(objective: Objective, full: int, each: float) -> int:
-    """Return how many of the points are timed: a batch, of which threads need no more than take long enough."""
+    """Return the number of points to time: a batch, or fewer on threads if they take long enough."""
     turns = DISTURBED / max(each, 1e-9) / objective.threads
     return full if _whole(objective) else min(full, objective.threads * max(1, math.ceil(turns)))
 
 
 def _repeat_points(objective: Objective, x: Tensor, rows: int, each: float, largest: float) -> tuple[Tensor, float]:
-    """Return the points, repeated to as many as are worth evaluating at once, and the seconds that they took.
+    """Return the points, repeated up to the useful batch size, and their seconds.
 
-    So many `rows` take `each` [s per episode]. More are tried up to what the objective prefers, or what takes `largest`
+    `rows` points take `each` [s per episode]. More are tried up to the objective's preferred number, or to `largest`
     seconds, as long as that saves time.
     """
     at_once, took = objective.preferred_batch, each * rows
@@ -191,7 +191,7 @@ def _repeat_points(objective: Objective, x: Tensor, rows: int, each: float, larg
 
 
 def repeat_seconds(objective: Objective, points: int, each: float) -> float:
-    """Estimate what timing adds to one evaluation of points that take `each` [s per episode]: `measure`, then turns."""
+    """Estimate the cost of timing beyond one evaluation of points that take `each` [s per episode]."""
     full = min(objective.preferred_batch, points)
     rows, added = _timed_rows(objective, full, each), each * full if each * full < BATCH_SECONDS else 0.0
     while each * rows < BATCH_SECONDS and rows < objective.preferred_batch:
@@ -208,7 +208,7 @@ def _repeat(x: Tensor, rows: int) -> Tensor:
 
 
 def time_again(objective: Objective, x: Float[Tensor, "point dim"], sample: Sample) -> Sample:
-    """Time a quick objective once more, as `measure` has done; seconds are the best of both."""
+    """Time a fast objective once more, as `measure` has done; seconds are the best of both."""
     batch = _repeat(x, sample.batch)
     objective.evaluate(batch, grad=True)
     known = {False: sample.forward, True: sample.with_gradient}
@@ -220,7 +220,7 @@ def time_again(objective: Objective, x: Float[Tensor, "point dim"], sample: Samp
 
 
 def _best(objective: Objective, batch: Tensor, *, grad: bool, known: float, repetition: float) -> float:
-    """Return seconds per episode, the least of repetitions; `known` is what the batch took before."""
+    """Return seconds per episode, the least of repetitions; `known` is the earlier time of the batch."""
     best, start = known, time.perf_counter()
     while not math.isfinite(best) or time.perf_counter() - start + best < repetition:
         began = time.perf_counter()
@@ -231,9 +231,9 @@ def _best(objective: Objective, batch: Tensor, *, grad: bool, known: float, repe
 
 @dataclass(frozen=True, eq=False)
 class Turns:
-    """Hold the seconds per episode of two objectives timed in turn, each without and with gradient, shape (2, round).
+    """The seconds per episode of two objectives timed in turn, each without and with gradient, shape (2, round).
 
-    `batch` is how many episodes were timed at once.
+    `batch` is the number of episodes timed at once.
     """
 
     first: Array
@@ -246,9 +246,9 @@ class Turns:
 
 
 def take_turns(first: Objective, second: Objective, x: Float[Tensor, "point dim"]) -> Turns:
-    """Time two objectives in turn at the same points, so that whatever else keeps the machine busy disturbs both alike.
+    """Time two objectives in turn at the same points, so that other load on the machine disturbs both alike.
 
-    Each round times both without gradient, then both with it; which is first changes from round to round.
+    Each round times both without gradient, then both with it; the order changes from round to round.
     """
     both = (first, second)
     batch = _timed_batch(both, x)
@@ -265,7 +265,7 @@ def take_turns(first: Objective, second: Objective, x: Float[Tensor, "point dim"
 
 
 def _timed_batch(both: tuple[Objective, Objective], x: Tensor) -> Tensor:
-    """Return as many points as take both long enough to be timed, from as many as there are threads; warm both up."""
+    """Return enough points to time, at least one per thread; warm both objectives up."""
     most = min(len(x), *(one.preferred_batch for one in both))
     whole = both[0].device == "cuda"  # takes all at once: of one point most would be launches
     rows = most if whole else min(most, max(one.threads for one in both))
@@ -279,7 +279,7 @@ def _timed_batch(both: tuple[Objective, Objective], x: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Bootstrap:
-    """Hold a number and its bootstrap interval (95 %); None where it is not finite or not defined."""
+    """A number and its bootstrap interval (95 %); None where it is not finite or not defined."""
 
     value: float | None
     low: float | None
@@ -305,7 +305,7 @@ class Bootstrap:
         return Bootstrap(*(value / whole if value is not None and whole else None for value in ends))
 
     def __str__(self) -> str:
-        """Return the number with the ends of its interval, as a sentence has it."""
+        """Return the number with the ends of its interval, for a sentence."""
         value, low, high = ("?" if end is None else f"{end:z.3g}" for end in (self.value, self.low, self.high))
         return f"{value} ({low} to {high})"
 
@@ -316,13 +316,13 @@ def interval_columns(name: str, found: Bootstrap | Estimate) -> dict[str, float 
 
 
 def percent(value: float | None) -> str:
-    """Return a share in per cent; None is what is not finite."""
-    return "more than a number can say" if value is None else f"{100 * value:.2g} %"
+    """Return a share in per cent; None means not finite."""
+    return "not finite" if value is None else f"{100 * value:.2g} %"
 
 
 @dataclass(frozen=True)
 class LossError:
-    """Hold median and 95th percentile of |loss - reference|, in the loss's unit and as shares of the losses' spread."""
+    """Median and 95th percentile of |loss - reference|, in the loss's unit and as shares of the losses' spread."""
 
     median: Bootstrap
     p95: Bootstrap
@@ -332,7 +332,7 @@ class LossError:
 
 @dataclass(frozen=True)
 class GradientError:
-    """Hold medians of gradients' cosine with the reference's, and of their relative error."""
+    """Medians of the cosine of gradients with the reference's, and of their relative error."""
 
     cosine: Bootstrap
     relative_error: Bootstrap
@@ -340,7 +340,7 @@ class GradientError:
 
 @dataclass(frozen=True)
 class Seconds:
-    """Hold what an episode takes [s], in batches."""
+    """The time of an episode [s], in batches."""
 
     forward: float
     with_gradient: float
@@ -348,12 +348,12 @@ class Seconds:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Hold a variant against the reference, at the points where that one did not fail: so many are `compared`.
+    """The comparison of a variant with the reference, at the `compared` points where the reference succeeded.
 
-    An episode that failed counts as infinitely far off, so that a percentile can be None. Where both have a loss:
-    `spearman`, rank correlation of losses; where both have a gradient, `gradient`. `diverged` is the share that failed,
-    `missing` that of the points with a loss and a reference's gradient that have none themselves, `batch` how many
-    episodes were timed at once.
+    A failed episode counts as infinitely far off, so a percentile can be None. Where both have a loss: `spearman`, rank
+    correlation of losses; where both have a gradient, `gradient`. `diverged` is the failed share. `missing` is the
+    share without a gradient among points with a loss and a reference gradient. `batch` is the number of episodes timed
+    at once.
     """
 
     loss_error: LossError
@@ -367,11 +367,11 @@ class Comparison:
 
     @property
     def failed(self) -> Estimate | None:
-        """The share that failed with its exact interval, None where nothing was compared."""
+        """The failed share with its exact interval, None where nothing was compared."""
         return None if self.diverged is None else share(round(self.diverged * self.compared), self.compared)
 
     def columns(self) -> dict[str, float | None]:
-        """Return what tables have of it: errors are shares of the spread, with the ends of 95 % intervals."""
+        """Return the columns of tables: errors are shares of the spread, with the ends of 95 % intervals."""
         return {
             "median": self.loss_error.median_relative.value,
             **interval_columns("p95", self.loss_error.p95_relative),
@@ -381,10 +381,10 @@ class Comparison:
 
 
 def compare(variant: Sample, reference: Sample, *, seed: int) -> Comparison:
-    """Hold a variant against the reference, at its first points where the variant was given up after these.
+    """Compare a variant with the reference, or only at its first points if the variant was abandoned after these.
 
-    The 95th percentile is the next larger error of the sample, not interpolated. Gradients are per width of the box;
-    they are equal where both are exactly zero, and where one is, their cosine is 0 and they are infinitely far off.
+    The 95th percentile is the next larger error of the sample, not interpolated. Gradients are per width of the box.
+    They are equal where both are exactly zero; where one is, their cosine is 0 and they are infinitely far off.
     """
     scale, reference = spread(reference), reference.first(len(variant.loss))
     known = has_loss(reference.status)
@@ -407,7 +407,7 @@ def compare(variant: Sample, reference: Sample, *, seed: int) -> Comparison:
 
 
 def spread(reference: Sample) -> float | None:
-    """Return what errors are shares of: the 5th to 95th percentile of the reference's losses; None without one."""
+    """Return the reference of errors: the 5th to 95th percentile of the reference's losses; None without one."""
     loss = reference.loss[has_loss(reference.status)]
     return loss_range(loss) or None
 
@@ -418,7 +418,7 @@ def loss_range(loss: Array) -> float:
 
 
 def pareto_front(seconds: Sequence[float], error: Sequence[float]) -> list[int]:
-    """Return the numbers of those that no other beats in both, by time; one that is not finite is beaten."""
+    """Return the numbers of those that no other beats in both, by time; non-finite ones are always beaten."""
     known = [k for k in range(len(seconds)) if np.isfinite(seconds[k]) and np.isfinite(error[k])]
     best, kept = np.inf, []
     for k in sorted(known, key=lambda k: (seconds[k], error[k])):

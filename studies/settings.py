@@ -1,4 +1,4 @@
-"""The numeric settings of a scene: what each can be set to, and the environment that makes."""
+"""The numeric settings of a scene: their possible values, and the environments with them."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ Pair = tuple[str, str]
 class Setting:
     """A numeric setting with its default, `base`, and its allowed range.
 
-    `ends` are those that are sought: largest, smallest, or both. A setting whose range begins at zero is `linear`.
+    `ends` are the directions to search: largest, smallest, or both. A setting whose range begins at zero is `linear`.
     """
 
     name: str
@@ -43,7 +43,7 @@ class Setting:
     linear: bool = False
 
     def grid(self, end: str) -> list[float]:
-        """Return what is tried towards an end, from the base on."""
+        """Return the values to try towards an end, from the base on."""
         if self.linear:
             goal = self.most if end == "largest" else self.least
             return [self.base + share * (goal - self.base) for share in (0, 0.25, 0.5, 0.75, 1)]
@@ -54,7 +54,7 @@ class Setting:
 
 @dataclass(frozen=True)
 class SceneSettings:
-    """The numeric settings of a scene at a fidelity, its `base`, and what they can be set to."""
+    """The numeric settings of a scene at a fidelity, its `base`, and their possible values."""
 
     base: Environment
     _known: dict[tuple[str, float], float] = field(default_factory=dict)
@@ -81,13 +81,13 @@ class SceneSettings:
 
     @cached_property
     def usual(self) -> list[str]:
-        """The settings that are changed unless others are named: not every option says how stiff something is."""
+        """The settings changed by default: not every option is a stiffness."""
         stiff = {self.base.contact_stiffness, *([self.base.material_range.option] if self.base.material_range else [])}
         return [name for name in self.all if name in {DT, RESOLUTION, BOX, HORIZON} | stiff]
 
     @property
     def usual_pairs(self) -> list[Pair]:
-        """The pairs that are mapped unless others are named: the step against what limits it, three at most."""
+        """The pairs mapped by default: the step against the settings that limit it, three at most."""
         if DT not in self.all:
             return []
         others = [name for name in self.usual if name not in (DT, HORIZON)]
@@ -96,26 +96,26 @@ class SceneSettings:
         return [(DT, name) for name in [*options, *(name for name in others if name in FACTORS), *last][:3]]
 
     def pick(self, names: Sequence[str]) -> list[Setting]:
-        """Return the settings of these names, or the usual ones. Raises ValueError for one that there is not."""
+        """Return the settings with these names, or the usual ones. Raises ValueError for an unknown one."""
         if unknown := [name for name in names if name not in self.all]:
             raise ValueError(f"{self.base.name} has settings {', '.join(self.all) or 'none'}; got {', '.join(unknown)}")
         return [self.all[name] for name in names or self.usual]
 
     def pick_pairs(self, pairs: Sequence[str]) -> list[Pair]:
-        """Return pairs of settings given as a:b. Raises ValueError for what is none."""
+        """Return pairs of settings given as a:b. Raises ValueError for an invalid pair."""
         found = list[Pair]()
         for pair in pairs:
             first, _, second = pair.partition(":")
             if pair != "none":
                 if not second or first == second:
-                    raise ValueError(f"--pairs takes two settings as dt:{BOX}, or none; got {pair!r}")
+                    raise ValueError(f"--pairs takes two settings, such as dt:{BOX}, or none; got {pair!r}")
                 found.append((self.pick([first])[0].name, self.pick([second])[0].name))
         return found
 
     def pick_precisions(self, names: Sequence[str]) -> list[str]:
-        """Return the precisions of these names, or all there are, the base's own first.
+        """Return the precisions with these names, or all, the base's own first.
 
-        Raises ValueError for one that there is not.
+        Raises ValueError for an unknown one.
         """
         if unknown := [name for name in names if name not in PRECISIONS]:
             raise ValueError(f"--precisions takes {', '.join(PRECISIONS)}; got {', '.join(unknown)}")
@@ -125,9 +125,9 @@ class SceneSettings:
         return [own.precision, *(one for one in PRECISIONS if one != own.precision and self._makes(one))]
 
     def make(self, values: Values, precision: str, fidelity: str | None = None) -> Environment:
-        """Make the environment of values, at the base's fidelity, or at a named one if no setting is part of that.
+        """Make the environment with these values, at the base's fidelity or a named one.
 
-        Raises ValueError where the scene refuses it.
+        A named one is only used if no setting is part of the fidelity. Raises ValueError where the scene refuses it.
         """
         own = self.base.fidelity
         if fidelity is None:
@@ -143,7 +143,7 @@ class SceneSettings:
         return env.with_horizon(values[HORIZON]) if HORIZON in values else env
 
     def axis(self, setting: Setting) -> Axis:
-        """Return what a setting is measured on."""
+        """Return the scale of a setting."""
         near = {DT: self._settle_dt, RESOLUTION: self._settle_resolution}.get(setting.name, float)
 
         def settle(value: float) -> float:
@@ -156,7 +156,7 @@ class SceneSettings:
         return Axis(settle, span=setting.most - setting.least if setting.linear else 0.0)
 
     def work(self, setting: Setting, value: float) -> float:
-        """Return how many times the work of the base an episode takes, where one setting is changed."""
+        """Return the work of an episode relative to the base, with one changed setting."""
         if setting.name in (DT, HORIZON):
             return (setting.base / value) if setting.name == DT else value / setting.base
         if setting.name != RESOLUTION:
@@ -176,7 +176,7 @@ class SceneSettings:
         return True
 
     def _option(self, name: str) -> Setting | None:
-        """Return the setting that an option is: a number above zero, or what the scene's material ranges over."""
+        """Return an option as a setting: a number above zero, or the scene's material range."""
         value, ends = getattr(self.base.options, name), self.base.material_range
         if ends is not None and ends.option == name and not ends.softest > 0:
             return Setting(name, "", value, ("largest", "smallest"), ends.softest, ends.stiffest, linear=True)
@@ -185,7 +185,7 @@ class SceneSettings:
         return Setting(name, "", value, ("largest", "smallest"), most=_most(self.base.options, name))
 
     def _settle_dt(self, dt: float) -> float:
-        """Return the nearest step of which whole ones make an episode, and a control step where controls are held."""
+        """Return the nearest step that divides an episode, and a control step where controls are constant."""
         if self.base.control_step:
             return self.base.nearest_dt(dt)
         with suppress(ValueError):  # refused: whoever tries it will say so
@@ -196,17 +196,17 @@ class SceneSettings:
         return dt
 
     def _settle_resolution(self, cells: float) -> float:
-        """Return the nearest even number of cells: some scenes take no other; the base is what it is."""
+        """Return the nearest even number of cells, which all scenes accept; the base stays."""
         base = self.base.fidelity.resolution
         return float(base) if round(cells) == base else float(max(2, 2 * round(cells / 2)))
 
 
 def values_key(values: Values) -> list[tuple[str, str]]:
-    """Return values of settings as text, in an order that does not depend on how they were made."""
+    """Return values of settings as text, in a fixed order."""
     return sorted((name, f"{value:.12g}") for name, value in values.items())
 
 
 def _most(options: Any, name: str) -> float:
-    """Return the largest number that an option takes."""
+    """Return the largest allowed value of an option."""
     (found,) = (one for one in fields(options) if one.name == name)
     return float(found.metadata.get("most") or math.inf)

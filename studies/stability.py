@@ -1,4 +1,4 @@
-"""Stability: what an objective returns at a setting, whether that is right, and up to which value it is stable."""
+"""Stability: an objective's results at a setting, whether they are right, and up to which value it is stable."""
 
 from __future__ import annotations
 
@@ -27,17 +27,17 @@ Array = NDArray[np.float64]
 
 
 def refuse(why: str) -> Sample:
-    """Return the sample of a setting that was refused."""
+    """Return the sample of a refused setting."""
     return Sample(np.zeros(0), np.zeros((0, 0)), np.zeros(0, dtype=np.int8), refused=why)
 
 
 def is_stable(sample: Sample) -> bool:
-    """Say whether all points have a finite loss and a finite gradient."""
+    """Return whether all points have a finite loss and a finite gradient."""
     return not sample.refused and bool(sample.fine.all())
 
 
 def evaluate_bound(objective: Objective, x: Float[Tensor, "point dim"], follow: Follow) -> Parts:
-    """Evaluate points in batches that the device has memory for."""
+    """Evaluate points in batches that fit into the device's memory."""
     began = time.perf_counter()
     found = MemoryBound(objective).evaluate(x, grad=True)
     return found, (time.perf_counter() - began) / len(x)
@@ -47,10 +47,10 @@ evaluate_kept = partial(evaluate_reference, by=evaluate_bound)
 
 
 def ask(objective: Objective, x: Float[Tensor, "point dim"], by: Evaluate = evaluate_bound) -> Sample:
-    """Evaluate an objective at the points of a study; whatever it raises is an answer, too.
+    """Evaluate an objective at the points of a study; an error is a result, too.
 
-    A ValueError refuses the setting, and so does too little memory for a single point, which says nothing of how the
-    setting behaves. Any other error is that of a point: points are then asked one by one.
+    A ValueError refuses the setting. So does too little memory for a single point, which shows nothing about the
+    setting. Any other error belongs to a point: points are then evaluated one by one.
     """
     try:
         found, error = _ask_together(objective, x, by)
@@ -60,7 +60,7 @@ def ask(objective: Objective, x: Float[Tensor, "point dim"], by: Evaluate = eval
 
 
 def _ask_together(objective: Objective, x: Float[Tensor, "point dim"], by: Evaluate) -> tuple[Evaluation, str]:
-    """Evaluate all points, one by one where that raises, and return what the first of them raised, too."""
+    """Evaluate all points, one by one where that raises, and return the first error, too."""
     try:
         found, _ = by(objective, x, ignore)
         return found, found.error
@@ -93,12 +93,13 @@ def _line(error: Exception) -> str:
 
 @dataclass(frozen=True)
 class Cell:
-    """Say how a setting ended: `values` of settings, in the order of their map or of a limit's one setting.
+    """The outcome of a setting: `values` of settings, in the order of their map or of a limit's one setting.
 
-    `outcome` is accurate, inaccurate or not judged where all points are fine, else the name of the commonest failure
-    (NONFINITE, ESCAPED, ERROR, NO_GRADIENT), or refused. `share` is that of the fine points; `error` the 95th
-    percentile of |loss - reference's|, as a share of the spread of the reference's losses there, over the fine points;
-    `loss` the median |loss| [objective's unit] and `slope` the largest gradient [loss unit / width of the box] of them.
+    `outcome` is accurate, inaccurate or not judged where all points are fine, else the name of the most frequent
+    failure (NONFINITE, ESCAPED, ERROR, NO_GRADIENT), or refused. `share` is that of the fine points. `error` is the
+    95th percentile of |loss - reference's|, as a share of the spread of the reference's losses there, over the fine
+    points. `loss` is their median |loss| [objective's unit] and `slope` their largest gradient [loss unit / width of
+    the box].
     """
 
     values: tuple[float, ...]
@@ -121,10 +122,10 @@ class Cell:
 
 
 def judge(values: Sequence[float], answer: Sample, reference: Sample | None, *, tolerance: float) -> Cell:
-    """Say how a setting ended, and whether its finite losses are right: compared with those of the reference there.
+    """Return the outcome of a setting, and whether its finite losses are right, compared with those of the reference.
 
-    Accurate is what is off by no more than `tolerance` of the spread in 95 % of the points. Nothing is judged where
-    there is no reference, or where that one fails at half of the points or more.
+    Losses are accurate if they are off by at most `tolerance` of the spread at 95 % of the points. There is no verdict
+    where there is no reference, or where it fails at half of the points or more.
     """
     if answer.refused:
         return Cell(tuple(values), REFUSED, 0.0, why=answer.refused)
@@ -145,8 +146,8 @@ def judge(values: Sequence[float], answer: Sample, reference: Sample | None, *, 
 def loss_error(answer: Sample, reference: Sample) -> float | None:
     """Return the 95th percentile of loss errors as a share of the spread of the reference's losses.
 
-    It is of the points at which both are fine. None where there are none, where the reference fails at half of all
-    points or more, and where its losses have no spread to measure by.
+    It uses the points where both are fine. None where there are none, where the reference fails at half of all points
+    or more, and where its losses have no spread.
     """
     if reference.refused or reference.fine.mean() <= 0.5:
         return None
@@ -160,7 +161,7 @@ def loss_error(answer: Sample, reference: Sample) -> float | None:
 
 @dataclass(frozen=True)
 class Axis:
-    """Measure a setting on a logarithmic scale, or on a linear one over a `span`; `settle` is what it can be set to."""
+    """The scale of a setting, logarithmic, or linear over a `span`; `settle` returns the nearest possible value."""
 
     settle: Callable[[float], float]
     span: float = 0.0
@@ -170,11 +171,11 @@ class Axis:
         return self.settle((a + b) / 2 if self.span else math.sqrt(a * b))
 
     def apart(self, a: float, b: float) -> float:
-        """Return how far two values are apart, as a share of the smaller one, or of the span."""
+        """Return the distance of two values, relative to the smaller one, or to the span."""
         return abs(a - b) / self.span if self.span else max(a, b) / min(a, b) - 1
 
     def spread(self, low: float, high: float, count: int) -> list[float]:
-        """Return so many values in a range, or fewer where there are none between, in ascending order."""
+        """Return this many values in a range, or fewer where there are none between, in ascending order."""
         values = np.linspace(low, high, count) if self.span else np.geomspace(low, high, count)
         return sorted({self.settle(float(value)) for value in values})
 
@@ -182,7 +183,7 @@ class Axis:
 def bisect(
     stable: float, failed: float, is_stable: Callable[[float], bool], axis: Axis, width: float
 ) -> tuple[float, float]:
-    """Return a stable and an unstable value no farther apart than a `width`, between two that are such.
+    """Return a stable and an unstable value at most a `width` apart, between two such values.
 
     It stops earlier where the setting has no value between them.
     """
@@ -197,7 +198,7 @@ def bisect(
 def bracket(values: Sequence[float], stable: Sequence[bool]) -> tuple[float | None, float | None]:
     """Return the last stable value before the first failure and that failure, each None where there is none.
 
-    `values` lead away from what is surely stable; where already the first one fails, nothing is.
+    `values` lead away from a surely stable value; if the first one already fails, no value is stable.
     """
     failed = next((at for at, fine in enumerate(stable) if not fine), None)
     if failed is None:
@@ -206,7 +207,7 @@ def bracket(values: Sequence[float], stable: Sequence[bool]) -> tuple[float | No
 
 
 def islands(values: Sequence[float], stable: Sequence[bool]) -> tuple[tuple[float, float], ...]:
-    """Return the stable stretches beyond the first failure, each by its first value and its last."""
+    """Return the stable ranges beyond the first failure, each by its first value and its last."""
     found: list[tuple[float, float]] = []
     failed = next((at for at, fine in enumerate(stable) if not fine), len(values))
     for at in range(failed, len(values)):

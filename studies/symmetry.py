@@ -1,6 +1,6 @@
-"""The study `symmetry`: how much of losses and gradients is the scene's, and how much its numerics'.
+"""The study `symmetry`: the parts of losses and gradients due to the scene, and due to its numerics.
 
-The same points are evaluated under every replica of a scene, which computes the same physics otherwise.
+The same points are evaluated under every replica of a scene, which computes the same physics differently.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ if TYPE_CHECKING:
 
 OWN, REPLICA = "the scene itself", "replica"
 HOOK = (
-    "a function takes replicas={'other grid': fn}, and a class has a method `replicas` that returns environments by "
-    "what was changed (docs/measures.md)"
+    "a function takes replicas={'other grid': fn}, and a class a method `replicas` that returns environments by the "
+    "name of the change (docs/measures.md)"
 )
 
 
 @dataclass(frozen=True)
 class MeasuredReplica:
-    """Hold one replica against the scene itself.
+    """The comparison of one replica with the scene itself.
 
     `apart` is the root mean square over points of the standard deviation between both losses, as a share of the range;
     `spearman` the rank correlation of losses; `cosine` the median of gradients' cosines, `cosine_low` their lower
@@ -52,7 +52,7 @@ class MeasuredReplica:
 
 @dataclass(frozen=True, kw_only=True)
 class SymmetryRecord(StudyRecord):
-    """Hold the replicas of a scene at the same points, each against the scene itself, and the floor of all together."""
+    """The replicas of a scene at the same points, each compared with the scene itself, and their joint floor."""
 
     kind: ClassVar[str] = "symmetry"
     read_elsewhere: ClassVar[bool] = False
@@ -74,21 +74,22 @@ class SymmetryRecord(StudyRecord):
             }
 
     def sentences(self) -> list[str]:
-        """Return the numerical floor with its intervals, and which replica is farthest away."""
+        """Return the numerical floor with its intervals, and the replica with the largest difference."""
         found = self.floor
         said = [f"{found.sentence()}{self._intervals()}"]
         known = [one for one in self.replicas if one.apart.value > 0]
         if len(known) > 1:
             farthest = max(known, key=lambda one: one.apart.value)
             said.append(
-                f"farthest from the scene itself: {farthest.name}, {percent(farthest.apart.value)} of the range"
+                f"largest difference from the scene itself: {farthest.name}, {percent(farthest.apart.value)} of the "
+                "range"
             )
         if found.failed:
-            said.append(f"{found.failed} of {self.points} points left out, where the scene or a replica fails")
+            said.append(f"{found.failed} of {self.points} points left out, because the scene or a replica fails there")
         return said
 
     def _intervals(self) -> str:
-        """Return the ends of both 95 % intervals, in brackets; nothing where points are too few."""
+        """Return the ends of both 95 % intervals, in brackets; empty where points are too few."""
         share, cosine = self.floor.share, self.floor.cosine
         if not math.isfinite(share.low):
             return ""
@@ -105,18 +106,18 @@ class SymmetryStudy(VariantStudy):
     what = "replicas"
     about_last = False
     default_points = 32
-    advice = "compiling kernels comes on top; --points and a cheaper --fidelity lower it"
+    advice = "plus compiling kernels; fewer --points or a cheaper --fidelity take less"
 
     def __init__(self, env: Environment, options: StudyOptions) -> None:
         self._replicas = {name: as_environment(one) for name, one in env.replicas().items()}
         if not self._replicas:
-            raise ValueError(f"{env.name} has no replicas, which compute the same physics otherwise: {HOOK}")
+            raise ValueError(f"{env.name} has no replicas, which compute the same physics differently: {HOOK}")
         for name, one in self._replicas.items():
             refuse_other_space(env, name, one)
         super().__init__(env, options)
 
     def identity(self) -> dict[str, Any]:
-        """Return what decides the numbers, as plain JSON; a study of other replicas is not continued."""
+        """Return the settings that decide the numbers, as plain JSON; a study of other replicas is not continued."""
         return {**super().identity(), "replicas": {name: one.identity() for name, one in self._replicas.items()}}
 
     @cached_property
@@ -136,7 +137,7 @@ class SymmetryStudy(VariantStudy):
         return Expected(variant.name, self.env, len(self.x))  # as much work, whatever a replica counts it in
 
     def run(self, watch: Watch, provenance: Mapping[str, Any], command: str) -> SymmetryRecord:
-        """Measure what is missing and return the record.
+        """Measure the missing parts and return the record.
 
         Raises ValueError where neither the scene itself nor any replica can be measured.
         """
@@ -153,12 +154,12 @@ class SymmetryStudy(VariantStudy):
 
 
 def _evaluation(sample: Sample) -> Evaluation:
-    """Return what a sample holds; its gradients are per width of the box already."""
+    """Return the content of a sample; its gradients are already per width of the box."""
     return Evaluation(torch.from_numpy(sample.loss), torch.from_numpy(sample.grad), torch.from_numpy(sample.status))
 
 
 def _measure(name: str, own: Evaluation, replica: Evaluation, seed: int) -> MeasuredReplica:
-    """Hold a replica against the scene itself."""
+    """Compare a replica with the scene itself."""
     found = floor_between(own, {name: replica}, seed=seed)
     both = (own.has_loss & replica.has_loss).numpy()
     cosines = replica_cosines(own, replica)

@@ -1,9 +1,9 @@
-"""The study `updates`: how losses are distributed after one update along the gradient, of many.
+"""The study `updates`: the distribution of losses after many single updates along the gradient.
 
-Rahn et al. 2023, "Policy optimization in a noisy neighborhood", look at returns after one update by random batches.
-Here an update follows the gradient at a point that is moved at random, which takes nothing but gradients, and each is
-held against a random step as long. Both are ours, and so is where returns are counted from: the loss at the centre of
-the box, where a policy has no weights and does nothing, or 0 for a function that is maximised.
+Rahn et al. 2023, "Policy optimization in a noisy neighborhood", examine returns after one update by random batches.
+Here an update follows the gradient at a randomly moved point, which needs nothing but gradients, and each is compared
+with a random step of the same length. Both are our choice. So is the zero of returns: the loss at the centre of the
+box, where a policy has zero weights and does nothing, or 0 for a function that is maximised.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Outcomes:
-    """Hold the losses after steps of one kind, NaN where a simulation failed.
+    """The losses after steps of one kind, NaN where a simulation failed.
 
-    `quantiles` are at 5, 25, 50, 75 and 95 %, a failure being the largest loss; `mean` is without failures. `worse` is
-    the share of steps after which the loss is larger than before, `tail` the left-tail probability, that a return is
-    below half the mode of returns: of losses above `tail_from`. Failures count as both. Where the mode is no gain, both
-    are NaN.
+    `quantiles` are at 5, 25, 50, 75 and 95 %, where a failure counts as the largest loss; `mean` is without failures.
+    `worse` is the share of steps after which the loss is larger than before. `tail` is the left-tail probability that a
+    return is below half the mode of returns, that is, a loss above `tail_from`. Failures count as both. Where the mode
+    is no gain, both are NaN.
     """
 
     name: str
@@ -57,7 +57,7 @@ class Outcomes:
 
     @classmethod
     def of(cls, name: str, losses: Array, *, before: float, zero: float) -> Outcomes:
-        """Return what steps led to, given the loss `before` them, and the loss of which the return is `zero`."""
+        """Return the outcomes of steps, from the loss `before` them, and the loss with return `zero`."""
         known, all_of = losses[np.isfinite(losses)], np.where(np.isfinite(losses), losses, np.inf)
         mode = mode_of(zero - known) if len(known) else math.nan
         tail_from = zero - DROP * mode if mode > 0 else math.nan
@@ -74,7 +74,7 @@ class Outcomes:
 
 
 def mode_of(values: Array) -> float:
-    """Return the middle of the fullest of a hundred bins, as the source's code has it."""
+    """Return the middle of the fullest of a hundred bins, as in the source's code."""
     if values.min() == values.max():
         return float(values[0])
     counts, edges = np.histogram(values, BINS)
@@ -84,12 +84,12 @@ def mode_of(values: Array) -> float:
 
 @dataclass(frozen=True, kw_only=True)
 class UpdatesRecord(StudyRecord):
-    """Hold the losses after single updates from a point, and after random steps as long.
+    """The losses after single updates from a point, and after random steps of the same length.
 
-    The point, `through`, has the loss `before`. An update is `rate` times the gradient at a point that is moved by
-    `noise` of each width of the box, and `length` long at the median [widths of the box]. Returns are `zero`, the loss
-    at the centre of the box, less the loss. `lower` is the share of pairs in which the update ends lower than the
-    random step. Of `unknown` updates the gradient failed, and `clamped` were cut off at the bounds.
+    The point, `through`, has the loss `before`. An update is `rate` times the gradient at a point moved by `noise` of
+    each width of the box, with the median `length` [widths of the box]. Returns are `zero`, the loss at the centre of
+    the box, minus the loss. `lower` is the share of pairs in which the update ends lower than the random step. For
+    `unknown` updates the gradient failed, and `clamped` were cut off at the bounds.
     """
 
     kind: ClassVar[str] = "updates"
@@ -119,38 +119,38 @@ class UpdatesRecord(StudyRecord):
             yield {"name": one.name, **intervals[0], **quantiles, **intervals[1], **intervals[2], "failed": one.failed}
 
     def sentences(self) -> list[str]:
-        """Return what an update does, what a random step does, and which of both ends lower."""
+        """Return the results of an update and of a random step, and which ends lower."""
         said = [
             f"before an update the loss is {self.before:.4g}; after it, {self.along.quantiles[2]:.4g} at the median "
             f"({self.along.quantiles[0]:.4g} to {self.along.quantiles[-1]:.4g} in nine of ten)",
             f"worse than before: {_percent(self.along.worse)} of updates, {_percent(self.random.worse)} of random "
-            "steps as long",
+            "steps of the same length",
             f"left-tail probability: {_percent(self.along.tail)}, of random steps {_percent(self.random.tail)}"
             if self.along.tail.value >= 0
-            else "left-tail probability: cannot tell, as most updates end no lower than the centre of the box is",
+            else "left-tail probability: unknown, because most updates do not end below the centre of the box",
             f"an update ends lower than a random step in {_percent(self.lower)} of pairs",
         ]
         if self.unknown:
-            said.append(f"{self.unknown} of {self.points} updates are not known, as there is no gradient")
+            said.append(f"{self.unknown} of {self.points} updates are unknown, because they have no gradient")
         if self.clamped:
             said.append(f"{self.clamped} updates were cut off at the bounds")
         return said
 
 
 class UpdatesStudy(Study):
-    """Updates from a point: gradients at points moved at random, then the losses where they lead."""
+    """Updates from a point: gradients at randomly moved points, then the losses after the updates."""
 
     kind = "updates"
     takes = ("through", "noise", "rate")
     what = "parts"
     default_points = 256
     about_last = False
-    advice = "--points lowers it"
+    advice = "fewer --points take less"
 
     def __init__(self, env: Environment, options: StudyOptions) -> None:
         if not env.has_gradient:
             raise ValueError(
-                f"{env.name} has no gradients to follow; --remedy smooth:1%:zeroth estimates some from losses"
+                f"{env.name} has no gradients to follow; estimate them from losses with --remedy smooth:1%:zeroth"
             )
         self.noise = read_positive("noise", options.noise, NOISE)
         self.rate = None if options.rate is None else read_positive("rate", options.rate, 1.0)
@@ -159,12 +159,12 @@ class UpdatesStudy(Study):
         super().__init__(env, options)
 
     def identity(self) -> dict[str, Any]:
-        """Return what decides the numbers, as plain JSON."""
+        """Return the settings that decide the numbers, as plain JSON."""
         own = {"point": self.start.tolist(), "noise": self.noise, "rate": self.rate}
         return {**super().identity(), **own}
 
     def run(self, watch: Watch, provenance: Mapping[str, Any], command: str) -> UpdatesRecord:
-        """Measure what is missing and return the record.
+        """Measure the missing parts and return the record.
 
         Raises ValueError where the point itself fails, or no gradient near it is known.
         """
@@ -203,14 +203,14 @@ class UpdatesStudy(Study):
         )  # fmt: skip
 
     def expected(self) -> Iterator[Expected]:
-        """Yield the gradients, and the losses after updates, as far as they are missing."""
+        """Yield the missing gradients, and losses after updates."""
         left = {"gradients": len(self.x) + 1, "losses": 2 * len(self.x) + 1}
         for name, episodes in left.items():
             if self.checkpoint.load(name) is None:
                 yield Expected(name, self.env, episodes)
 
     def describe_left(self) -> str:
-        """Say how much there is to measure."""
+        """Describe the remaining measurements."""
         return f"{len(self.x)} updates, {len(list(self.expected()))} of 2 parts of them to measure"
 
     def _points(self, points: int) -> Tensor:
@@ -226,14 +226,14 @@ class UpdatesStudy(Study):
         return torch.Generator().manual_seed(2 * self.seed + number)
 
     def _clamp(self, x: Float[Tensor, "step dim"]) -> tuple[Float[Tensor, "step dim"], int]:
-        """Return points within the bounds, unless those beyond mean something, and how many were beyond."""
+        """Return points within the bounds, unless the environment is defined outside, and how many were outside."""
         if self.env.beyond_box:
             return x, 0
         inside = torch.clamp(x, self.env.space.lower, self.env.space.upper)
         return inside, int((inside != x).any(dim=1).sum())
 
     def _rate(self, slope: Float[Tensor, "step dim"]) -> float:
-        """Return the rate at which updates are as long as they are by default; 1 where gradients are zero."""
+        """Return the rate at which updates have their default length; 1 where gradients are zero."""
         size = float((slope / self._widths).norm(dim=1).median())
         return LENGTH / size if size else 1.0
 
@@ -242,13 +242,13 @@ class UpdatesStudy(Study):
         return lengths
 
     def _random_steps(self, ends: Float[Tensor, "step dim"]) -> Float[Tensor, "step dim"]:
-        """Return where steps in random directions lead that are as long as the updates."""
+        """Return the ends of steps in random directions with the length of the updates."""
         drawn = torch.randn(ends.shape, generator=self._generator(1), dtype=torch.float64)
         unit = drawn / drawn.norm(dim=1, keepdim=True)
         return self._clamp(self.start + self._lengths(ends)[:, None] * self._widths * unit)[0]
 
     def _gradients(self, follow: Follow) -> dict[str, Array]:
-        """Return the loss at the point, the first, and losses and gradients at those that it is moved to."""
+        """Return the loss at the point, the first, and losses and gradients at the moved points."""
         found, _ = evaluate_parts(self.env, torch.cat([self.start[None], self.x]), follow)
         assert found.grad is not None  # as it was asked for
         return {"loss": found.loss.numpy(), "grad": found.grad.numpy()}

@@ -42,7 +42,7 @@ class Variant:
     """One way to simulate a scene: a fidelity, an engine, a device, options.
 
     `changed` is the setting that differs from a named fidelity of the same scene, whose time step is `base_dt`; "named"
-    of such a fidelity itself.
+    for such a fidelity itself.
     """
 
     name: str
@@ -55,26 +55,26 @@ class Variant:
 
     @classmethod
     def of(cls, env: Environment) -> Variant:
-        """Return the variant that an environment is."""
+        """Return the variant of an environment."""
         return cls(env.fidelity.name, "named", env.fidelity, env.engine, env.device, record_options(env.options))
 
     @classmethod
     def all_named(cls, env: Environment) -> list[Variant]:
-        """Return the variants that the named fidelities of an environment are."""
+        """Return the variants of the named fidelities of an environment."""
         own = cls.of(env)
         return [replace(own, name=name, fidelity=fidelity) for name, fidelity in env.fidelities.items()]
 
     def make(self, scene: Environment) -> Environment:
         """Make the environment of this variant of a scene.
 
-        Raises ValueError where the scene refuses it, or would round its steps to an episode of another length.
+        Raises ValueError where the scene refuses it, or would change the length of an episode by rounding its steps.
         """
         env = scene.remake(fidelity=self.fidelity, engine=self.engine, device=self.device, **self.options)
         if self.base_dt is not None and self.fidelity.dt != self.base_dt:
             longer = env.length() / env.remake(fidelity=replace(self.fidelity, dt=self.base_dt)).length()
             if abs(longer - 1) > EPISODE_ROUNDING:
                 raise ValueError(
-                    f"{env.name} cuts an episode into whole steps; with dt {self.fidelity.dt:.4g} s it would be "
+                    f"{env.name} rounds an episode to whole steps; with dt {self.fidelity.dt:.4g} s it would be "
                     f"{longer:.3g} times as long"
                 )
         return env
@@ -84,7 +84,7 @@ class Variant:
         return replace(self, name=name, changed=setting, base_dt=self.fidelity.dt, **changes)
 
     def refine(self, setting: str, what: str, **changes: Any) -> Variant:
-        """Return this variant at a changed fidelity, which is named after what is changed."""
+        """Return this variant at a changed fidelity, named after the change."""
         fidelity = replace(self.fidelity, name=f"{self.fidelity.name}-{what}", **changes)
         return self.change(fidelity.name, setting, fidelity=fidelity)
 
@@ -93,16 +93,16 @@ class Variant:
         return self.refine("dt", f"dt-x{dt / self.fidelity.dt:.3g}", dt=dt)
 
     def with_cells(self, factor: float) -> Variant:
-        """Return this variant at so many times the cells along each axis, an even number: some scenes take no other."""
+        """Return this variant with this factor on the cells along each axis, rounded to even: some scenes need that."""
         cells = self.even_cells(factor)
         return self.refine("resolution", f"resolution-{cells}", resolution=cells)
 
     def even_cells(self, factor: float) -> int:
-        """Return the even number nearest to so many times the cells along each axis."""
+        """Return the nearest even number to this factor times the cells along each axis."""
         return 2 * round(self.fidelity.resolution * factor / 2)
 
     def with_particles(self, factor: float) -> Variant:
-        """Return this variant with so many times the particles."""
+        """Return this variant with this factor on the particles."""
         changes: dict[str, float] = {"particles": round(self.fidelity.particles * factor)}
         if not self.fidelity.particles:
             changes = {"sampling": round(self.fidelity.sampling * math.cbrt(factor), 3)}
@@ -114,7 +114,7 @@ class Variant:
         return self.refine("precision", other, precision=other)
 
     def vary(self, setting: str, factors: Sequence[float], env: Environment) -> Iterator[Variant]:
-        """Yield this variant at so many times a setting of the fidelity, or in the other precision; none it lacks."""
+        """Yield this variant with a factor on a setting of its fidelity, or in the other precision, if it has it."""
         if setting == "dt" and self.fidelity.dt:
             yield from (self.with_dt(env.nearest_dt(self.fidelity.dt * factor)) for factor in factors)
         elif setting == "resolution" and self.fidelity.resolution:
@@ -125,18 +125,18 @@ class Variant:
             yield self.with_other_precision()
 
     def key(self) -> tuple[Any, ...]:
-        """Return what decides the variant's numbers."""
+        """Return the settings that decide the variant's numbers."""
         same = replace(self.fidelity, name="")
         return same, self.engine, self.device, tuple(sorted(self.options.items()))
 
 
 def expected_work(env: Environment) -> float:
-    """Return what an episode is expected to cost, in comparison with other variants of its scene."""
+    """Return the expected cost of an episode, relative to other variants of its scene."""
     return env.work().count * precision_cost(env.fidelity.precision)
 
 
 def precision_cost(precision: str) -> float:
-    """Return what a precision is expected to cost, in times what float32 does."""
+    """Return the expected cost of a precision, relative to float32."""
     return FLOAT64_COST if precision == "float64" else 1.0
 
 
@@ -149,12 +149,12 @@ def seconds_with_gradient(env: Environment) -> float:
 
 
 def refuse_single(env: Environment) -> None:
-    """Raise ValueError for a scene that has one fidelity only: nothing of it can be compared."""
+    """Raise ValueError for a scene with a single fidelity, which has nothing to compare."""
     if len(env.fidelities) < 2:
         raise ValueError(
-            f"{env.name} has one fidelity, {', '.join(env.fidelities)}, so there is nothing to compare; "
-            "name several: a function takes fidelities={'draft': {'dt': 0.02}, 'reference': {'dt': 0.001}}, and a "
-            "class has `fidelities`"
+            f"{env.name} has one fidelity, {', '.join(env.fidelities)}, so there is nothing to compare; add some: a "
+            "function takes fidelities={'draft': {'dt': 0.001}, 'reference': {'dt': 0.001}}, and a class has "
+            "`fidelities`"
         )
 
 
@@ -165,19 +165,19 @@ def refuse_settings(settings: Sequence[str], known: Sequence[str], where: str = 
 
 
 def part_name(prefix: str, name: str, key: Any) -> str:
-    """Return a name of a part of a checkpoint: of another key, which is plain JSON, it is another one."""
+    """Return the name of a part of a checkpoint, different for each key, which is plain JSON."""
     slug = re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")
     return f"{prefix}-{slug}-{digest(key)}"
 
 
 def one_line(error: BaseException) -> str:
-    """Return what an error says, on one line."""
+    """Return an error's message, on one line."""
     return " ".join(str(error).split())
 
 
 @dataclass(frozen=True)
 class Refused:
-    """Say which variant or setting the scene or its engine refused, and why."""
+    """A variant or setting that the scene or its engine refused, and why."""
 
     name: str
     why: str
@@ -185,7 +185,7 @@ class Refused:
 
 @dataclass(frozen=True, kw_only=True)
 class StudyRecord(abc.ABC):
-    """Hold what every study measured: at how many points of which scene, and what was refused.
+    """The common results of every study: the number of points, the scene, and refusals.
 
     The fields are those of the JSON file; see `landscapes.convert`.
     """
@@ -207,15 +207,15 @@ class StudyRecord(abc.ABC):
 
     @property
     def device(self) -> str:
-        """The device that was measured on."""
+        """The device of the measurement."""
         return str(self.identity["device"])
 
     @abc.abstractmethod
     def rows(self) -> Iterable[Mapping[str, Any]]:
-        """Return what was measured, a row each, in the columns of the table."""
+        """Return the measurements, a row each, in the columns of the table."""
 
     def table(self) -> pd.DataFrame:
-        """Return what was measured as a table; `rows` says which columns it has."""
+        """Return the measurements as a table; `rows` describes its columns."""
         import pandas as pd
 
         rows, index = list(self.rows()), list(self.index)
@@ -226,11 +226,11 @@ class StudyRecord(abc.ABC):
         """Return the verdicts."""
 
     def to_keep(self) -> StudyRecord | None:
-        """Return what of it is worth keeping where other verbs find it; nothing says when a function has changed."""
+        """Return the part worth storing for other commands; changes of a function cannot be detected."""
         return self if self.read_elsewhere and self.identity.get(MODEL_VERSION) else None
 
     def plot(self, width: float | None = None) -> Picture:
-        """Draw it, for a screen, or for a page so wide [mm]."""
+        """Draw it, for a screen, or for a page of this width [mm]."""
         from ..landscapes.draw.figure import figure_of
 
         return figure_of(self, width)
@@ -242,7 +242,7 @@ class StudyRecord(abc.ABC):
 
 @dataclass(frozen=True, eq=False)
 class NamedPoint:
-    """A point, and what it is called."""
+    """A point and its name."""
 
     name: str
     x: Tensor
@@ -250,7 +250,7 @@ class NamedPoint:
 
 @dataclass(frozen=True)
 class StudyOptions:
-    """What a study is asked for, as `gradscape.study` explains it; None is the default of its kind."""
+    """The options of a study, as `gradscape.study` explains them; None is the default of its kind."""
 
     points: int | None = None
     seed: int = 0
@@ -269,7 +269,7 @@ class StudyOptions:
     rate: float | None = None
 
     def given(self) -> dict[str, Any]:
-        """Return the options that are not those by default."""
+        """Return the options that differ from the defaults."""
         return {name: value for name, value in vars(self).items() if value != getattr(StudyOptions, name)}
 
 
@@ -278,9 +278,9 @@ EVERY_STUDY = ("points", "seed")  # the options that every study takes
 
 @dataclass(frozen=True)
 class Expected:
-    """Say what is left to simulate of a variant: so many `episodes` with gradient, and `repeats` to time it.
+    """The remaining simulations of a variant: `episodes` with gradient, and `repeats` to time it.
 
-    Its repeats take so long [s] where an episode takes so long [s].
+    `repeats` maps the time of an episode [s] to the time of the repeats [s].
     """
 
     name: str
@@ -290,10 +290,10 @@ class Expected:
 
 
 class Study(abc.ABC):
-    """What a kind of study measures of a scene at the points `x`, shape (point, dim).
+    """The measurements of a kind of study at the points `x`, shape (point, dim).
 
-    What is measured is kept in the `checkpoint`, so that a study can be stopped at any time. `refused` says what cannot
-    be measured, and why; `takes` are the kind's own options.
+    Results are stored in the `checkpoint`, so a study can be stopped at any time. `refused` has the reason for each
+    refused measurement; `takes` are the kind's own options.
     """
 
     kind: ClassVar[str]
@@ -302,7 +302,7 @@ class Study(abc.ABC):
     default_points: ClassVar[int] = 64
     copies: ClassVar[int] = 50  # of the points: a loss and a gradient there by every variant
     about_last: ClassVar[bool] = True  # of a scene's fidelities, or else about the one that is given
-    advice: ClassVar[str] = "compiling kernels comes on top; --points and --settings lower it"
+    advice: ClassVar[str] = "plus compiling kernels; fewer --points or --settings take less"
     checkpoint: Checkpoint
 
     def __init__(self, env: Environment, options: StudyOptions) -> None:
@@ -317,51 +317,51 @@ class Study(abc.ABC):
     def choose_fidelity(
         cls, scene: Environment | type[Environment], given: Fidelity | str | None
     ) -> Fidelity | str | None:
-        """Return the fidelity of the reference. Raises ValueError where it is the scene's last, and one is `given`."""
+        """Return the fidelity of the reference. Raises ValueError where it is the scene's last, but one is `given`."""
         if not cls.about_last:
             return given
         if given is not None:
-            raise ValueError(f"study {cls.kind} is about the last fidelity of a scene; got {given}, leave it out")
+            raise ValueError(f"study {cls.kind} examines the last fidelity of a scene; got {given}, so leave it out")
         return list(scene.fidelities)[-1]
 
     def identity(self) -> dict[str, Any]:
-        """Return what decides the numbers, as plain JSON; a study of another identity is not continued."""
+        """Return the settings that decide the numbers, as plain JSON; a study with others is not continued."""
         return {**self.env.identity(), "points": len(self.x), "seed": self.seed}
 
     def folder_parts(self) -> list[object]:
-        """Return what the study's folder is named after."""
+        """Return the parts of the name of the study's folder."""
         return [self.kind, self.env.name, len(self.x)]
 
     def open(self, folder: Path, *, force: bool = False) -> None:
-        """Continue the study in a folder, or begin it there. Raises StoreMismatchError where it holds another study."""
+        """Continue the study in a folder, or begin it there. Raises StoreMismatchError for another study."""
         self.checkpoint = Checkpoint.open(folder, self.identity(), what=f"{self.kind} study", force=force)
 
     @abc.abstractmethod
     def run(self, watch: Watch, provenance: Mapping[str, Any], command: str) -> StudyRecord:
-        """Measure what is missing and return the record. Raises ValueError where the reference cannot be measured."""
+        """Measure the missing parts and return the record. Raises ValueError where the reference cannot be measured."""
 
     @abc.abstractmethod
     def expected(self) -> Iterator[Expected]:
-        """Yield what is left to simulate."""
+        """Yield the remaining simulations."""
 
     def describe_kept(self) -> str:
-        """Say how much of it is on disk."""
+        """Describe the stored part."""
         return f"{self.checkpoint.count()} {self.what} are kept in {self.checkpoint.folder}"
 
     @abc.abstractmethod
     def describe_left(self) -> str:
-        """Say how much there is to measure."""
+        """Describe the remaining measurements."""
 
     @contextmanager
     def refusing(self, name: str) -> Iterator[None]:
-        """Note what the scene or its engine refuses, and why."""
+        """Record a refusal of the scene or its engine, and the reason."""
         try:
             yield
         except (ValueError, RuntimeError, MemoryError) as error:
             self.refused[name] = one_line(error)
 
     def about(self, provenance: Mapping[str, Any], command: str) -> dict[str, Any]:
-        """Return the fields that every record has."""
+        """Return the fields of every record."""
         return {
             **{"env": self.env.name, "points": len(self.x), "seed": self.seed, "loss_unit": self.env.loss_unit},
             "refused": tuple(Refused(name, why) for name, why in self.refused.items()),
@@ -377,15 +377,14 @@ class Study(abc.ABC):
         known = (*EVERY_STUDY, *cls.takes)
         if foreign := [name for name in options.given() if name not in known]:
             raise ValueError(
-                f"study {cls.kind} takes {', '.join(known)}; got {', '.join(foreign)}, so leave out what it does not "
-                "take"
+                f"study {cls.kind} takes {', '.join(known)}; got {', '.join(foreign)}, so leave out the others"
             )
 
 
 class VariantStudy(Study):
     """Variants of a scene, each compared with the first of them, the reference `env`.
 
-    A kind of study says which variants there are, how one is measured, and what follows from all of them.
+    A kind of study defines the variants, how to measure one, and the conclusions from all of them.
     """
 
     @property
@@ -398,18 +397,18 @@ class VariantStudy(Study):
         return variant.name
 
     def measure(self, variant: Variant, follow: Follow) -> Mapping[str, Any]:
-        """Return the arrays that are measured of a variant, and give back its memory."""
+        """Return the measured arrays of a variant, and free its memory."""
         env = self._make(variant)
         found = evaluate_points(env, self.x, follow, by=self.evaluates(variant)).arrays()
         env.release()
         return found
 
     def evaluates(self, variant: Variant) -> Evaluate:
-        """Return what evaluates a variant: the reference is kept for every study of the same points."""
+        """Return the evaluator of a variant: the reference is stored for every study of the same points."""
         return evaluate_reference if variant.name == self.variants[0].name else evaluate_parts
 
     def measure_all(self, watch: Watch) -> dict[str, dict[str, Any]]:
-        """Return the arrays of each variant that can be measured, by its name; what is kept is not measured again.
+        """Return the arrays of each measurable variant, by its name; stored ones are not measured again.
 
         Raises ValueError where the first, the reference, cannot be measured.
         """
@@ -428,7 +427,7 @@ class VariantStudy(Study):
                 with self.refusing(variant.name):
                     found[variant.name] = self.checkpoint.load_or_compute(self.part(variant), compute)
                 if number == 0 and variant.name in self.refused:
-                    raise ValueError(f"{self.env.name} has no reference to measure by: {self.refused[variant.name]}")
+                    raise ValueError(f"{self.env.name} has no reference for comparison: {self.refused[variant.name]}")
             advance(len(self.variants))
         return found
 
@@ -437,19 +436,19 @@ class VariantStudy(Study):
         return [variant for variant in self.variants if self.checkpoint.load(self.part(variant)) is None]
 
     def describe_kept(self) -> str:
-        """Say how much of it is on disk."""
+        """Describe the stored part."""
         done = len(self.variants) - len(self.left())
         return f"{done} of {len(self.variants)} {self.what} are kept in {self.checkpoint.folder}"
 
     def describe_left(self) -> str:
-        """Say how much there is to measure."""
+        """Describe the remaining measurements."""
         left = len(self.left())
-        kept = f", {len(self.variants) - left} are there already" if left < len(self.variants) else ""
-        known = f", the {self.variants[0].name} by what is kept of it" if self._is_known(self.variants[0]) else ""
+        kept = f", {len(self.variants) - left} already stored" if left < len(self.variants) else ""
+        known = f", the {self.variants[0].name} from stored results" if self._is_known(self.variants[0]) else ""
         return f"{left} {self.what} to measure{kept}{known}"
 
     def _is_known(self, variant: Variant) -> bool:
-        """Say whether a variant is the reference, and an earlier study has kept what it returns at these points."""
+        """Return whether a variant is the reference, with stored results of an earlier study at these points."""
         if variant.name != self.variants[0].name or self.checkpoint.load(self.part(variant)) is not None:
             return False
         with suppress(ValueError, RuntimeError, MemoryError):  # refused: whoever measures it will say so
@@ -457,7 +456,7 @@ class VariantStudy(Study):
         return False
 
     def expected(self) -> Iterator[Expected]:
-        """Yield the variants that are not measured yet and not refused."""
+        """Yield the variants that are neither measured nor refused."""
         for variant in self.left():
             with self.refusing(variant.name):
                 found = self._expect(variant, self._make(variant))
@@ -472,12 +471,12 @@ class VariantStudy(Study):
 
 
 def samples_of(arrays: Mapping[str, Mapping[str, Any]]) -> dict[str, Sample]:
-    """Return the samples that are measured of variants, by name."""
+    """Return the samples of measured variants, by name."""
     return {name: Sample.of_arrays(found) for name, found in arrays.items()}
 
 
 def read_positive(name: str, value: float | None, default: float) -> float:
-    """Return an option that is a positive number. Raises ValueError where it is none."""
+    """Return an option that is a positive number. Raises ValueError for anything else."""
     value = default if value is None else value
     if not 0 < value < math.inf:
         raise ValueError(f"{name} takes a positive number; got {value:g}")

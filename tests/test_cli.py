@@ -22,8 +22,8 @@ def test_a_command_alone_is_its_help(run: Run, arguments: list[str]) -> None:
 
 def test_a_word_too_few_or_too_many_says_where_to_read_on(run: Run) -> None:
     for arguments in (["slice"], ["slice", "fluid", "--dimz", "0"], ["slice", "fluid", "--resolution", "x"]):
-        assert "(`landscape slice --help` says what it takes)" in run(*arguments).stderr
-    assert "(`landscape --help` says what it takes)" in run("plot").stderr
+        assert "(see `landscape slice --help`)" in run(*arguments).stderr
+    assert "(see `landscape --help`)" in run("plot").stderr
 
 
 @pytest.mark.drawn
@@ -65,7 +65,7 @@ def test_a_device_without_memory_for_a_point_is_one_line_and_exit_code_1(
     assert last.startswith("landscape: ")
     assert "out of memory" in last
     assert "Failed to allocate 18792000 bytes" in last
-    assert last.endswith("take a lower --fidelity or another --device")
+    assert last.endswith("use a lower --fidelity or another --device")
 
 
 @pytest.mark.parametrize(("name", "text"), [("p.json", "[1.5, 2.5]"), ("p.txt", "1.5 2.5\n"), ("p.csv", "1.5,2.5\n")])
@@ -112,7 +112,7 @@ def test_bench_prints_tables(run: Run, tmp_path: Path) -> None:
     batches = [line.split()[1] for line in done.stdout.splitlines() if " warp " in line and line[2].isdigit()]
     assert batches == ["2", "4"]
     steps = round(2 / gradscape.make("bounce", device="cpu").fidelity.dt)
-    for shown in (f"{steps} body-steps", "episodes/s", "advance backward", "outside kernels", "the sampler's own"):
+    for shown in (f"{steps} body-steps", "episodes/s", "advance backward", "outside kernels", "the sampler itself"):
         assert shown in done.stdout
     assert not list(tmp_path.iterdir())
 

@@ -26,7 +26,7 @@ def test_a_report_of_several_slices_leaves_somebody_elses_alone(run: Run, tmp_pa
         (tmp_path / "mine" / name).write_text("precious")
         done = run("report branin --all --out mine")
         assert done.returncode == 2
-        done = run.refuse("report --all --out mine", said="mine/report.json is not there, damaged or of something else")
+        done = run.refuse("report --all --out mine", said="mine/report.json is missing, damaged or not a summary")
         assert (tmp_path / "mine" / name).read_text() == "precious"
 
 

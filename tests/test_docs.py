@@ -10,6 +10,7 @@ import subprocess
 import sys
 import tomllib
 from collections.abc import Iterator
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -231,6 +232,19 @@ def test_every_block_of_python_runs(
     if "throw.png" in block:
         assert 0 <= float(capsys.readouterr().out.split()[-1]) < 0.1  # the target can be hit
         assert (desk / "throw.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_every_import_of_gradscape_in_a_page_finds_its_names() -> None:
+    """Of blocks that no test runs, too."""
+    found = {tuple(one) for one in re.findall(r"^ *from (gradscape[\w.]*) import ([\w, ]+)$", TEXT, flags=re.MULTILINE)}
+    assert len(found) > 3
+    lacks = {
+        (module, name)
+        for module, names in found
+        for name in names.split(", ")
+        if not hasattr(import_module(module), name.split()[0]) and find_spec(f"{module}.{name.split()[0]}") is None
+    }
+    assert not lacks
 
 
 def test_the_two_commands_are_the_makefiles() -> None:

@@ -67,7 +67,7 @@ NAMES = ("of_torch", "of_jax", "of_numpy", "of_warp", "Bowl", "bowl", "own")
 WALKED = ("of_jax", "Own")  # by all functions and verbs; others by the functions that evaluate, keep and send them
 SHORT = ("as_environment", "make", "check", "slice", "sample", "optimize", "advise")
 LACKING = {  # what some verbs need of a simulator
-    "replay": "has no episode to draw; a class with a method `episode` has",
+    "replay": "has no episode to draw; give its class a method `episode`",
     "study": "has one fidelity, default, so there is nothing",
 }
 
@@ -246,10 +246,10 @@ def test_functions_of_a_file_have_its_names(here: Path) -> None:
 @pytest.mark.parametrize(
     ("what", "said"),
     [
-        ("doors.py:nothing", r"holds no nothing; it has of_torch, of_jax, of_numpy, of_warp, Bowl, bowl, Own, own"),
-        ("doors.py:launch", "launch is a function, and nothing says what its parameters are"),
+        ("doors.py:nothing", r"has no nothing; it has of_torch, of_jax, of_numpy, of_warp, Bowl, bowl, Own, own"),
+        ("doors.py:launch", "launch is a function without a parameter space"),
         ("doors.py:space", "ParameterSpace is no simulator: it has no space and no evaluate"),
-        ("elsewhere.py:f", "there is no file elsewhere.py to take f from"),
+        ("elsewhere.py:f", "there is no file elsewhere.py, so f cannot be loaded"),
     ],
 )
 def test_what_is_no_simulator_is_refused_in_words(what: str, said: str, here: Path) -> None:

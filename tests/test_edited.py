@@ -30,7 +30,7 @@ pytestmark = pytest.mark.e2e
 SPACE = ParameterSpace({"x": (-1, 1), "y": (-1, 1)})
 DIMS = ("x", "y")
 Loss = Callable[[Tensor], Tensor]
-BOTH = r"{} of {} whose losses are others now: \S+ then, \S+ now, at x = \(\S+, \S+\); .*--out.*--force"
+BOTH = r"{} of {} whose losses have changed: \S+ then, \S+ now, at x = \(\S+, \S+\); .*--out.*--force"
 
 
 def plain(x: Tensor) -> Tensor:
@@ -72,12 +72,12 @@ def sloped(slope: float) -> Any:
 
 CHANGES = {
     "losses": (loss_of(plain), loss_of(edited), BOTH.format("slice", "loss")),
-    "a little": (loss_of(plain), loss_of(lambda x: plain(x) * (1 + 1e-9)), "losses are others now"),
-    "gradients": (sloped(2.0), sloped(1.0), r"gradients are others now: gradient by x 2 then, 1 now"),
+    "a little": (loss_of(plain), loss_of(lambda x: plain(x) * (1 + 1e-9)), "losses have changed"),
+    "gradients": (sloped(2.0), sloped(1.0), r"gradients have changed: gradient by x 2 then, 1 now"),
     "status": (
         loss_of(lambda x: plain(x) * torch.nan),
         loss_of(plain),
-        "points end otherwise now: NONFINITE then, OK now",
+        "points end differently: NONFINITE then, OK now",
     ),
 }
 
@@ -132,7 +132,7 @@ def test_a_function_that_differs_at_every_call_goes_on_within_its_noise(tmp_path
     for seed in range(20):
         gs.slice(loss_of(noisy), DIMS, resolution=8, out=tmp_path / f"{seed}")
         gs.slice(loss_of(noisy), DIMS, resolution=8, out=tmp_path / f"{seed}")
-    with pytest.raises(StoreMismatchError, match="losses are others now"):
+    with pytest.raises(StoreMismatchError, match="losses have changed"):
         gs.slice(loss_of(lambda x: 100 * noisy(x)), DIMS, resolution=8, out=tmp_path / "0")
 
 
@@ -156,7 +156,7 @@ def test_rounding_that_a_batch_or_a_simulator_amplifies_goes_on(tmp_path: Path) 
     gs.slice(loss_of(single), DIMS, resolution=9, out=tmp_path / "single")
     gs.slice(loss_of(chaotic(0.0)), DIMS, resolution=8, out=tmp_path / "chaotic")
     gs.slice(loss_of(chaotic(2.0**-51)), DIMS, resolution=8, out=tmp_path / "chaotic")
-    with pytest.raises(StoreMismatchError, match="losses are others now"):
+    with pytest.raises(StoreMismatchError, match="losses have changed"):
         gs.slice(loss_of(chaotic(1e-4)), DIMS, resolution=8, out=tmp_path / "chaotic")
 
 
@@ -164,7 +164,7 @@ def test_workers_fill_nothing_up_that_is_another_functions(tmp_path: Path) -> No
     half(loss_of(plain), tmp_path / "cut")
     kept = bits(tmp_path / "cut")
     job = SliceJob.of(loss_of(edited), PLANE, command="", out=tmp_path / "cut")
-    with ThreadPoolExecutor(2) as executor, pytest.raises(StoreMismatchError, match="losses are others now"):
+    with ThreadPoolExecutor(2) as executor, pytest.raises(StoreMismatchError, match="losses have changed"):
         replace(job, executor=executor).run()
     assert bits(tmp_path / "cut") == kept
 
@@ -172,7 +172,7 @@ def test_workers_fill_nothing_up_that_is_another_functions(tmp_path: Path) -> No
 def test_a_report_of_a_slice_refuses_an_edited_function(tmp_path: Path) -> None:
     cut = gs.slice(loss_of(plain), DIMS, resolution=8, out=tmp_path / "cut")
     cut.report(points=2)
-    with pytest.raises(StoreMismatchError, match="losses are others now"):
+    with pytest.raises(StoreMismatchError, match="losses have changed"):
         type(cut)(cut.data, cut.folder, lambda: loss_of(edited)).report(points=2)
 
 
@@ -235,7 +235,7 @@ def test_the_same_call_after_an_edit_is_refused(tmp_path: Path, monkeypatch: pyt
     kept = {name: content for name, content in bits(out).items() if name.endswith(".npz") or ".zarr" in name}
     assert kept
     monkeypatch.setattr(Throw, "curvature", 3.0)
-    with pytest.raises(StoreMismatchError, match=r"throw whose losses are others now: \S+ then, \S+ now") as refused:
+    with pytest.raises(StoreMismatchError, match=r"throw whose losses have changed: \S+ then, \S+ now") as refused:
         STUDIES[study](out)
     assert str(out) in str(refused.value)
     assert {name: bits(out)[name] for name in kept} == kept
@@ -251,17 +251,17 @@ def overlaid(out: Path, again: bool) -> Any:
 EXTENDED: dict[str, tuple[Callable[[Path, bool], Any], str]] = {
     "run": (
         lambda out, again: gs.optimize(Throw, "descents", budget=20 if again else 6, out=out),
-        r"holds a run of throw whose losses are others now",
+        r"contains a run of throw whose losses have changed",
     ),
     "race": (
         lambda out, again: gs.race(Throw, ["random"], budget=4, seeds=2 if again else 1, out=out),
-        "losses are others now",
+        "losses have changed",
     ),
     "league": (
         lambda out, again: gs.league([Throw], ["random"], budget=4, seeds=1, out=out),
-        r"throw@draft: StoreMismatchError: .* whose losses are others now",
+        r"throw@draft: StoreMismatchError: .* whose losses have changed",
     ),
-    "overlay": (overlaid, "losses are others now"),
+    "overlay": (overlaid, "losses have changed"),
 }
 
 
@@ -287,7 +287,7 @@ def test_a_card_goes_on_with_the_same_engines_alone(tmp_path: Path, monkeypatch:
         return Evaluation(found.loss / 2, found.grad, found.status)
 
     monkeypatch.setattr(Branin, "_evaluate", halved)
-    with pytest.raises(StoreMismatchError, match="a study of branin whose losses are others now"):
+    with pytest.raises(StoreMismatchError, match="a study of branin whose losses have changed"):
         gs.card(["control"], **how)
 
 
@@ -340,6 +340,6 @@ def test_an_edit_of_what_a_class_uses_is_noticed_where_it_changes_a_number(tmp_p
         for command in commands:
             done = alone(partial(landscape, *command.split()), tmp_path)
             assert done.returncode == (2 if step == 2 else 0), done.stderr
-            assert ("are there already" in done.stderr) is (step == 1)
-            assert ("of mine whose losses are others now:" in done.stderr) is (step == 2)
+            assert ("are done already" in done.stderr) is (step == 1)
+            assert ("of mine whose losses have changed:" in done.stderr) is (step == 2)
             assert step < 2 or done.stderr.strip().count("\n") == 0

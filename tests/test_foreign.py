@@ -81,7 +81,7 @@ def test_a_class_in_a_file_is_sliced_measured_searched_and_shown(run: Run, folde
         registry.entries().pop("two-link-arm", None)  # as in another process
         run.ok(*command, cwd=folder)
     registry.entries().pop("two-link-arm")
-    run.refuse("report cut --out elsewhere", cwd=folder, said="say where it is, --env FILE.py:NAME, or env= in Python")
+    run.refuse("report cut --out elsewhere", cwd=folder, said="give --env FILE.py:NAME, or env= in Python")
 
 
 def test_a_class_in_a_file_says_what_there_is_to_say(run: Run, folder: Path) -> None:
@@ -91,7 +91,7 @@ def test_a_class_in_a_file_says_what_there_is_to_say(run: Run, folder: Path) -> 
             assert part in said
         assert "Stiffness(" not in said
         assert "differentiable scene" not in said  # what the base class says of all
-    assert "It says nothing of itself" in bare
+    assert "No description" in bare
     assert "An arm.\n\nWith words." in worded
     listed = run("envs", cwd=folder).stdout
     assert "?" not in listed
@@ -111,18 +111,18 @@ def test_a_line_has_one_dimension(run: Run, folder: Path, words: list[str], last
     np.testing.assert_allclose(line["loss"], (line["u"] - 1) ** 2 + 0.5)
     assert (folder / "line/landscape.png").exists()
     again = run(*command, "--resolution", "5", "--out", "line", cwd=folder)
-    assert "all 5 episodes with gradients are there already" in again.stderr
+    assert "all 5 episodes with gradients are done already" in again.stderr
 
 
 @pytest.mark.parametrize(
     ("name", "said"),
     [
-        ("arm.py:Leg", "arm.py holds no Leg; it has TwoLinkArm, Arm"),
+        ("arm.py:Leg", "arm.py has no Leg; it has TwoLinkArm, Arm"),
         ("arm.py:NOTHING", "arm.py:NOTHING: int is no simulator"),
         ("leg.py:Leg", "there is no file leg.py"),
         ("broken.py:Arm", "broken.py cannot be imported: ZeroDivisionError"),
-        ("leaves.py:Arm", "leaves.py called sys.exit(3) while it was imported; let it do that as a program only"),
-        ("fluid.py:Mine", "fluid.py:Mine is called 'fluid', and so is gradscape.envs.mpm.fluid:Fluid"),
+        ("leaves.py:Arm", "leaves.py called sys.exit(3) while it was imported; move that call under"),
+        ("fluid.py:Mine", "fluid.py:Mine and gradscape.envs.mpm.fluid:Fluid are both called 'fluid'"),
     ],
 )
 def test_a_file_without_the_class_is_refused_by_name(run: Run, folder: Path, name: str, said: str) -> None:
@@ -151,7 +151,7 @@ def test_a_program_registers_a_class_and_the_command_finds_it(run: Run) -> None:
     run.ok("slice spring --dims 0 --resolution 4 --out cut")
     run.ok("report cut --points-per-axis 2 --out told")
     gs.register(Spring)  # again, as a cell of a notebook does
-    with pytest.raises(ValueError, match="an environment called 'fluid' exists already"):
+    with pytest.raises(ValueError, match="an environment called 'fluid' already exists"):
         gs.register(type("Fluid", (Spring,), {"name": "fluid"}))
     with pytest.raises(ValueError, match="takes an environment, or a class derived from Environment"):
         gs.register("spring")  # type: ignore[type-var]
@@ -167,14 +167,14 @@ def short_of(**what: object) -> gs.Environment:
     [
         (
             {"_evaluate": lambda self, x, *, grad: x[:, 0]},
-            "must return an Evaluation; got Tensor. Evaluation.from_results",
+            "must return an Evaluation; got Tensor; make one with Evaluation.from_results",
         ),
         ({"_evaluate": lambda self, x, *, grad: None}, "must return an Evaluation; got NoneType"),
         (
             {"_evaluate": lambda self, x, *, grad: gs.Evaluation.from_results(x[:, 0], None)},
-            r"was asked for gradients \(grad=True\) and returned none",
+            r"must return gradients with grad=True; got none",
         ),
-        ({"space": None}, "needs its parameters: give the class a ParameterSpace as `space`"),
+        ({"space": None}, "has no parameters; give the class a ParameterSpace as `space`"),
     ],
 )
 def test_what_a_class_lacks_is_said(what: dict[str, object], said: str) -> None:

@@ -40,7 +40,7 @@ def test_four_kills_change_no_bit(job: str, tmp_path: Path) -> None:
     ended = {folder: alone(work, folder) for folder in (killed, whole)}
     for done in ended.values():
         assert done.returncode == 0, done.stderr
-    assert "there already" in ended[killed].stderr
+    assert "done already" in ended[killed].stderr
     assert numbers(killed) == numbers(whole) != {}
     assert not [path for path in killed.rglob(".*") if path.suffix in (".making", ".partial")]
 
@@ -85,7 +85,7 @@ def test_ctrl_c_says_what_is_kept_and_how_to_go_on_and_changes_no_bit(job: str, 
     assert (stopped / "made/progress.png").exists() == (job == "optimize")
     again = alone(work, stopped)
     assert again.returncode == alone(work, whole).returncode == 0, again.stderr
-    assert "are there already" in again.stderr
+    assert "are done already" in again.stderr
     assert f"all {count}" not in again.stderr
     summary = again.json
     if job == "race":

@@ -41,7 +41,7 @@ def test_a_report_is_printed_from_what_it_kept(run: Run, tmp_path: Path, monkeyp
     for file in (tmp_path / "told").iterdir():
         (tmp_path / "cut" / file.name).write_bytes(file.read_bytes())
     beside = run("report cut --points-per-axis 2 --out copied --figure-width-mm 85")
-    assert "copied is copied from cut" in beside.stderr
+    assert "copied: the report is copied from cut" in beside.stderr
     assert (tmp_path / "copied" / name).read_bytes() == before
     (tmp_path / "told/gradient-quality.npz").unlink()
     older = run(*command, "--figure-width-mm", "85")

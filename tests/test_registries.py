@@ -181,7 +181,7 @@ def test_an_engine_without_wheels_for_this_python_says_so_and_what_to_do(monkeyp
         envs.make("fluid", engine="taichi", device="cpu")
     here = f"{sys.version_info.major}.{sys.version_info.minor}"
     assert str(said.value).endswith(
-        f"3.10, and this is Python {here}; take engine warp, or install gradscape with Python 3.10"
+        f"3.10, but this is Python {here}; use engine warp, or install gradscape with Python 3.10"
     )
     monkeypatch.setitem(ENGINES, "taichi", replace(gone, newest_python=(3, 99)))
     with pytest.raises(ValueError, match=r"here: No module named 'gradscape.envs.engines.nowhere'$"):

@@ -43,38 +43,38 @@ class Left:
 RESULTS = {
     "slice": Left(
         "summary.json landscape.png slice.zarr.zip", "36 of 36 points are kept", "slice", "landscape.png",
-        "all 36 episodes with gradients are there already", "--resolution 5",
+        "all 36 episodes with gradients are done already", "--resolution 5",
     ),
     "line": Left(
         "summary.json landscape.png slice.zarr.zip", "16 of 16 points are kept", "slice", "",
-        "all 16 episodes with gradients are there already", "--resolution 5",
+        "all 16 episodes with gradients are done already", "--resolution 5",
     ),
     "sweep": Left(
         "summary.json sweep.gif sweep.mp4 sweep.rrd frames", "32 of 32 points are kept", "sweep", "",
-        "all 32 episodes with gradients of 2 slices are there already", "--resolution 3",
+        "all 32 episodes with gradients of 2 slices are done already", "--resolution 3",
     ),
     "run": Left(
         "summary.json progress.png run.zarr", "30 of 30 episodes are kept", "run", "progress.png",
-        "all 30 episodes are there already", "--seed 2",
+        "all 30 episodes are done already", "--seed 2",
     ),
     "race": Left(
         "race.json race.png random-0 random-1 descents-0 descents-1", "64 of 64 episodes are kept", "race", "",
-        "all 64 episodes are there already", DIM,
+        "all 64 episodes are done already", DIM,
     ),
     "league": Left(
         "league.json league.png branin-exact ackley-exact", "32 of 64 episodes are kept", "league", "",
-        "32 of 32 episodes are there",
+        "32 of 32 episodes are done",
     ),
     "pairs": Left("pairs.json - pieces", "batches are kept", "pairs", other=DIM),
     "hessian": Left("hessian.json hessian.png hessian.npz pieces", "batches are kept", "Hessian", other=DIM),
     "remedy": Left("remedy.json remedy.png remedy.npz pieces", "2 remedies are kept", "study of remedies", other=DIM),
     "census": Left(
-        "census.json census.png census.npz pieces", "4 of 4 slices are kept", "census", "", THERE, DIM
+        "census.json census.png census.npz pieces", "4 of 4 slices are kept", "census", "", "done already", DIM
     ),
-    "advise": Left("advice.json -", "nothing of the advice is kept", "advice", other="--seed 1"),
-    "check": Left("check.json check.png", "nothing of the check is kept", "check", other="--seed 1"),
+    "advise": Left("advice.json -", "the advice is not saved", "advice", other="--seed 1"),
+    "check": Left("check.json check.png", "the check is not saved", "check", other="--seed 1"),
     "card": Left(
-        "card.json card.png card.html card.npz pieces", "1 of 1 engines in scenes are kept", "report card", "", "",
+        "card.json card.png card.html card.npz pieces", "1 of 1 engine checks are kept", "report card", "", "",
         "--resolution 4",
     ),
     "fidelity": Left(
@@ -82,12 +82,12 @@ RESULTS = {
     ),
     "report": Left(
         "report.json gradient-quality.png gradient-quality.npz measures.json", "0 of 1 reports are kept", "report", "",
-        THERE, "--points-per-axis 3", "holds another report (points 2 there, 3 here)",
+        "the report exists already", "--points-per-axis 3", "contains another report (points 2 there, 3 now)",
     ),
-    "overlay": Left("- overlay.png overlay.rrd", "each file in", "overlay", "overlay.png"),
-    "comparison": Left("compare.json compare.png", "each file in", "comparison"),
-    "replay": Left("episode.json episode.png episode.rrd", "each file in", "episode"),
-    "surface": Left("- surface.png surface.gltf", "each file in", "surface", "surface.png"),
+    "overlay": Left("- overlay.png overlay.rrd", "every file in", "overlay", "overlay.png"),
+    "comparison": Left("compare.json compare.png", "every file in", "comparison"),
+    "replay": Left("episode.json episode.png episode.rrd", "every file in", "episode"),
+    "surface": Left("- surface.png surface.gltf", "every file in", "surface", "surface.png"),
 }  # fmt: skip
 VERBS = {kind: KINDS[kind].make.split()[0] for kind in RESULTS}
 PRINTED = [kind for kind in RESULTS if VERBS[kind] not in ("sweep", "pairs", "advise")]
@@ -161,7 +161,7 @@ def test_a_folder_of_other_files_is_left_alone(kind: str, force: bool) -> None:
     force = force and any("--force" in one.names for one in verbs()[VERBS[kind]].options)
     done = repeated(kind, folder, *(["--force"] if force else []))
     assert done.returncode == 2
-    assert f"{MADE} holds other files and no {RESULTS[kind].mine}" in done.stderr
+    assert f"{MADE} has other files but no {RESULTS[kind].mine}" in done.stderr
     assert [file.read_text() for file in files(folder / MADE)] == ["precious"] * 2
 
 
@@ -183,10 +183,10 @@ FULL = {
         kind: (KINDS[kind].make, one.last or one.files.split()[0], one.kept)
         for kind, one in RESULTS.items()
     },
-    "export": (f"export cut --out {MADE}.csv", f"{MADE}.csv", "each file that is there is whole"),
+    "export": (f"export cut --out {MADE}.csv", f"{MADE}.csv", "every finished file is complete"),
     "gallery": (
         "gallery compute --only bounce-y --part slices --fidelity draft --resolution 4 --device cpu "
-        f"--data {MADE}", "landscape.png", f"all that is finished is kept in {MADE}",
+        f"--data {MADE}", "landscape.png", f"finished parts are kept in {MADE}",
     ),
 }  # fmt: skip
 

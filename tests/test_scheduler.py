@@ -148,7 +148,7 @@ def test_a_worker_whose_scene_has_another_model_is_refused(monkeypatch):
     made = recipe(make("branin"))
     assert made().name == "branin"
     monkeypatch.setattr(Branin, "model_version", 2)
-    with pytest.raises(ValueError, match=r"has branin model 2; here it is model 1: install the same version"):
+    with pytest.raises(ValueError, match=r"has branin model 2, but this machine has model 1; install the same version"):
         made()
 
 
@@ -238,7 +238,7 @@ def test_a_scheduler_that_is_gone_ends_it_with_a_slice_to_go_on_with(tmp_path, m
     with pytest.raises(WorkersLostError, match=gone), workers(address, "cpu") as executor:
         sample(objective, PLANE, store, batch=1, executor=executor, progress=kill)
     (warning,) = (line for line in capsys.readouterr().err.splitlines() if "warning" in line)
-    assert warning.startswith(f"warning: {address} is without TLS")
+    assert warning.startswith(f"warning: {address} has no TLS")
     assert len(store.pending()) == len(store.tiles()) - 1
     assert same(sample(from_torch(wave, SPACE), PLANE, store), sample(from_torch(wave, SPACE), PLANE))
 
@@ -281,7 +281,7 @@ DEAD, CLOSED = "tcp://127.0.0.1:9", "tls://127.0.0.1:9"
     [
         ("local:0", 2, "local:N for N workers", {}, ""),
         ("local:two", 2, "local:N for N workers", {}, ""),
-        (CLOSED, 2, f"{CLOSED} takes certificates; docs/clusters.md says where they are named", {}, ""),
+        (CLOSED, 2, f"{CLOSED} needs certificates; docs/clusters.md says how to name them", {}, ""),
         (CLOSED, 2, "configuration names cannot be read", {"ca-file": "/none", "client.cert": "/none"}, ""),
         (DEAD, 1, f"no Dask scheduler answers at {DEAD}", {}, ""),
         (DEAD, 2, "pip install '.[distributed]'", {}, "distributed"),
@@ -304,4 +304,4 @@ def test_what_listens_at_an_address_and_is_no_scheduler_is_not_waited_for(run, m
         address = f"tcp://127.0.0.1:{mute.getsockname()[1]}"
         said = run("slice", "branin", "--dims", "0", "1", "--scheduler", address)
     assert (said.returncode, said.stderr.count("\n")) == (1, 1)
-    assert f"no Dask scheduler answers at {address}: nothing is said there in 0.1 s" in said.stderr
+    assert f"no Dask scheduler answers at {address}: no answer within 0.1 s" in said.stderr

@@ -84,6 +84,6 @@ def test_what_another_process_fills_is_not_begun_anew(run: Run, tmp_path: Path, 
     run.ok(command)
     with holding(tmp_path / "made"):  # a lock of this process's, too, is of another file that is open
         done = run.refuse(
-            f"{command} --force", said="made is being filled by another process, so it is not begun again"
+            f"{command} --force", said="made is being filled by another process, so it is not started again"
         )
     assert len(done.stderr.splitlines()) == 1

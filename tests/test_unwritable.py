@@ -33,10 +33,8 @@ def test_a_command_without_a_place_for_kernels_names_the_variable_that_moves_the
     )  # fmt: skip
     assert done.returncode == 1
     (line,) = done.stderr.splitlines()
-    assert line.startswith(f"landscape: Warp's kernels cannot be kept at {tmp_path / 'file'}")
-    assert line.endswith(
-        "(not a directory); set the environment variable WARP_CACHE_PATH to a folder that can be written to"
-    )
+    assert line.startswith(f"landscape: Warp's kernels cannot be stored at {tmp_path / 'file'}")
+    assert line.endswith("(not a directory); set the environment variable WARP_CACHE_PATH to a writable folder")
 
 
 def test_kernels_that_cannot_be_written_say_so_too(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -51,10 +49,10 @@ def test_kernels_that_cannot_be_written_say_so_too(monkeypatch: pytest.MonkeyPat
 def test_other_folders_of_the_user_say_so_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "file").write_text("in the place of a folder")
     monkeypatch.setattr(targets, "user_cache_path", lambda name: tmp_path / "file" / name)
-    with pytest.raises(OSError, match=r"targets cannot be kept at .* XDG_CACHE_HOME"):
+    with pytest.raises(OSError, match=r"targets cannot be stored at .* XDG_CACHE_HOME"):
         targets.load_or_make("rope", "content", lambda: np.zeros(1))
     monkeypatch.setattr(own_folder, "user_data_path", lambda name: tmp_path / "file" / name)
-    with pytest.raises(OSError, match=r"what was measured cannot be kept at .* XDG_DATA_HOME"):
+    with pytest.raises(OSError, match=r"the measurements cannot be stored at .* XDG_DATA_HOME"):
         kept.keep(replace(fidelities(), identity={"device": "cpu", "options": {}, "model_version": 1}))
 
 

@@ -111,7 +111,7 @@ def test_a_folder_is_made_however_deep(tmp_path: Path) -> None:
 
 def test_a_loop_of_links_is_no_path(desk: Path) -> None:
     for path in (desk / "loop", desk / "loop/x"):
-        with pytest.raises(ValueError, match=r"loop.* leads in a circle, by symbolic links; give another path"):
+        with pytest.raises(ValueError, match=r"loop.* leads in a circle of symbolic links; use another path"):
             resolve(path)
     assert resolve(desk / "not/there") == Path(os.path.realpath(desk)) / "not/there"
 
@@ -120,4 +120,4 @@ def test_a_path_too_long_for_the_system_ends_in_a_line(run: Run, desk: Path) -> 
     done = run("slice", "branin", "--dims", "0", "1", "--out", f"{DEEP}/{DEEP}")
     assert done.returncode == 1
     assert len(done.stderr.splitlines()) == 1
-    assert "file name too long; give another path" in done.stderr
+    assert "file name too long; use another path" in done.stderr

@@ -1,1 +1,1 @@
-"""Pages that are written when the site is built, each from what it documents: a module for each kind of them."""
+"""Pages that are generated when the site is built; each module writes one kind of page."""

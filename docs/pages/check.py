@@ -1,5 +1,6 @@
-"""Read every page that was built: none may load anything from elsewhere, no link or anchor may lead nowhere, and every
-picture says what it is.
+"""Check every page that was built.
+
+No page loads anything from elsewhere, no link is broken, and every picture has an alternative text.
 
     python -m docs.pages.check build/docs
 """
@@ -25,7 +26,7 @@ STYLED = re.compile(r"""url\(\s*['"]?([^'")]+)|@import\s+['"]([^'"]+)""", re.IGN
 
 @dataclass(frozen=True)
 class Page:
-    """What a page loads, what it links to, what can be linked to in it, and pictures that do not say what they are."""
+    """What a page loads, its links, its anchors, and its pictures without an alternative text."""
 
     loads: list[str]
     links: list[str]
@@ -50,22 +51,22 @@ class Page:
 
 
 def styled(sheet: str) -> list[str]:
-    """Return what a style sheet loads."""
+    """Return the addresses that a style sheet loads."""
     return [found[1] or found[2] for found in STYLED.finditer(sheet)]
 
 
 def pages_of(root: Path) -> list[Path]:
-    """Return the pages of a site: all but what its theme keeps with styles and scripts."""
+    """Return the pages of a site, without those that its theme keeps with styles and scripts."""
     return [file for file in sorted(root.rglob("*.html")) if "_static" not in file.relative_to(root).parts]
 
 
 def find_faults(root: Path) -> Iterator[str]:
-    """Yield what is wrong in a folder of pages, a line each: what is loaded from elsewhere, what leads nowhere."""
+    """Yield the faults in a folder of pages, one line each: loads from elsewhere, missing texts, broken links."""
     read = cache(Page.read)
     for file in pages_of(root):
         page, name = read(file), file.relative_to(root)
         yield from (f"{name} loads {one}" for one in page.loads if ELSEWHERE.match(one))
-        yield from (f"{name} shows {one} without saying what it is" for one in page.unsaid)
+        yield from (f"{name} shows {one} without an alternative text" for one in page.unsaid)
         for address in dict.fromkeys([*page.loads, *page.links]):
             parts = urlsplit(address.split(" ")[0])
             if parts.scheme or parts.netloc:
@@ -86,7 +87,7 @@ def _last(picture: Tag, attribute: str) -> str:
 
 
 def main(folder: str) -> None:
-    """Print the faults of a site. Exits with 1 where there are any, or no page."""
+    """Print the faults of a site, and exit with 1 if there are any, or no page."""
     root = Path(folder)
     pages, faults = pages_of(root), list(find_faults(root))
     print(*faults, f"{len(pages)} pages, {len(faults)} faults", sep="\n")

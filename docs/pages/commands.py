@@ -1,4 +1,4 @@
-"""A page for each verb of the command, of what `--help` says of it."""
+"""A page for each verb of the command, from its `--help`."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from .text import render
 
 
 def pages() -> dict[str, str]:
-    """Return the pages of all verbs, and one that lists them, in the order of the command's own help."""
+    """Return a page for each verb, and one that lists them in the order of the command's help."""
     files = {f"{name.replace(' ', '-')}.md": verb for name, verb in verbs().items()}
     listed = {"commands/index.md": render("commands.md", files=files)}
     return listed | {f"commands/{file}": _page(verb) for file, verb in files.items()}

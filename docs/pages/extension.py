@@ -1,5 +1,5 @@
-"""The Sphinx extension: writes the pages that are made of the package and its data, lets links between folders lead to
-pages, takes the gallery in, and writes formulas as MathML, which asks for no script and which screen readers read.
+"""The Sphinx extension: it writes the generated pages, redirects links between folders, copies the gallery, and writes
+formulas as MathML, which needs no script and works with screen readers.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ INCLUDED = {  # what stands at the repository's root, and the page that shows it
 
 
 def pages(kept: Kept, pictures: Path) -> dict[str, str]:
-    """Return all pages by their paths under `generated/`; pictures are drawn into a folder."""
+    """Return all pages by their paths under `generated/`, and draw their pictures into a folder."""
     wall = render("wall.md", kept=kept, draw=partial(draw_slice, folder=pictures))
     licence = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["license"]
     figures = render("figures.md", kept=kept, licence=licence, drawn=pictures_of_pages())
@@ -46,7 +46,7 @@ def pages(kept: Kept, pictures: Path) -> dict[str, str]:
 
 
 def pictures_of_pages() -> dict[str, tuple[list[str], str]]:
-    """Return the pages that show each picture of `docs`, and the command that made it."""
+    """Return for each picture of `docs` the pages that show it, and the command that made it."""
     texts = {file.name: file.read_text() for file in sorted((ROOT / "docs").glob("*.md"))}
     texts |= {here: (ROOT / name).read_text() for name, here in INCLUDED.items()}
     made = tomllib.loads((ROOT / "docs/pictures.toml").read_text())
@@ -57,14 +57,14 @@ def pictures_of_pages() -> dict[str, tuple[list[str], str]]:
 
 
 def write_pages(app: Sphinx) -> None:
-    """Write the pages into a folder that holds nothing else but pictures and the interface; old ones go."""
+    """Write the generated pages into their folder, and remove old ones."""
     if app.config.walked:
         folder = Path(app.srcdir) / "generated"
         write(pages(Kept.read(gallery=gallery_site(app)), folder / "pictures"), folder)
 
 
 def write(pages: Mapping[str, str], folder: Path) -> None:
-    """Write pages into a folder, and remove others; an equal page is left as it is, and is not built again."""
+    """Write pages into a folder and remove others; an unchanged page is not written, so it is not built again."""
     for old in folder.rglob("*.md"):
         if old.relative_to(folder).as_posix() not in pages:
             old.unlink()
@@ -76,25 +76,25 @@ def write(pages: Mapping[str, str], folder: Path) -> None:
 
 
 def mend_links(app: Sphinx, docname: str, source: list[str]) -> None:
-    """Let links to files of the root, and to the example package, lead to the pages that show them."""
+    """Redirect links to files of the root, and to the example package, to the pages that show them."""
     for name, here in INCLUDED.items():
         source[0] = re.sub(rf"\]\(((?:\.\./)*)\.\./{re.escape(name)}", rf"](\g<1>{here}", source[0])
     source[0] = source[0].replace("](example_package)", "](example.md)")
 
 
 def tidy_shapes(app: Sphinx, what: str, name: str, one: Any, options: Any, said: str | None, back: str | None) -> Any:
-    """Leave out the blank that tells a linter that a shape's only axis is no name that it should know."""
+    """Remove the blank in shapes such as " dim", which is there for the linter only."""
     return tuple(text and text.replace("' ", "'") for text in (said, back))
 
 
 def gallery_site(app: Sphinx) -> Path | None:
-    """Return where the built gallery is, None where there is none."""
+    """Return the folder of the built gallery, or None without one."""
     named = ROOT / app.config.gallery_site
     return named if (named / "manifest.json").is_file() else None
 
 
 def take_gallery(app: Sphinx, error: Exception | None) -> None:
-    """Copy the gallery's site to the pages, instead of an earlier one, with a way back; nothing where there is none."""
+    """Copy the gallery's site next to the pages, with a link back; do nothing without a gallery."""
     if error is None and app.builder.format == "html":
         place = Path(app.outdir) / "gallery"
         shutil.rmtree(place, ignore_errors=True)
@@ -108,19 +108,19 @@ def take_gallery(app: Sphinx, error: Exception | None) -> None:
 
 
 def write_inline(writer: HTML5Translator, node: nodes.math) -> None:
-    """Write a formula of a line."""
+    """Write an inline formula."""
     writer.body.append(tex2mathml(node.astext()))
     raise nodes.SkipNode
 
 
 def write_block(writer: HTML5Translator, node: nodes.math_block) -> None:
-    """Write a formula that stands by itself."""
+    """Write a displayed formula."""
     writer.body.append(f'<div class="formula">{tex2mathml(node.astext(), as_block=True)}</div>')
     raise nodes.SkipNode
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
-    """Say what the extension adds."""
+    """Register the extension."""
     app.add_config_value("gallery_site", "out/gallery", "html")
     app.add_config_value("walked", True, "env")
     app.connect("builder-inited", write_pages)

@@ -53,16 +53,16 @@ def whole() -> Iterator[NDArray[np.uint8]]:
         place = torch.stack([axis[at] for axis, at in zip(plane.axes(), (node.column, node.row), strict=True)])
         episode = env.episode(plane.lift(place[None])[0])
         shown = list(frames(episode, pick_frames(episode, FRAMES), height=HEIGHT))
-        left = draw_map(dataset, place.tolist(), f"{why}: {node.loss:.3f} m", vars(env.options)["speed"])
+        left = draw_map(dataset, place.tolist(), f"{why}: {node.loss:.3f} m")
         for frame in [*shown, *[shown[-1]] * REST]:
             yield np.concatenate([left, np.ascontiguousarray(frame[: len(left)])], axis=1)
 
 
-def draw_map(dataset: Any, place: list[float], said: str, speed: float) -> NDArray[np.uint8]:
-    """Draw the losses and the directions of steepest descent, with the node; a parameter of 1 is a `speed` [m/s]."""
+def draw_map(dataset: Any, place: list[float], said: str) -> NDArray[np.uint8]:
+    """Draw the losses and the directions of steepest descent, with the node."""
     figure = Figure(figsize=(1.3 * HEIGHT / DPI, HEIGHT / DPI), dpi=DPI, layout="constrained")
     ax = figure.subplots()
-    u, v = (speed * dataset[name].to_numpy() for name in ("u", "v"))
+    u, v = (dataset[name].to_numpy() for name in ("u", "v"))
     mesh = ax.pcolormesh(u, v, dataset["loss"].to_numpy(), cmap=style.LOSS_MAP, shading="nearest")
     figure.colorbar(mesh, ax=ax, label="loss [m]")
     rows, columns = (slice(EVERY // 2, None, EVERY) for _ in range(2))
@@ -70,12 +70,11 @@ def draw_map(dataset: Any, place: list[float], said: str, speed: float) -> NDArr
     down = down / np.linalg.norm(down, axis=-1, keepdims=True)
     ax.quiver(u[columns], v[rows], down[..., 0], down[..., 1], color="white", alpha=0.8, pivot="mid", width=0.005)
     for width, colour in ((5.0, "white"), (2.5, "#b5367a")):
-        at = [speed * one for one in place]
-        ax.plot(*at, "o", markersize=13, markerfacecolor="none", markeredgecolor=colour, markeredgewidth=width,
+        ax.plot(*place, "o", markersize=13, markerfacecolor="none", markeredgecolor=colour, markeredgewidth=width,
                 clip_on=False, zorder=5)  # fmt: skip
     ax.set_title(said, fontsize=12)
-    ax.set_xlabel(f"{dataset['u'].attrs['long_name']} [m/s]")
-    ax.set_ylabel(f"{dataset['v'].attrs['long_name']} [m/s]")
+    ax.set_xlabel(dataset["u"].attrs["label"])
+    ax.set_ylabel(dataset["v"].attrs["label"])
     return picture(figure, dpi=DPI)
 
 

@@ -1,4 +1,4 @@
-"""What is kept of the gallery's figures: where each lies, what was measured, and by which version of its scene."""
+"""The stored data of the gallery's figures: slices, reports, and the version of the scene that made them."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ NOT_MEASURED = "not measured yet"
 
 
 class KeptFigure:
-    """A figure of the gallery with what there is of it under `root`: its slice and its report, None where not."""
+    """A figure of the gallery with its slice and its report under `root`, each None if it is missing."""
 
     def __init__(self, figure: Figure, root: Path = DATA) -> None:
         self.figure, self.root = figure, root
@@ -34,49 +34,49 @@ class KeptFigure:
 
     @property
     def current(self) -> bool:
-        """Whether its samples are of the scene's model as it is now."""
+        """Whether its samples are from the present version of the scene's model."""
         known = self.slice.identity if self.slice else None
         return bool(known and known["model_version"] == environment_class(self.figure.env).version_on(known["engine"]))
 
     @property
     def losses(self) -> tuple[float, float] | None:
-        """The least and the largest loss of its samples, None where there are none [loss unit]."""
+        """The lowest and the highest loss of its samples, or None without losses [loss unit]."""
         if self.slice is None or not bool(self.slice.data["loss"].notnull().any()):
             return None
         return float(self.slice.data["loss"].min()), float(self.slice.data["loss"].max())
 
     @property
     def axes(self) -> str:
-        """What its slice varies."""
+        """The parameters that its slice varies."""
         return " and ".join(self.slice.plane.labels) if self.slice else ""
 
     @property
     def paper_words(self) -> tuple[str, ...]:
-        """The paper's words for it, its own or those of the scene."""
+        """The paper's words for this slice, or else those for its scene."""
         said = read_paper().words.get(self.figure.env)
         return self.figure.caption.words or (said.words if said else ())
 
     @property
     def findings(self) -> tuple[PaperFinding, ...]:
-        """What else is known of the paper's words for it."""
+        """Other measurements that concern the paper's words for this slice."""
         return read_paper().findings.get(self.figure.id, ())
 
     @property
     def as_the_paper(self) -> bool:
-        """Whether its scene was set as the paper has it, by its preset."""
+        """Whether its scene had the paper's settings, by the preset."""
         wanted = environment_class(self.figure.env).presets.get("paper")
         known = self.report.options if self.report else {}
         return wanted is not None and all(known.get(name) == value for name, value in wanted.items())
 
     @property
     def words(self) -> str:
-        """The words that were measured of it."""
+        """The measured verdict as text."""
         return ", ".join(self.report.words) if self.report else NOT_MEASURED
 
 
 @dataclass(frozen=True)
 class Kept:
-    """All that pages show: the figures and what is kept of them, what the paper says, and the league if any."""
+    """The data of all pages: the stored figures, the paper's statements, and the league if there is one."""
 
     figures: Sequence[KeptFigure]
     paper: Paper
@@ -85,7 +85,7 @@ class Kept:
 
     @classmethod
     def read(cls, root: Path = DATA, *, gallery: Path | None = None) -> Kept:
-        """Read what lies in a folder of the gallery's data. Raises ValueError, naming it, for a damaged file."""
+        """Read a folder of the gallery's data. Raises ValueError, naming the file, for a damaged one."""
         return cls([KeptFigure(one, root) for one in read_figures()], read_paper(), read_league(root), gallery)
 
     @cached_property
@@ -95,6 +95,6 @@ class Kept:
         return {env: [one for one in self.figures if one.figure.env == env] for env in names}
 
     def link(self, figure: Figure, up: str) -> str:
-        """Return a figure's name, as a link to its page of the gallery where that is built; `up` leads to the root."""
+        """Return a figure's name, as a link to its page if the gallery is built; `up` leads to the root."""
         shown = self.gallery and (self.gallery / figure.id / "index.html").exists()
         return f'<a href="{up}gallery/{figure.id}/index.html">{figure.id}</a>' if shown else f"`{figure.id}`"

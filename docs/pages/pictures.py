@@ -21,7 +21,7 @@ FUNCTION_RESOLUTION = 48
 
 
 def draw_slice(kept: KeptFigure, folder: Path, *, small: bool = False) -> dict[str, str]:
-    """Draw a figure's slice, if its pictures are not there already, and return their names."""
+    """Draw a figure's slice unless its pictures are up to date, and return their names."""
     assert kept.slice is not None
     name, data = f"{kept.figure.id}{'-small' if small else ''}.png", kept.slice.data
     if _is_old(folder / name, slice_path(kept.folder)):
@@ -44,7 +44,7 @@ def _both(name: str) -> dict[str, str]:
 
 
 def _is_old(picture: Path, *data: Path) -> bool:
-    """Say whether a picture is not there, or is older than its data or the code that draws."""
+    """Say whether a picture is missing, or older than its data or the code that draws it."""
     picture.parent.mkdir(parents=True, exist_ok=True)
     sources = [*data, *(file for folder in (*data, *map(Path, draw.__path__)) for file in folder.rglob("[!_]*"))]
     newest = max(file.stat().st_mtime for file in sources)

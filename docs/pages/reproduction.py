@@ -1,4 +1,4 @@
-"""The page that holds what the paper shows and claims against what is kept here: nothing on it is written by hand."""
+"""The page that compares the paper's figures and claims with our data; all of it is generated."""
 
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ from .pictures import draw_slice
 from .text import cell, render
 
 CONFIRMED, REFUTED, DIFFERENT, UNSEEN = "confirmed", "refuted", "different", "not seen here"
-SAYS_NOTHING = "the paper says nothing of it"
+SAYS_NOTHING = "not described in the paper"
 MEANING = {
-    CONFIRMED: "all that the paper says of it was measured here too; of a claim about two methods: the rank test of "
-    "Mann and Whitney, corrected by Holm's rule for all pairs of the race, has p below 0.05",
-    REFUTED: "none of the paper's words was measured, with its settings, preset paper, nor with another that is known; "
-    "of a claim: that test says the opposite",
-    UNSEEN: "none of the paper's words was measured, and another setting has some of them, or the paper's is another; "
-    "what is known of the reason is said",
+    CONFIRMED: "all of the paper's words were measured here too. For a claim about two methods: the rank test of Mann "
+    "and Whitney has p below 0.05, after Holm's correction for all pairs of the race",
+    REFUTED: "none of the paper's words was measured, neither with the paper's settings (preset paper) nor with any "
+    "other known setting. For a claim: that test says the opposite",
+    UNSEEN: "none of the paper's words was measured, but another setting shows some of them, or the slice has other "
+    "settings than the paper. Known reasons are given",
     DIFFERENT: "some of the paper's words were measured and some were not",
-    "not decided": "the races that are kept do not say which of two methods is ahead",
+    "not decided": "the stored races do not decide which of the two methods is ahead",
     "not run": "one of the two methods was not raced in this scene",
-    NOT_MEASURED: "there are no data of it in this version",
+    NOT_MEASURED: "this version has no data for it",
 }
 
 
 @dataclass(frozen=True)
 class FoundClaim:
-    """What the paper claims of two methods in a scene, and what the league makes of it."""
+    """A claim of the paper about two methods in a scene, with the league's verdict."""
 
     env: str
     claim: Claim
@@ -44,7 +44,7 @@ class FoundClaim:
 
 
 def pages(kept: Kept, pictures: Path) -> dict[str, str]:
-    """Return the page; small pictures are drawn into a folder."""
+    """Return the page, and draw its small pictures into a folder."""
     claims = list(judge_claims(kept))
     numbers: dict[int | None, list[KeptFigure]] = {}  # of the supplement's figures; ours, which have none, are last
     for one in sorted(kept.figures, key=lambda one: one.figure.caption.number or float("inf")):
@@ -60,7 +60,7 @@ def pages(kept: Kept, pictures: Path) -> dict[str, str]:
 
 
 def verdict_of(one: KeptFigure) -> str:
-    """Return what the measured words of a slice make of the paper's."""
+    """Return the verdict on the paper's words for a slice."""
     if one.report is None:
         return NOT_MEASURED
     words, missing = one.paper_words, missing_words(one)
@@ -73,12 +73,12 @@ def verdict_of(one: KeptFigure) -> str:
 
 
 def missing_words(one: KeptFigure) -> tuple[str, ...]:
-    """Return the paper's words for a slice that were not measured of it."""
+    """Return the paper's words for a slice that were not measured."""
     return tuple(word for word in one.paper_words if one.report is not None and word not in one.report.words)
 
 
 def judge_claims(kept: Kept) -> Iterator[FoundClaim]:
-    """Yield every claim of the paper in every scene, and what the kept league makes of it."""
+    """Yield every claim of the paper about every scene, with the verdict of the stored league."""
     raced = {scene.env: scene for scene in kept.league.scenes} if kept.league else {}
     for env, claims in kept.paper.claims.items():
         if env not in raced:
@@ -86,7 +86,7 @@ def judge_claims(kept: Kept) -> Iterator[FoundClaim]:
             continue
         for found in raced[env].findings(kept.paper.claims_about(env)):
             chance = found.superiority
-            won = f"the first wins {chance.probability:.0%}, corrected p {chance.corrected:.2g}" if chance else ""
+            won = f"first method wins {chance.probability:.0%}, corrected p {chance.corrected:.2g}" if chance else ""
             yield FoundClaim(env, found.claim, VERDICTS[found.verdict], won)
 
 

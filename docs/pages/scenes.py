@@ -1,4 +1,4 @@
-"""A page for each environment that is registered: what it says of itself, its picture, and what was measured."""
+"""A page for each registered environment: its description, its picture, and its measurements."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ FEW = 32  # parameters that are listed one by one
 
 
 def pages(kept: Kept, pictures: Path) -> dict[str, str]:
-    """Return the pages of all environments of this package, and one that lists them; pictures go into a folder."""
+    """Return a page for each environment of this package and one that lists them; draw pictures into a folder."""
     listed = {"scenes/index.md": render("scenes.md", scenes=BUILTIN)}
     return listed | {f"scenes/{one.name}.md": _page(one, kept, pictures) for one in BUILTIN}
 
@@ -50,7 +50,7 @@ def _page(entry: Entry, kept: Kept, pictures: Path) -> str:
 
 
 def _about(env: Environment) -> Iterator[str]:
-    """Yield the paragraphs of what a scene says of itself, with what each is about in bold; what is said twice once."""
+    """Yield the paragraphs of a scene's description, each once and with its subject in bold."""
     for block in dict.fromkeys(env.about().split("\n\n")):
         for part in PARTS.split(block):
             yield re.sub(r"^(\w+)", r"**\1**", prose(part)) if PARTS.match(part) else prose(part)

@@ -1,9 +1,9 @@
-"""Write the tables that the gallery's records fill into README and the pages, between <!-- NAME --> and <!-- /NAME -->.
+"""Write the tables of the gallery's records into README and the pages, between <!-- NAME --> and <!-- /NAME -->.
 
     python -m docs.pages.tables [--check]
 
-With --check nothing is written, and exit code 1 says that a page differs from the records. A scene without a record, or
-whose model changed since, has a row that says so.
+With --check it writes nothing, and exits with code 1 if a page differs from the records. A scene without a record, or
+with a model that has changed since, has a row that says so.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ from .text import cell, table
 ROOT = Path(__file__).parents[2]
 FLOORS = DATA / "floors.json"  # which benchmarks/symmetry.py writes
 UNMEASURED, MISSING = "not measured since the scene changed", "not measured"
-UNCOUNTED = "not measured since the words changed"
+UNCOUNTED = "no census since the verdicts changed"
 COLUMNS = {  # of README: what a slice may be, and the words that say so, of which a slice has one at most
     "very smooth": ("very smooth",),
     "smooth with local minima": ("smooth with local minima",),
@@ -59,34 +59,34 @@ Record = Mapping[str, Any]
 
 
 def scenes() -> list[str]:
-    """Return our simulated scenes: functions have one fidelity, and engines of others promise nothing."""
+    """Return our simulated scenes, without functions, which have one fidelity, and without engines of others."""
     return sorted(
         name for name, one in entries().items() if not one.extra and len(environment_class(name).fidelities) > 1
     )
 
 
 def present(record: Record) -> bool:
-    """Say whether a record is of its scene's model as it is now."""
+    """Say whether a record is from the present version of its scene's model."""
     known = record["identity"]
     return bool(known["model_version"] == environment_class(known["objective"]).version_on(known["engine"]))
 
 
 def kept(pattern: str, scene: str, data: Path = DATA) -> list[Record] | str:
-    """Return a scene's records of its present model, such as "census/{}-{}.json", or why there are none."""
+    """Return a scene's records of its present model, such as "census/{}-{}.json", or the reason for none."""
     files = (data / pattern.format(scene, device) for device in DEVICES)
     records = [read_json(file) for file in files if file.exists()]
     return [one for one in records if present(one)] or (UNMEASURED if records else MISSING)
 
 
 def studies(kind: str, scene: str, data: Path = DATA) -> list[StudyRecord] | str:
-    """Return a scene's studies of a kind, of its present model, or why there are none."""
+    """Return a scene's studies of a kind for its present model, or the reason for none."""
     files = (data / "studies" / file_name(scene, device, kind) for device in DEVICES)
     found = [read_study(file, kind) for file in files if file.exists()]
     return [one for one in found if present({"identity": one.identity})] or (UNMEASURED if found else MISSING)
 
 
 def censuses() -> str:
-    """What many slices of a scene are like: the share of them that each word fits, of those that are not flat."""
+    """The share of a scene's slices that each verdict fits, among those that are not flat."""
     rows = []
     for scene in scenes():
         said, found = _paper_words(scene), _census(scene)
@@ -99,12 +99,12 @@ def censuses() -> str:
         flat = str(len(found.slices) - found.solid)
         paper = ", ".join(told[word] for word in said)
         rows.append([f"`{scene}`", str(len(found.slices)), flat, ", ".join(measured), paper])
-    head = ("environment", "slices", "flat", "measured: share of the others (95 % interval)", "the paper's words")
+    head = ("environment", "slices", "flat", "measured: share of the other slices (95 % interval)", "the paper's words")
     return table(head, rows)
 
 
 def short_censuses() -> str:
-    """README's, of the scenes that were counted: how many slices are not flat, and the shares of them."""
+    """README's table of the censuses: the number of slices that are not flat, and the share of each verdict."""
     rows, left = [], []
     for scene in scenes():
         found = _census(scene)
@@ -114,7 +114,7 @@ def short_censuses() -> str:
         cells = [str(found.solid), *(_interval(found.share(words)) for words in COLUMNS.values())]
         rows.append([f"`{scene}`", *cells, ", ".join(_paper_words(scene))])
     shown = table(("environment", "slices", *COLUMNS, "the paper says"), rows)
-    return f"{shown}\n\nNot counted since the words changed: {', '.join(left)}." if left else shown
+    return f"{shown}\n\nNo census since the verdicts changed: {', '.join(left)}." if left else shown
 
 
 def _census(scene: str) -> Census | str:
@@ -150,7 +150,7 @@ def races(head: Sequence[str], cells: Callable[[SceneStandings], Sequence[str]],
 
 
 def short_league() -> str:
-    """README's: who has the best mean rank, and how many of the others it is ahead of."""
+    """README's table of the league: the best mean rank, and how many other methods it is ahead of."""
     scenes = kept_league().scenes
     (budget,), (forwards,) = {one.budget for one in scenes}, {f"{one.equal_cost.forwards:.0f}" for one in scenes}
     ahead = "is ahead of"
@@ -160,17 +160,17 @@ def short_league() -> str:
         rest = f"{len(one.not_told_from_random)} of {len(one.methods) - 1}"
         return [*_lead(one.lead, one.ranks), *_lead(one.equal_cost.lead, one.equal_cost.ranks), rest]
 
-    return races((*costs, "not told from random search"), cells) + _changed(scenes)
+    return races((*costs, "not distinguishable from random search"), cells) + _changed(scenes)
 
 
 def _changed(scenes: Sequence[SceneStandings]) -> str:
-    """Say which scenes have another model since they were raced, nothing where none has."""
+    """Name the scenes whose model has changed since their race, or return nothing."""
     names = [f"`{one.env}`" for one in scenes if not present({"identity": one.identity})]
     return f"\nRaced with a model that has changed since: {', '.join(names)}.\n" if names else ""
 
 
 def _lead(lead: Lead, ranks: Sequence[MeanRank]) -> list[str]:
-    """Return the cells of the methods of the best mean rank: in bold only where there is one, and it is first."""
+    """Return the cells of the methods with the best mean rank, in bold only if one method is first."""
     others, best = len(ranks) - 1, ranks[0].rank
     name = f"{', '.join(f'`{one.method}`' for one in ranks if one.rank == best)} {best:.2f}"
     if lead.is_first:
@@ -179,7 +179,7 @@ def _lead(lead: Lead, ranks: Sequence[MeanRank]) -> list[str]:
 
 
 def league() -> str:
-    """Mean ranks of all methods in all scenes, at equal episodes and at equal forward equivalents."""
+    """The mean ranks of all methods in all scenes, at equal episodes and at equal forward equivalents."""
     found = kept_league()
     cost = {one.method: one.rank for one in found.overall_at_equal_cost}
     whole = ["all scenes", "", *(f"{one.rank:.2f} / {cost[one.method]:.2f}" for one in found.overall)]
@@ -196,10 +196,10 @@ def _ranks(scene: SceneStandings, method: str) -> str:
 
 
 def rivals() -> str:
-    """Which methods the one of the best mean rank is not ahead of, and which cannot be told from random search."""
+    """The methods not distinguishable from the one with the best mean rank, and those not from random search."""
     costs = ("best mean rank at equal episodes", "best mean rank at equal forward equivalents")
     return races(
-        (*costs, "not told from random search"),
+        (*costs, "not distinguishable from random search"),
         lambda one: [_rivals(one.lead), _rivals(one.equal_cost.lead), ", ".join(one.not_told_from_random) or "none"],
     )
 
@@ -207,11 +207,11 @@ def rivals() -> str:
 def _rivals(lead: Lead) -> str:
     if lead.is_first:
         return f"**`{lead.method}`**, first: p at most {lead.p:.2g}"
-    return f"`{lead.method}`, not told from {', '.join(lead.rivals)} (p up to {lead.p:.2g})"
+    return f"`{lead.method}`, not distinguishable from {', '.join(lead.rivals)} (p up to {lead.p:.2g})"
 
 
 def method_defaults() -> str:
-    """Whose choice each default of a method is."""
+    """The source of each default of a method."""
     rows = []
     for name in methods():
         known: dict[str, list[str]] = {}
@@ -224,7 +224,7 @@ def method_defaults() -> str:
 
 
 def margins() -> str:
-    """How near standard's step is to the longest that is stable, by precision."""
+    """How near standard's time step is to the longest stable one, by precision."""
     rows = []
     for scene in scenes():
         found = studies("extremes", scene)
@@ -237,7 +237,7 @@ def margins() -> str:
             for limit in one.limits if limit.setting == "dt"
         ]  # fmt: skip
         rows += [[f"`{scene}`", one.device, *_margin(limit)] for one, limit in limits]
-    step = ("standard's step [s]", "longest stable [s]", "margin", "beyond", "95 % error")
+    step = ("step of standard [s]", "longest stable step [s]", "margin", "beyond", "95 % error")
     return table(("scene", "device", "precision", *step), rows)
 
 
@@ -252,7 +252,7 @@ def _margin(limit: Limit) -> list[str]:
 
 
 def fidelities() -> str:
-    """What draft and standard keep of their claims, against the reference, and what numerics alone move."""
+    """Whether draft and standard keep their claims against the reference, and their numerical floors."""
     rows = []
     for scene, claim in product(scenes(), CLAIMS):
         *cells, kept = _fidelity(scene, claim)
@@ -262,7 +262,7 @@ def fidelities() -> str:
 
 
 def _floor(scene: str, fidelity: str, file: Path = FLOORS) -> list[str]:
-    """Return the cells of a fidelity's floor, of losses and gradients, of the scene and settings that are there now."""
+    """Return the cells of a fidelity's floor of losses and gradients, for the present scene and settings."""
     now = environment_class(scene).fidelities[fidelity].record()
     measured = [
         row["floor"]
@@ -277,7 +277,7 @@ def _floor(scene: str, fidelity: str, file: Path = FLOORS) -> list[str]:
 
 
 def _fidelity(scene: str, claim: Claim) -> list[str]:
-    """Return the cells of a fidelity, of the variant that has its settings now."""
+    """Return the cells of a fidelity, from the variant with its present settings."""
     found = studies("fidelity", scene)
     now = environment_class(scene).fidelities[claim.name]
     for record in found if not isinstance(found, str) else ():
@@ -297,7 +297,7 @@ def _fidelity(scene: str, claim: Claim) -> list[str]:
 
 
 def accuracy() -> str:
-    """BENCHMARKS.md's: time and error of draft and standard alone."""
+    """The table in BENCHMARKS.md: time and error of draft and standard."""
     rows = []
     for scene in scenes():
         cells = [_fidelity(scene, claim) for claim in CLAIMS]
@@ -307,7 +307,7 @@ def accuracy() -> str:
 
 
 def parts() -> str:
-    """What each part of a scene's model is for: how far losses move without it, what it costs, and the verdict."""
+    """What each part of a scene's model contributes: the change of losses without it, its cost, and the verdict."""
     rows = []
     for scene in sorted(entries()):
         found = studies("model", scene)
@@ -316,7 +316,7 @@ def parts() -> str:
             one = measured.get(part.name)
             cells = [*[""] * 4, UNMEASURED] if one is None or one.options != dict(part.options) else _part(one)
             rows.append([f"`{scene}`", part.name, f"{part.change}{' (missing now)' if part.missing else ''}", *cells])
-    return table(("scene", "part", "changed to", "95 % of losses move by", "rank", "cosine", "time", "verdict"), rows)
+    return table(("scene", "part", "changed to", "95 % of losses change by", "rank", "cosine", "time", "verdict"), rows)
 
 
 def _part(one: MeasuredPart) -> list[str]:
@@ -335,13 +335,13 @@ def _number(value: float | None, digits: int) -> str:
 
 
 def measured() -> str:
-    """What the gallery's slices are like, by their reports."""
+    """The verdicts on the gallery's slices, from their reports."""
     files = [DATA / figure.id / "report.json" for figure in read_figures()]
     return environments_markdown([Report.read(file) for file in files if file.exists()])
 
 
 def known_causes() -> str:
-    """Return a row for each cause of wrong gradients by its name: whether a check then fails or warns, what to try."""
+    """Return a row for each cause of wrong gradients: its name, whether a check fails or warns, and what to try."""
     rows: dict[str, tuple[set[str], list[str]]] = {}
     for one in causes():
         ends, remedies = rows.setdefault(one.name, (set(), []))
@@ -373,7 +373,7 @@ TABLES: dict[tuple[str, str], Callable[[], str]] = {  # by page and name
 
 
 def settle(*, check: bool) -> Iterator[str]:
-    """Write all tables, unless they are only checked, and yield the pages that differed."""
+    """Write all tables, or only check them, and yield the pages that differ."""
     for (page, name), wanted in TABLES.items():
         file = ROOT / page
         marks = (f"<!-- {name} -->\n\n", f"\n<!-- /{name} -->")
@@ -386,7 +386,7 @@ def settle(*, check: bool) -> Iterator[str]:
 
 
 def main() -> None:
-    """Print which tables differed from the records; exit code 1 says that one still does."""
+    """Print the tables that differed from the records; exit with code 1 if one still does."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--check", action="store_true", help="write nothing")
     asked = parser.parse_args()

@@ -1,4 +1,4 @@
-"""Pages are templates of Markdown, and texts of the package go into them with only what is in backticks as code."""
+"""Markdown templates of pages; texts of the package are escaped, except for code in backticks."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ SPECIAL = re.compile(r"([\\*_\[\]<>$#|{}~])")
 
 
 def prose(text: str) -> str:
-    """Return a text whose characters mean themselves but for backticks, and for empty lines, which part paragraphs."""
+    """Escape Markdown in a text, except for backticks, and for empty lines between paragraphs."""
     parts = CODE.split(text)
     return "".join(part if CODE.fullmatch(part) else SPECIAL.sub(r"\\\1", part) for part in parts)
 
 
 def cell(text: str) -> str:
-    """Return a text for a cell of a table: in one line, and of whose bars none ends the cell."""
+    """Return a text for a cell of a table: in one line, with escaped bars."""
     return " ".join(re.sub(r"(?<!\\)\|", r"\\|", prose(text)).split())
 
 
@@ -38,5 +38,5 @@ TEMPLATES.filters |= {"prose": prose, "cell": cell, "code": lambda text: text.re
 
 
 def render(template: str, **shown: Any) -> str:
-    """Return the page that a template, such as "wall.md", makes of what is shown on it."""
+    """Render a template, such as "wall.md", with its data."""
     return TEMPLATES.get_template(f"{template}.jinja").render(shown)

@@ -21,7 +21,7 @@ def installed_version(package: str) -> str | None:
 
 
 def is_installed(package: str) -> bool:
-    """Say whether a package is installed, without importing it."""
+    """Return whether a package is installed, without importing it."""
     return installed_version(package) is not None
 
 
@@ -34,11 +34,11 @@ def install_line(extra: str) -> str:
 class Engine:
     """Describe an engine without loading it.
 
-    `solvers` maps what is simulated (mpm, springs) to the module with its solver, from this folder on. An engine that
-    is `deterministic` gives the same bits every time, on a GPU too, whatever else is in a batch. Solvers of a
-    `concurrent` engine run in parallel in the threads of one process; a solver of any other has all cores to
-    itself. A `profiled` engine tells the time by kernel. An engine that is not always installed comes with an `extra`
-    of this package. `newest_python` is the last Python that it has wheels for, where that is not the newest there is.
+    `solvers` maps what is simulated (mpm, springs) to the module with its solver, relative to this folder. A
+    `deterministic` engine gives the same bits every time, also on a GPU, whatever else is in a batch. Solvers of a
+    `concurrent` engine run in parallel in the threads of one process; a solver of any other engine uses all cores. A
+    `profiled` engine reports times by kernel. An optional engine has an `extra` of this package. `newest_python` is the
+    last Python with wheels for it, if that is not the newest.
     """
 
     name: str
@@ -54,7 +54,7 @@ class Engine:
         if self.newest_python and sys.version_info[:2] > self.newest_python:
             newest, here = (".".join(map(str, one)) for one in (self.newest_python, sys.version_info[:2]))
             return (
-                f"{self.name.capitalize()} has no wheels past Python {newest}, and this is Python {here}; take engine "
+                f"{self.name.capitalize()} has no wheels past Python {newest}, but this is Python {here}; use engine "
                 f"warp, or install gradscape with Python {newest}"
             )
         return f"{error}; {install_line(self.extra)}" if self.extra else str(error)
@@ -79,5 +79,5 @@ ENGINES = {
 
 
 def find_engine(name: str) -> Engine:
-    """Return what an engine can do; one that a scene brings along is taken to do what is usual."""
+    """Return the abilities of an engine; an unknown engine of a scene has the default ones."""
     return ENGINES.get(name, Engine(name))

@@ -26,7 +26,7 @@ _TRACED: dict[str, str] = {}  # the precision that JAX has last traced a functio
 
 
 def has_cuda() -> bool:
-    """Say whether JAX computes on a CUDA device by default."""
+    """Return whether JAX computes on a CUDA device by default."""
     return bool(jax.default_backend() != "cpu")
 
 
@@ -69,8 +69,8 @@ class JaxFunction:
     """A JAX function of one point, compiled for batches of several sizes, losses alone and with gradients.
 
     At most `rows` points are in one call, and smaller batches are padded to the next power of four. `mode` is reverse
-    or forward differentiation, `batch` is vmap or map. A `key` says all that `fn` computes from: what is traced is kept
-    under it, and other processes do not call `fn`.
+    or forward differentiation, `batch` is vmap or map. A `key` identifies everything that `fn` depends on. Its trace is
+    stored under the key, and other processes do not call `fn`.
     """
 
     fn: Callable[[Any], Any]
@@ -138,8 +138,8 @@ class JaxFunction:
         loss = self.fn(x)
         if isinstance(loss, tuple):
             raise SimulatorError(
-                f"{self.name} must return its loss alone, which JAX differentiates; got {len(loss)} values, so return "
-                "the first of them"
+                f"{self.name} must return only its loss, because JAX differentiates it; got {len(loss)} values, so "
+                "return the first one"
             )
         if not isinstance(loss, jax.Array):
             raise SimulatorError(f"{self.name} must return a JAX array; got {type(loss).__name__}")
@@ -174,8 +174,8 @@ class JaxFunction:
                     f"{self.name} cannot be differentiated in reverse: {_line(error)}; pass mode='forward' to from_jax"
                 ) from error
             raise SimulatorError(
-                f"{self.name} cannot be traced: {_line(error)}. It takes one point, of shape ({self.dim},), and "
-                "returns its loss; from_jax vectorizes it"
+                f"{self.name} cannot be traced: {_line(error)}. It has to take one point, of shape ({self.dim},), and "
+                "return its loss; from_jax vectorizes it"
             ) from error
 
 
@@ -208,7 +208,7 @@ def computing_in(name: str) -> Iterator[None]:
 def compiled(fn: Callable[[Any], Any], shape: tuple[int, ...], precision: str, key: str = "") -> Callable[[Any], Any]:
     """Return the compiled function of an array of one shape, in the precision that JAX computes in now.
 
-    What was traced under a `key`, by this process or another one, is not traced again.
+    A function already traced under a `key`, by this process or another one, is not traced again.
     """
     _forget_other_precision(precision)
     program = traced(fn, shape, precision, key) if key else fn

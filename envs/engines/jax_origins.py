@@ -1,4 +1,4 @@
-"""Where a gradient of JAX first is not finite: a function is evaluated and differentiated operation by operation."""
+"""Find where a gradient of JAX first is not finite: a function is evaluated and differentiated step by step."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""Programs of JAX that the next process finds again: what XLA compiled, and of MuJoCo scenes what JAX traced.
+"""Programs of JAX that later processes reuse: those compiled by XLA, and for MuJoCo scenes those traced by JAX.
 
-JAX keeps what XLA compiled, found by the program itself, the device and the versions of both. Until it can ask for
-that it has to trace the function, which takes seconds where a simulator is long. So a traced program is kept too, as
-StableHLO, and found by a key that its caller answers for: whatever the function computes has to be in it.
+JAX caches compiled programs under the program itself, the device and both versions. To look one up, it first has to
+trace the function, which takes seconds for a long simulator. So a traced program is also cached, as StableHLO, under a
+key from its caller, which must contain everything that the function depends on.
 """
 
 from __future__ import annotations
@@ -39,14 +39,14 @@ Program = Callable[[Any], Any]  # of one array: an array, or a tuple of several
 
 
 def user_folder() -> Path:
-    """Return where programs are kept unless JAX was given another folder."""
+    """Return the default folder of cached programs."""
     return user_cache_path("gradscape") / "jax-programs"
 
 
 def keep_compiled() -> None:
-    """Let JAX keep what it compiles in the user's cache, where it was not told another folder.
+    """Let JAX cache compiled programs in the user's cache, unless it has another folder.
 
-    JAX heeds `JAX_COMPILATION_CACHE_DIR`, and with `JAX_ENABLE_COMPILATION_CACHE=0` it keeps nothing.
+    JAX respects `JAX_COMPILATION_CACHE_DIR`, and with `JAX_ENABLE_COMPILATION_CACHE=0` it caches nothing.
     """
     if jax.config.values["jax_compilation_cache_dir"] is None:
         jax.config.update("jax_compilation_cache_dir", str(user_folder()))
@@ -86,10 +86,10 @@ def _compile(lowered: Any, options: dict[str, Any]) -> Program:
 
 
 def traced(fn: Program, shape: tuple[int, ...], precision: str, key: str) -> Program:
-    """Return a function of an array of one shape as a program that is kept under a key, which `fn` may have to make.
+    """Return a function of an array of one shape as a program stored under a key, traced if necessary.
 
-    The key says all that `fn` computes from; the precision, JAX's settings and its versions are added to it. Where
-    nothing can be kept, `fn` itself is returned.
+    The key contains everything that `fn` depends on; the precision, JAX's settings and its versions are added. Where
+    nothing can be stored, `fn` itself is returned.
     """
     if (folder := _folder()) is None:
         return fn

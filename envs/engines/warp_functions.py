@@ -25,7 +25,7 @@ CORRUPTS = "This may corrupt gradient computation"  # how Warp ends what it says
 
 
 class WarpCompute(Compute):
-    """Call a function that launches Warp kernels; it is `unchecked` until one has looked for what is overwritten."""
+    """Call a function that launches Warp kernels; it is `unchecked` until a search for overwritten arrays."""
 
     def __init__(
         self, unchecked: bool, call: Function, settings: Mapping[str, Any], precision: str, device: str
@@ -85,7 +85,7 @@ class WarpCompute(Compute):
         except Exception as error:  # Warp's own types of errors differ from release to release
             if wanted := _wanted_type(error, self.real):
                 raise SimulatorError(
-                    f"{self.name} launches kernels that want {wanted} where its points are {self.precision}: pass "
+                    f"{self.name} launches kernels that take {wanted}, but its points are {self.precision}; pass "
                     f"precision={wanted!r} to from_warp, or write kernels for {self.precision} ({_line(error)})"
                 ) from error
             raise
@@ -94,8 +94,8 @@ class WarpCompute(Compute):
         check_shape(tuple(losses.shape), (len(points),), "losses", self.name)
         if losses.dtype != self.real:
             raise SimulatorError(
-                f"{self.name} must return losses of {self.real.__name__}, as its points are; got "
-                f"{losses.dtype.__name__} (from_warp's precision says which)"
+                f"{self.name} must return losses of {self.real.__name__}, like its points; got "
+                f"{losses.dtype.__name__} (from_warp's precision sets the type)"
             )
         return losses
 
@@ -106,9 +106,7 @@ class WarpCompute(Compute):
                 "its losses, or sample with gradients=0 (--no-gradients)"
             )
         if not losses.requires_grad:
-            raise SimulatorError(
-                f"{self.name} returned losses that carry no gradient; make them with requires_grad=True"
-            )
+            raise SimulatorError(f"{self.name} returned losses without a gradient; make them with requires_grad=True")
         tape.backward(grads={losses: wp.ones_like(losses, requires_grad=False)})
         if points not in tape.gradients:
             raise SimulatorError(
@@ -133,8 +131,8 @@ class WarpCompute(Compute):
         found = [one for one in said if any(name in one for name in launched)]
         if found:
             raise SimulatorError(
-                f"{self.name} writes to what it has read, so its gradients would be wrong: {found[0]} "
-                "Write to an array of its own for each step, or pass check_overwrites=False to from_warp"
+                f"{self.name} overwrites an array that it has read, so its gradients would be wrong: {found[0]} Write "
+                "each step to its own array, or pass check_overwrites=False to from_warp"
             )
 
 

@@ -1,9 +1,9 @@
-"""Which kernel makes a gradient of Warp wrong: a tape is looked at launch by launch.
+"""Find the kernel that makes a gradient of Warp wrong, by examining a tape launch by launch.
 
-A gradient that is not finite begins where the tape is played backwards. One that is finite and wrong has a kernel whose
-adjoint is not that of the kernel itself: a loop that overwrites a variable, an array that is overwritten in place, or
-an adjoint of one's own. Each launch is a function f of the arrays before it; along random directions v and w,
-w f'(x) v by differences is held against v times the adjoint of w.
+A gradient that is not finite is traced by playing the tape backwards. A finite wrong one comes from a kernel whose
+adjoint is not its derivative: a loop that overwrites a variable, an array overwritten in place, or a custom adjoint.
+Each launch is a function f of the arrays before it. Along random directions v and w, w f'(x) v by differences is
+compared with v times the adjoint of w.
 """
 
 from __future__ import annotations
@@ -80,9 +80,9 @@ Arrays = dict[int, Any]  # by the identity of an argument's array
 
 
 def wrong_kernel(tape: Any) -> str:
-    """Return the first kernel of a tape whose adjoint is finite and differs from its differences; "" where none does.
+    """Return the first kernel of a tape whose adjoint is finite but differs from differences; "" where none does.
 
-    Of each kernel the first launch and the last are looked at.
+    The first and the last launch of each kernel are examined.
     """
     launches: dict[Any, list[Any]] = {}
     for launch in tape.launches:
@@ -96,7 +96,7 @@ def wrong_kernel(tape: Any) -> str:
 
 
 class _Probe:
-    """A launch as a function of the arrays before it: what it makes of copies of them."""
+    """A launch as a function of the arrays before it: its results from copies of them."""
 
     def __init__(self, launch: Any) -> None:
         self.launch, self.arguments = launch, (*launch[3], *launch[4])

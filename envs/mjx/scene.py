@@ -1,4 +1,4 @@
-"""A MuJoCo model as an environment: which of its numbers are parameters, and what the loss is."""
+"""A MuJoCo model as an environment: the choice of its parameters and of its loss."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ Mode = Literal["forward", "reverse"]
 class Parameter:
     """Say which number of a MuJoCo model a parameter is, and its bounds [`unit`].
 
-    `field` is qpos or qvel (of the state at first), ctrl (held over each segment of the episode), or a field of the
-    model: body_mass, geom_friction, dof_damping and others. `index` says which of its numbers: a row, or the name of
-    the body, geom, joint or actuator it belongs to; of a field with columns a pair of row and column.
+    `field` is qpos or qvel (of the initial state), ctrl (constant over each segment of the episode), or a field of the
+    model: body_mass, geom_friction, dof_damping and others. `index` selects one of its numbers: a row, or the name of
+    the body, geom, joint or actuator it belongs to. In a field with columns it is a pair of row and column.
     """
 
     name: str
@@ -44,10 +44,10 @@ class Parameter:
 
 @dataclass(frozen=True)
 class MjxOptions(EpisodeOptions):
-    """How gradients come, and how contacts are solved.
+    """How gradients are computed, and how contacts are solved.
 
-    `mode`: forward differentiates forward, which the solver's loops need; reverse is cheaper for many parameters, and
-    with contacts works with `iterations=1` alone. `solver` of the constraints, its `iterations`, and those of its line
+    `mode`: forward differentiates forward, which the solver's loops need. reverse is cheaper for many parameters; with
+    contacts it works only with `iterations=1`. `solver` of the constraints, its `iterations`, and those of its line
     search, `ls_iterations`; 0 takes the model's own.
     """
 
@@ -60,13 +60,12 @@ class MjxOptions(EpisodeOptions):
 class MjxScene(Environment):
     """A scene that MuJoCo simulates in JAX.
 
-    A scene derives from this class and says: `mjcf`, a file of MuJoCo's or the text of one; `parameters`, which of its
-    numbers are varied; `duration` [s]; `segments`, how many times controls are held; and `loss_of(state)`, the loss of
-    the last state, a JAX number, from its `qpos`, `qvel`, `xpos` and others. A row that ends in numbers that are not
-    finite has failed. Loss and gradient come from two programs, so that losses are the same with gradients and without.
-
-    What JAX traces of an episode is kept for other processes, unless a class has its own `act`. What somebody's
-    `loss_of` reads nobody knows, so it is traced in each process.
+    A scene derives from this class and defines: `mjcf`, a MuJoCo file or its text; `parameters`, the numbers that vary;
+    `duration` [s]; `segments`, the number of segments with constant controls; and `loss_of(state)`, the loss of the
+    last state, a JAX number, from its `qpos`, `qvel`, `xpos` and others. A row that ends in numbers that are not finite
+    has failed. Loss and gradient come from two programs, so losses are the same with and without gradients. JAX's trace
+    of an episode is cached for other processes, unless a class has its own `act`. A user's `loss_of` can read anything,
+    so each process traces it.
     """
 
     model_version = 1
@@ -100,7 +99,7 @@ class MjxScene(Environment):
 
     @property
     def time(self) -> float:
-        """How long an episode is [s]."""
+        """Duration of an episode [s]."""
         return self.steps * self.fidelity.dt
 
     def work(self) -> Work:
@@ -108,7 +107,7 @@ class MjxScene(Environment):
         return Work(self.steps * max(1, self._model.host.nbody - 1), "body-step")
 
     def episode(self, x: Float[Tensor, " dim"]) -> Episode:
-        """Return where geoms are during the episode at one point."""
+        """Return the poses of geoms during the episode at one point."""
         at, turn = self._model.frames(lambda row: self._rollout.frames(row), self._row(x)[0].numpy(), self._key)
         rows = np.unique(np.linspace(0, len(at) - 1, FRAMES).round().astype(int))
         time = torch.from_numpy(rows * self.fidelity.dt)
@@ -138,7 +137,7 @@ class MjxScene(Environment):
         self._function = self._bind(solver)
 
     def _bind(self, solver: Any) -> Any:
-        """Return the loss as a function of JAX, of which what is known is kept: all, or of somebody's the episode."""
+        """Return the loss as a JAX function, cached: whole for our scenes, the episode alone for a user's."""
         how = (self.space.dim, self.name, self.fidelity.precision, self.preferred_batch, self.options.mode)
         kinds = [kind for kind in type(self).__mro__ if issubclass(kind, MjxScene)]
         if _of_package(*kinds, self.loss_of, self.act, self._setup):
@@ -152,7 +151,7 @@ class MjxScene(Environment):
 
     @cached_property
     def _rollout(self) -> Any:
-        """What MJX simulates, which only tracing needs."""
+        """The rollout that MJX simulates; only tracing needs it."""
         return self._engine("rollout").Rollout(self._model, self._course)
 
     def _loss(self, x: Any) -> Any:
@@ -176,7 +175,7 @@ class MjxScene(Environment):
 
 
 def _of_package(*code: Any) -> bool:
-    """Say whether classes and functions are all of this package, whose files are part of what programs are found by."""
+    """Say whether all classes and functions are from this package, whose files are part of the cache key."""
     return all(one.__module__.startswith(__package__.rpartition(".")[0] + ".") for one in code)
 
 
@@ -186,7 +185,7 @@ def draw(
     turn: Float[Tensor, "frame geom 3 3"],
     geoms: Sequence[Mapping[str, Any]],
 ) -> Episode:
-    """Return the episode of geoms that move; MuJoCo's z is upwards, ours y."""
+    """Return the episode of moving geoms; MuJoCo's z is upwards, ours is y."""
     up = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]], dtype=torch.float64)
     at, turn = at @ up.T, up @ turn @ up.T
     parts, points = list[Part](), dict[str, Tensor]()
@@ -208,7 +207,7 @@ def draw(
 
 
 def _view(at: Tensor, geoms: Sequence[Mapping[str, Any]], ground: bool) -> View:
-    """Return what all that moves is seen in, with some room around."""
+    """Return a view of everything that moves, with a margin."""
     moving = [number for number, geom in enumerate(geoms) if geom["shape"] != "plane"]
     room = max(max(geoms[number]["size"]) for number in moving) * 2
     lower, upper = at[:, moving].amin(dim=(0, 1)) - room, at[:, moving].amax(dim=(0, 1)) + room

@@ -38,13 +38,13 @@ def _speeds(bound: float) -> tuple[Parameter, ...]:
 
 
 class Drop(MjxScene):
-    """Drop a ball onto the ground, so that it lies 0.5 m ahead after 0.6 s.
+    """Drop a ball onto the ground, so that it is 0.5 m ahead after 0.6 s.
 
-    Model: MuJoCo's, in JAX: a ball of radius 0.1 m and mass 1 kg falls from 1 m onto a plane, with MuJoCo's own soft
-    contact and friction (coefficient 1); semi-implicit Euler, dt 1/500 s at standard.
+    Model: MuJoCo's, in JAX. A ball of radius 0.1 m and mass 1 kg falls from 1 m onto a plane, with MuJoCo's own soft
+    contact and friction (coefficient 1). Semi-implicit Euler, dt 1/500 s at standard.
     Parameters: initial velocity x, y, z [m/s], z upwards.
-    Loss: squared distance on the ground to (0.5, 0) m at the end [m^2]. A ball that is dropped straight down (example
-    `straight`) does not slide when it touches, which is where gradients of such contacts are worth a look.
+    Loss: squared distance on the ground to (0.5, 0) m at the end [m^2]. A ball dropped straight down (example
+    `straight`) does not slide when it touches. Such contacts are an interesting case for gradients.
     """
 
     name = "mjx-drop"
@@ -62,9 +62,9 @@ class Drop(MjxScene):
 class MjxBounce(MjxScene):
     """Throw a ball so that it is at the target after 2 s, as in `bounce`, by MuJoCo.
 
-    Model: MuJoCo's, in JAX: a ball of radius 0.1 m and mass 1 kg flies from (-0.5, 0, 1) m under gravity; the plane
-    pushes back by MuJoCo's contact with the stiffness 1e4 and the damping 10 of `bounce` for each kg, and rubs
-    (coefficient 0.25), which spins the ball; semi-implicit Euler, dt 1/500 s at standard.
+    Model: MuJoCo's, in JAX. A ball of radius 0.1 m and mass 1 kg flies from (-0.5, 0, 1) m under gravity. The plane
+    pushes back by MuJoCo's contact with the stiffness 1e4 and the damping 10 of `bounce` per kg. It has friction
+    (coefficient 0.25), which spins the ball. Semi-implicit Euler, dt 1/500 s at standard.
     Parameters: initial velocity x, y, z [m/s], z upwards; `bounce` has y upwards.
     Loss: squared distance of the ball's centre to the target (2, 0, 1) m after 2 s [m^2].
     """
@@ -93,7 +93,7 @@ LINK = """
 
 
 def _chain() -> str:
-    """Return a cart so heavy that no torque moves it, and three uniform rods of 1 m that hang from it."""
+    """Return a cart too heavy for any torque to move, and three uniform rods of 1 m that hang from it."""
     inner = ""
     for k, mass in ((3, 0.25), (2, 0.5), (1, 1.0)):
         inner = LINK.format(k=k, z=0 if k == 1 else -1, mass=mass, inertia=mass / 12, inner=inner)
@@ -115,7 +115,7 @@ def _chain() -> str:
 
 @dataclass(frozen=True)
 class ChainOptions(MjxOptions):
-    """Nothing touches anything, so the chain is differentiated in reverse unless told otherwise."""
+    """The chain has no contacts, so it is differentiated in reverse by default."""
 
     mode: Mode = "reverse"
 
@@ -123,10 +123,11 @@ class ChainOptions(MjxOptions):
 class MjxCartpole(MjxScene):
     """Swing up a chain of three links, as in `cartpole`, by MuJoCo.
 
-    Model: MuJoCo's, in JAX: three uniform rods of 1 m with masses 1, 0.5 and 0.25 kg hang from a cart, at rest at
-    first, under gravity and the torques of three motors; the cart takes each velocity at once, as by an impulse, and
-    is so heavy that nothing else moves it. Classical Runge-Kutta, dt 0.01 s at standard.
-    Parameters and loss are those of `cartpole`, which this scene was made to be held against.
+    Model: MuJoCo's, in JAX. Three uniform rods of 1 m with masses 1, 0.5 and 0.25 kg hang from a cart, initially at
+    rest, under gravity and the torques of three motors. The cart takes each velocity instantly, as by an impulse, and
+    is too heavy for anything else to move it. Classical Runge-Kutta, dt 0.01 s at standard.
+    Parameters: those of `cartpole`.
+    Loss: that of `cartpole`, so that the two scenes can be compared.
     """
 
     name = "mjx-cartpole"
@@ -162,11 +163,11 @@ class MjxCartpole(MjxScene):
 
 
 class Push(MjxScene):
-    """Push a box across a rough floor with a ball, so that it lies at (0.6, 0.15) m after 1 s.
+    """Push a box across a rough floor with a ball, so that it is at (0.6, 0.15) m after 1 s.
 
-    Model: MuJoCo's, in JAX: a box of 0.2 m and 1 kg lies at the origin on a plane (friction 0.5); a ball of radius
-    0.05 m on two rails pushes it, whose velocity follows its control. Semi-implicit Euler, dt 1/500 s at standard.
-    Parameters: five times the wanted velocity x and y of the ball [m/s], each held for 0.2 s.
+    Model: MuJoCo's, in JAX. A box of 0.2 m and 1 kg lies at the origin on a plane (friction 0.5). A ball of radius 0.05
+    m on two rails pushes it; its velocity follows its control. Semi-implicit Euler, dt 1/500 s at standard.
+    Parameters: five target velocities x and y of the ball [m/s], each lasting 0.2 s.
     Loss: squared distance of the box's centre on the floor to (0.6, 0.15) m [m^2].
     """
 
@@ -224,7 +225,7 @@ def _slider(name: str, up: str, radius: float, damping: float = 0.0) -> str:
 
 
 def _ball(gravity: float, damping: float, walls: str = "") -> str:
-    """Return a ball that slides in an upright plane, over the ground and among walls."""
+    """Return a ball that slides in an upright plane, above the ground and between walls."""
     contact = BOUNCY.format(damping=damping)
     ball = _slider("ball", "z", RADIUS, damping)
     return f"""
@@ -236,7 +237,7 @@ def _ball(gravity: float, damping: float, walls: str = "") -> str:
 
 
 def _start(x: tuple[float, float], z: tuple[float, float], vx: tuple[float, float], vz: tuple[float, float]) -> Any:
-    """Return the parameters of a ball at first, each given by its middle and half width."""
+    """Return the parameters of a ball's initial state, each given by its centre and half width."""
     named = (("position x", "qpos", "ball x", x, "m"), ("position z", "qpos", "ball z", z, "m"))
     named += (("velocity x", "qvel", "ball x", vx, "m/s"), ("velocity z", "qvel", "ball z", vz, "m/s"))  # type: ignore[assignment]
     return tuple(
@@ -245,11 +246,12 @@ def _start(x: tuple[float, float], z: tuple[float, float], vx: tuple[float, floa
 
 
 class MjxBounceOnce(MjxScene):
-    """Let a ball bounce off the ground once, as in `bounce-once`, by MuJoCo; the loss is how high it is then.
+    """Let a ball bounce off the ground once, as in `bounce-once`, by MuJoCo; the loss is its height afterwards.
 
-    Model: MuJoCo's, in JAX: a ball of radius 0.1 m and mass 1 kg slides in an upright plane, without gravity and
-    friction; the ground pushes back by MuJoCo's contact with stiffness 1e4 for each kg, without damping; semi-implicit
-    Euler, dt 1/500 s at standard. The contact lasts pi/100 s, by which its slopes differ from those of an impact.
+    Model: MuJoCo's, in JAX. A ball of radius 0.1 m and mass 1 kg slides in an upright plane, without gravity and
+    friction. The ground pushes back by MuJoCo's contact with stiffness 1e4 per kg, without damping. Semi-implicit
+    Euler, dt 1/500 s at standard. The contact lasts pi/100 s, which makes its derivatives differ from those of an
+    impact.
     Parameters: initial position x, z [m] and velocity x, z [m/s], z upwards.
     Loss: height of the ball's centre after 1 s [m].
     """
@@ -271,9 +273,9 @@ class MjxBounceOnce(MjxScene):
 class MjxGroundWall(MjxScene):
     """Throw a ball at the ground and a wall, as in `ground-wall`, by MuJoCo, so that it comes back to the target.
 
-    Model: MuJoCo's, in JAX: a ball of radius 0.1 m and mass 1 kg slides in an upright plane without friction; ground
-    and wall push back by MuJoCo's contact with stiffness 1e4 and damping 5.3 for each kg, after which a rebound is 0.92
-    times as fast; semi-implicit Euler, dt 1/500 s at standard.
+    Model: MuJoCo's, in JAX. A ball of radius 0.1 m and mass 1 kg slides in an upright plane without friction. Ground
+    and wall push back by MuJoCo's contact with stiffness 1e4 and damping 5.3 per kg, so that the rebound has 0.92 times
+    the speed. Semi-implicit Euler, dt 1/500 s at standard.
     Parameters: initial position x, z [m] and velocity x, z [m/s], z upwards.
     Loss: squared distance of the ball's centre to (-2, 1.5) m after 0.6 s [m^2].
     """
@@ -295,13 +297,14 @@ class MjxGroundWall(MjxScene):
 
 
 class MjxTwoBalls(MjxScene):
-    """Push a ball against another one, as in `two-balls`, by MuJoCo, so that this is at the origin after 1 s.
+    """Push a ball against a second one, as in `two-balls`, by MuJoCo, so that the second one ends at the origin.
 
-    Model: MuJoCo's, in JAX: two balls of radius 0.2 m and mass 1 kg slide on a plane without friction and gravity, and
-    push each other by MuJoCo's contact with stiffness 1e4 for each kg, without damping; semi-implicit Euler, dt 1/500 s
-    at standard.
+    Model: MuJoCo's, in JAX. Two balls of radius 0.2 m and mass 1 kg slide on a plane without friction and gravity. They
+    push each other by MuJoCo's contact with stiffness 1e4 per kg, without damping. Semi-implicit Euler, dt 1/500 s at
+    standard.
     Parameters: initial positions x, y [m] and velocities x, y [m/s] of both, and the push x, y on the first [m/s²].
-    Loss: squared distance of the second ball to the origin after 1 s, and 0.1 times the push's square by time [m²].
+    Loss: squared distance of the second ball to the origin after 1 s, plus 0.1 times the squared push times its
+    duration [m²].
     """
 
     name = "mjx-two-balls"
@@ -322,7 +325,7 @@ class MjxTwoBalls(MjxScene):
     loss_unit = "m²"
 
     def loss_of(self, state: Any) -> Any:
-        """Return the squared distance to the origin, and what the push costs."""
+        """Return the squared distance to the origin plus the cost of the push."""
         cost = PRICE * self.time * (state.ctrl[0] ** 2 + state.ctrl[1] ** 2)
         return state.qpos[2] ** 2 + state.qpos[3] ** 2 + cost
 

@@ -1,4 +1,4 @@
-"""Plasticine that tools push into a target shape: the environment behind eight scenes."""
+"""Plasticine that tools push into a target shape: the environment of eight scenes."""
 
 from __future__ import annotations
 
@@ -42,10 +42,10 @@ THIRDS = ((1 / 3, 2 / 3), (2 / 3, 1 / 3))  # of a cell along x and z: with 0, wh
 
 
 def fidelities(*, draft: tuple[int, int, int], standard: tuple[int, int, int]) -> dict[str, Fidelity]:
-    """Return a scene's fidelities, of (cells per metre, particles, substeps of a control step) each.
+    """Return a scene's fidelities from (cells per metre, particles, substeps of a control step) of each.
 
-    The reference has a finer grid than all standards and, as they have, about the longest step that is stable on it:
-    grid and step are refined together.
+    The reference has a finer grid than every standard. Like them, it takes about the longest step that is stable on its
+    grid, so grid and step are refined together.
     """
     settings = {"draft": draft, "standard": standard, "reference": (96, 34_000, 30)}
     return {
@@ -62,12 +62,13 @@ def fidelities(*, draft: tuple[int, int, int], standard: tuple[int, int, int]) -
 
 @dataclass(frozen=True)
 class PhysicsOptions(EpisodeOptions):
-    """What the model's parts are multiplied by, 1 being the scene's own and 0 leaving the part out.
+    """Factors on parts of the model: 1 keeps the scene's own value, and 0 leaves the part out.
 
-    `tool_friction` and `floor_friction` (a sticky floor's is 10, and less than that rubs), `yield_stress` (1e6: an
-    elastic body), `poisson` (its ratio) and `gravity`. `softness` [1/m] is that of the shell through which tools are
-    felt (1e5: they are felt at their surface alone). Without `walls` the room has neither walls nor lid, and an episode
-    escapes where plasticine leaves the grid. Raises ValueError where one is below 0.
+    `tool_friction` and `floor_friction` scale Coulomb friction. A sticky floor has friction 10; with less, bodies slide
+    and rub on it. `yield_stress` (1e6: an elastic body). `poisson` scales Poisson's ratio, `gravity` the gravity.
+    `softness` [1/m] is no factor but the value for the shell through which tools act (1e5: tools act at their surface
+    only). Without `walls` the room has neither walls nor lid, and an episode gets status ESCAPED when plasticine leaves
+    the grid. Raises ValueError where one is below 0.
     """
 
     tool_friction: float = 1.0
@@ -88,7 +89,7 @@ class PhysicsOptions(EpisodeOptions):
 
 @dataclass(frozen=True)
 class Piece:
-    """A piece of plasticine that weighs as much as so many of PlasticineLab's `particles`."""
+    """A piece of plasticine that weighs as much as this many of PlasticineLab's `particles`."""
 
     shape: Shape
     particles: int
@@ -96,9 +97,9 @@ class Piece:
 
 @dataclass(frozen=True)
 class Anchor:
-    """A tool that the parameters move: from `start` [m], at most by `step` per control step, within its bounds.
+    """A tool that the parameters move: from `start` [m], by at most `step` per control step, within its bounds.
 
-    A roller's step is (spin [rad], turn [rad], height [m]).
+    The step of a roller is (spin [rad], turn [rad], height [m]).
     """
 
     tool: Tool
@@ -109,7 +110,7 @@ class Anchor:
 
     @property
     def reach(self) -> Point:
-        """How far the tool gets along each axis in one control step [m]."""
+        """Largest move of the tool along each axis in one control step [m]."""
         if self.tool.kind is Kind.ROLLER:
             rolled = self.tool.size[1] * self.step[0]
             return rolled, self.step[2], rolled
@@ -118,10 +119,10 @@ class Anchor:
 
 @dataclass(frozen=True)
 class Scene:
-    """All that makes one scene; `posts` are tools that stay, `target` is empty where a demonstration makes it.
+    """The data of one scene; `posts` are fixed tools, and `target` is empty if a demonstration makes the target.
 
-    `yield_stress` [Pa] is the norm of the stress's deviator where plasticine yields, as in PlasticineLab. Von Mises'
-    stress is sqrt(3/2) times as large: a bar of "50 Pa" yields in tension at 61 Pa.
+    `yield_stress` [Pa] is the norm of the deviatoric stress at yield, as in PlasticineLab. Von Mises' stress is
+    sqrt(3/2) times as large: a bar of "50 Pa" yields in tension at 61 Pa.
     """
 
     pieces: tuple[Piece, ...]
@@ -138,7 +139,7 @@ class Scene:
         return (*(anchor.tool for anchor in self.anchors), *(tool for tool, _ in self.posts))
 
     def altered(self, options: PhysicsOptions) -> Scene:
-        """Return the scene with its material and frictions as options say."""
+        """Return the scene with its material and frictions changed by the options."""
         return replace(
             self,
             yield_stress=self.yield_stress * options.yield_stress,
@@ -149,7 +150,7 @@ class Scene:
         )
 
     def room(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the corners of what tools can push bodies through [m]: where walls stand."""
+        """Return the corners of the room through which tools can push bodies [m]: the positions of the walls."""
         corners = [shape.bounds for shape in (*(piece.shape for piece in self.pieces), *self.target)]
         reach = np.clip(STEPS * np.max([anchor.reach for anchor in self.anchors], axis=0), *ROOM)
         lower = np.min([low for low, _ in corners], axis=0) - reach
@@ -158,7 +159,7 @@ class Scene:
 
 
 def model(scene: Scene, fidelity: Fidelity, steps: int = STEPS, options: PhysicsOptions = PhysicsOptions()) -> Model:
-    """Return a scene's model of so many control steps: bodies at rest, tools, and a grid that covers its room."""
+    """Return a scene's model with this many control steps: bodies at rest, tools, and a grid that covers its room."""
     dx = 1.0 / fidelity.resolution
     scene = scene.altered(options)
     lower, upper = scene.room()
@@ -204,7 +205,7 @@ def _boundary(scene: Scene, dt: float, options: PhysicsOptions) -> ToolsInRoom:
 
 
 def _rub(tool: Tool, factor: float) -> Tool:
-    """Return the tool with so many times its friction."""
+    """Return the tool with its friction multiplied by a factor."""
     return replace(tool, friction=factor * tool.friction)
 
 
@@ -220,7 +221,7 @@ def _bodies(scene: Scene, fidelity: Fidelity, dx: float) -> tuple[Body, ...]:
 
 
 def _sort_by_cell(x: np.ndarray, dx: float) -> np.ndarray:
-    """Return particles cell by cell, so that those that meet the same nodes are neighbours in memory."""
+    """Return particles cell by cell, so that particles at the same nodes are neighbours in memory."""
     return np.asarray(x[np.lexsort(np.floor(x / dx).T[::-1])])
 
 
@@ -289,10 +290,10 @@ REACH = 0.1  # what a policy measures lengths by [m]
 
 @dataclass(frozen=True)
 class PlasticineOptions(PhysicsOptions):
-    """`loss` is of the final frame, or summed over all control steps.
+    """`loss` is that of the final frame, or summed over all control steps.
 
-    `density`, `sdf` and `contact` are the weights of its terms: the body's density against the target's, its distance
-    from the target, and the distance of the tools from it.
+    `density`, `sdf` and `contact` are the weights of its terms. They compare the body's density with the target's, and
+    measure the body's distance from the target and the tools' distance from the body.
     """
 
     loss: Literal["final", "sum"] = "final"
@@ -304,33 +305,34 @@ class PlasticineOptions(PhysicsOptions):
 class Plasticine(MpmScene):
     """Model: MLS-MPM, fixed-corotated elasticity, von Mises plasticity in log strain; x right, y up, z to the front.
 
-    A yield stress is the norm of the stress's deviator: in tension a body yields at sqrt(3/2) times as much.
-    Young's modulus 5000 Pa at a density of 1 kg/m^3; gravity 30 m/s^2; 0.1 s. Tools are signed distances that move as
-    the parameters say and are felt by grid nodes, with Coulomb friction, through a shell (3.5 mm) in which their
-    influence falls to nothing. The floor is thick: its nodes reach up to y = 1/32 m, and what lies lower rests among
-    them.
-    Parameters: 5 segments x tools x 3, each a share of the farthest a tool can go, held for 10 control steps.
-    Loss at the end, or summed over control steps: 10 density + 10 sdf + 500 contact (options; `terms` has each alone).
-    density = sum |m - m*| over the masses of grid nodes [kg]; sdf = sum m D* [kg m], D* the distance to the target's
-    nearest node; contact = sum over tools of the squared distance to the closest particle [m^2]. The weight of contact
-    is ours: the paper raised it and does not say to what. At draft 64 random points of table lose 8 to 104 with it
-    (5 to 95 %), in the median 71 % of that contact; the paper's colour bar goes from 14 to 86.
-    PlasticineLab sums the loss over 50 control steps; the default is that of the final frame, because the paper's bars
-    are. Summed, density and sdf of bodies that nothing touches alone come to 271 in assembly, 678 in triple-move and 46
-    in writer, whose bars end at 44, 85 and 15; of the final frame they are 5.4, 13.6 and 0.9 (draft, contact=0).
-    Targets are shapes, or what the scene's demonstration (an example) leaves at the same fidelity: at each of them a
-    solution is known.
-    Simplifications: a tool that only translates carries no rotation; a slippery room ends where tools push nothing, or
-    0.5 m beyond the bodies; particles are spread evenly whatever a body weighs (upstream, weight follows the number
-    drawn). Departures from upstream: as many substeps as the grid needs (10 to 25 a control step at standard, 19
-    upstream), an exact distance field, softness 666 everywhere, no jump at a shell's end nor on a sticky floor; a shell
-    acts per time, not per substep; only the closest particle has the contact's gradient, and undeformed bodies have
-    theirs.
-    Refine step and grid together. Velocities pass through the grid once per substep, which damps what is as short as a
-    few cells: on a given grid the shorter the step, the more. On 64 cells with 4000 particles the loss of one of
-    assembly's random episodes grows by 1.3, 1.5 and 1.5 % as the step halves from 2e-4 to 2.5e-5 s. That is no chaos:
-    with 2000 particles at 1e-4 s, parameters 1e-8 apart end at most 1.3e-8 m apart at four random points of table and
-    assembly.
+    A yield stress is the norm of the deviatoric stress: in tension a body yields at sqrt(3/2) times as much. Young's
+    modulus is 5000 Pa, density 1 kg/m^3, gravity 30 m/s^2; an episode lasts 0.1 s. Tools are signed distances that
+    follow the parameters. They act on grid nodes, with Coulomb friction, through a shell (3.5 mm) in which their
+    influence fades to nothing. The floor is thick: its nodes reach up to y = 1/32 m, and material below that height
+    rests among them.
+    Parameters: 5 segments x tools x 3. Each is a fraction of the tool's largest possible move, and lasts 10 control
+    steps.
+    Loss: 10 density + 10 sdf + 500 contact, at the end or summed over control steps (options; `terms` has each alone).
+    density = sum |m - m*| over the masses of grid nodes [kg]. sdf = sum m D* [kg m], with D* the distance to the
+    target's nearest node. contact = sum over tools of the squared distance to the closest particle [m^2]. The weight of
+    contact is ours: the paper raised it without giving a value. At draft, 64 random points of table have losses of 8 to
+    104 (5 to 95 %) with our weight, and the median share of contact is 71 %. The paper's colour bar goes from 14 to 86.
+    PlasticineLab sums the loss over 50 control steps. Our default is the loss of the final frame, because the paper's
+    colour bars match it. Summed, density and sdf of untouched bodies alone come to 271 in assembly, 678 in triple-move
+    and 46 in writer, whose bars end at 44, 85 and 15. At the final frame they are 5.4, 13.6 and 0.9 (draft, contact=0).
+    Targets: shapes, or the result of the scene's demonstration (an example) at the same fidelity. So a solution is
+    known at every fidelity.
+    Simplifications: a tool that only translates carries no rotation. A slippery room ends at the reach of the tools, or
+    0.5 m beyond the bodies. Particles are spread evenly whatever a body weighs (upstream, its weight follows its number
+    of particles). Departures from upstream: as many substeps as the grid needs (10 to 25 per control step at standard,
+    19 upstream), an exact distance field, softness 666 everywhere, and no jump at a shell's end or on a sticky floor. A
+    shell acts per time, not per substep. Only the closest particle gets the contact's gradient. Undeformed bodies have
+    gradients too.
+    Refinement: refine step and grid together. Velocities pass through the grid once per substep, which damps motion on
+    the scale of a few cells, and more so with shorter steps on a given grid. On 64 cells with 4000 particles, the loss
+    of one random episode of assembly grows by 1.3, 1.5 and 1.5 % as the step is halved from 2e-4 to 2.5e-5 s. That is
+    not chaos: with 2000 particles at 1e-4 s, parameters 1e-8 apart end at most 1.3e-8 m apart at four random points of
+    table and assembly.
     Source: PlasticineLab (Huang et al., ICLR 2021), as used in "Rethinking Optimization with Differentiable Simulation
     from a Global Perspective" (CoRL 2022).
     """
@@ -364,16 +366,16 @@ class Plasticine(MpmScene):
         return super().memory() + Raster.bytes_per_row(self.model)
 
     def replicas(self) -> Mapping[str, Environment]:
-        """Return the scene on grids moved along the floor by thirds of a cell, and of other particles.
+        """Return the scene on grids moved along the floor by thirds of a cell, and with other particles.
 
-        Targets are each replica's own. Along y the grid stays, because the floor is as high as its highest node.
+        Each replica has its own target. Along y the grid stays, because the floor is as high as its highest node.
         """
         places = {f"grid moved by {x:.2f}, {z:.2f} cells": {"shift_x": x, "shift_z": z} for x, z in THIRDS}
         changes = {**places, "other particles": {"particle_seed": 1}}
         return self._replicas_of({name: {"settings": settings} for name, settings in changes.items()})
 
     def tools(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch step_plus_1 slot 3"]:
-        """Return where tools are at the ends of control steps [m]; a roller's second slot is (spin, yaw, 0) [rad]."""
+        """Return tool positions at the ends of control steps [m]; a roller's second slot is (spin, yaw, 0) [rad]."""
         shares, count = hold(x.view(len(x), SEGMENTS, -1), STEPS), self.model.steps
         steps = extend(shares, count, then=torch.zeros_like(shares[:, :1])).view(len(x), count, -1, 3)
         slots: list[Tensor] = []
@@ -436,7 +438,7 @@ class Plasticine(MpmScene):
     def _terms(
         self, stage: Stage, end: Float[Tensor, "batch particle 3"], tools: Float[Tensor, "batch slot 3"]
     ) -> Float[Tensor, "batch term"]:
-        """Return the loss's terms where particles and tools are."""
+        """Return the loss's terms at these positions of particles and tools."""
         shape = compare(stage.raster(end).double(), self._target)
         touch = contact(end.double(), tools, [anchor.tool for anchor in self.scene.anchors])
         return torch.cat([shape, touch[:, None]], dim=1)
@@ -459,12 +461,12 @@ class Plasticine(MpmScene):
 
     @cached_property
     def _target(self) -> Target:
-        """What a shape is compared with, on this model's grid."""
+        """Target of the shape, on this model's grid."""
         with self._making:
             return Target.of(self.model, self._target_particles(), self.device)
 
     def _target_particles(self) -> np.ndarray:
-        """Return where the target's particles are [m]."""
+        """Return the positions of the target's particles [m]."""
         if self.scene.target:
             return target(self.scene, self.fidelity)
         device = "cpu" if self.model.particle_substeps <= MAX_CPU_WORK else self.device

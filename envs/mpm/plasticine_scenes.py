@@ -24,8 +24,8 @@ def _parse_demonstration(text: str) -> dict[str, tuple[float, ...]]:
 class Assembly(Plasticine):
     """Lift a ball with two spheres and set it on a box.
 
-    A box 0.16 m wide on a sticky floor, a ball of 0.06 m radius 0.3 m to its left; yield stress 100 Pa. The target is
-    the ball on the box, where upstream has it.
+    The box is 0.16 m wide and stands on a sticky floor; the ball, of 0.06 m radius, is 0.3 m to its left. Yield stress
+    100 Pa. The target is the ball on the box, at its upstream position.
     """
 
     name = "assembly"
@@ -50,8 +50,8 @@ class Assembly(Plasticine):
 class Pinch(Plasticine):
     """Press a dent into the front of a cube with a sphere.
 
-    A cube 0.2 m wide on a sticky floor, a sphere of 0.04 m radius above it; yield stress 50 Pa. Weighs as much as
-    PlasticineLab's target, not as its cube, which weighs 0.6 of it.
+    The cube is 0.2 m wide and stands on a sticky floor; a sphere of 0.04 m radius is above it. Yield stress 50 Pa. The
+    cube weighs as much as PlasticineLab's target. PlasticineLab's cube weighs 0.6 of its target.
     """
 
     name = "pinch"
@@ -84,8 +84,8 @@ class Pinch(Plasticine):
 class RollingPin(Plasticine):
     """Roll a slab flat with a rolling pin.
 
-    A slab 0.3 m wide and 0.1 m high on a rubbing floor; the pin (0.3 m, radius 0.03 m) rolls without slip, turns about
-    the vertical and rises or sinks; yield stress 50 Pa.
+    The slab is 0.3 m wide and 0.1 m high, on a floor with friction. The pin (0.3 m, radius 0.03 m) rolls without slip,
+    turns about the vertical and rises or sinks. Yield stress 50 Pa.
     """
 
     name = "rolling-pin"
@@ -110,8 +110,9 @@ class RollingPin(Plasticine):
 class Rope(Plasticine):
     """Bend a rope around a post by its two ends.
 
-    A rope 0.6 m long on a rubbing floor, two spheres in front of it, a post of 0.1 m radius behind; yield stress 50 Pa.
-    The target is a full ring around the post, which the rope is too short for: its loss cannot vanish.
+    The rope is 0.6 m long, on a floor with friction. Two spheres are in front of it, and a post of 0.1 m radius is
+    behind it. Yield stress 50 Pa. The target is a full ring around the post. The rope is too short for it, so its loss
+    cannot vanish.
     """
 
     name = "rope"
@@ -138,9 +139,10 @@ class Rope(Plasticine):
 class Table(Plasticine):
     """Bend one leg of a table outwards with a sphere.
 
-    Four legs that weigh as much as the top each, on a rubbing floor, a sphere of 0.04 m radius between them; its
-    vertical parameters do nothing; yield stress 50 Pa, Poisson's ratio 0.05. The demonstration hits the leg just before
-    the end: pushed for longer it takes the table along, because a leg bends at about the force that the floor holds.
+    Each of the four legs weighs as much as the top. They stand on a floor with friction; a sphere of 0.04 m radius is
+    between them, and its vertical parameters have no effect. Yield stress 50 Pa, Poisson's ratio 0.05. The
+    demonstration hits the leg just before the end. A longer push would move the whole table, because a leg bends at
+    about the force at which the floor gives way.
     """
 
     name = "table"
@@ -168,7 +170,8 @@ class Table(Plasticine):
 class Torus(Plasticine):
     """Press a ring into a slab.
 
-    A slab 0.3 m wide and 0.1 m high on a sticky floor, a torus (0.05 m, tube 0.03 m) above it; yield stress 50 Pa.
+    The slab is 0.3 m wide and 0.1 m high, on a sticky floor; a torus (0.05 m, tube 0.03 m) is above it. Yield stress 50
+    Pa.
     """
 
     name = "torus"
@@ -195,8 +198,8 @@ class Torus(Plasticine):
 class TripleMove(Plasticine):
     """Carry three blocks through the air with three pairs of spheres.
 
-    Blocks 0.1 m wide on a rubbing floor, each between two spheres of 0.03 m radius; yield stress 200 Pa. The targets
-    hang in the air, so that blocks must be lifted and held.
+    The blocks are 0.1 m wide, on a floor with friction, each between two spheres of 0.03 m radius. Yield stress 200 Pa.
+    The targets are in the air, so the blocks have to be lifted and held.
     """
 
     name = "triple-move"
@@ -228,8 +231,8 @@ class TripleMove(Plasticine):
 class Writer(Plasticine):
     """Write a stroke into a slab with a pen.
 
-    A slab 0.3 m wide and 0.1 m high on a sticky floor, a frictionless upright capsule that starts 0.03 m deep in it;
-    yield stress 50 Pa.
+    The slab is 0.3 m wide and 0.1 m high, on a sticky floor. The pen is a frictionless upright capsule that starts 0.03
+    m deep in it. Yield stress 50 Pa.
     """
 
     name = "writer"

@@ -1,4 +1,4 @@
-"""What the MLS-MPM scenes share: tools that controls move, a pool of solvers, losses by where particles are."""
+"""Common parts of the MLS-MPM scenes: tools moved by controls, a pool of solvers, losses from particle positions."""
 
 from __future__ import annotations
 
@@ -52,10 +52,10 @@ class MpmScene(Environment):  # noqa: D101 -- `about` prints the docstrings of a
 
     @abc.abstractmethod
     def tools(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch step_plus_1 slot 3"]:
-        """Return where tools are at the ends of control steps [m]."""
+        """Return tool positions at the ends of control steps [m]."""
 
     def end(self, x: Float[Tensor, " dim"]) -> Float[Tensor, "particle 3"]:
-        """Return where particles are at the end of the episode at one point [m]."""
+        """Return particle positions at the end of the episode at one point [m]."""
         with self._solvers.lend() as stage:
             return copied(stage.solver.run(self.tools(self._row(x)))[0])
 
@@ -80,23 +80,23 @@ class MpmScene(Environment):  # noqa: D101 -- `about` prints the docstrings of a
 
     @abc.abstractmethod
     def _losses(self, stage: Stage, step: int, end: Tensor, paths: Tensor) -> Float[Tensor, " batch"]:
-        """Return losses by where particles and tools are before a control step, differentiably by both."""
+        """Return losses from the positions of particles and tools before a control step, differentiable in both."""
 
     @abc.abstractmethod
     def _length_scale(self, tools: Float[Tensor, "batch step_plus_1 slot 3"], points: int) -> Tensor | float:
-        """Return what a policy measures the places of so many points by [m], the tools' slots last."""
+        """Return the length unit [m] in which a policy sees each point, the tools' slots last."""
 
     @abc.abstractmethod
     def _body_names(self) -> Sequence[str]:
-        """Return what bodies are called in an episode."""
+        """Return the names of the bodies in an episode."""
 
     @abc.abstractmethod
     def _tool_names(self) -> Sequence[str]:
-        """Return what tools' slots are called in an episode."""
+        """Return the names of the tools' slots in an episode."""
 
     @abc.abstractmethod
     def _parts(self, bodies: Sequence[Tensor], tools: Float[Tensor, "frame slot 3"]) -> tuple[Part, ...]:
-        """Return what is to be drawn."""
+        """Return the parts to draw."""
 
     @staticmethod
     def _make_stage(
@@ -118,7 +118,7 @@ class MpmScene(Environment):  # noqa: D101 -- `about` prints the docstrings of a
             compile_all(self.model, self.device)
 
     def _loss_steps(self) -> Sequence[int]:
-        """Return the control steps before which losses are taken, the episode's end being one."""
+        """Return the control steps before which losses are computed, including the end of the episode."""
         return (self.model.steps,)
 
     def _evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
@@ -143,7 +143,7 @@ class MpmScene(Environment):  # noqa: D101 -- `about` prints the docstrings of a
         return Evaluation(loss, slope, torch.where(escaped, int(Status.ESCAPED), int(Status.OK)))
 
     def _observe(self, x: Float[Tensor, "batch dim"], decision: int) -> Float[Tensor, "batch feature"]:
-        """Watch bodies and tools: at the start, before the last control step, and after it."""
+        """Observe bodies and tools: at the start, before the last control step, and after it."""
         step, tools = decision * STEPS // SEGMENTS, self.tools(x)
         with self._solvers.lend() as stage:
             if step:

@@ -1,4 +1,4 @@
-"""What a plasticine loss is made of: the target's mass and distance field, how far tools are from plasticine."""
+"""Parts of a plasticine loss: the target's mass and distance field, and the distance of tools from plasticine."""
 
 from __future__ import annotations
 
@@ -143,9 +143,10 @@ class Target:
 
 
 def compare(mass: Float[Tensor, "batch node"], target: Target) -> Float[Tensor, "batch 2"]:
-    """Return how far masses at nodes are from a target's [kg], and from where it is [kg m].
+    """Return the difference of node masses from a target's [kg], and their distance from it [kg m].
 
-    These are sum |m - m_target| and sum m d. Rows are added up one by one: a batched sum rounds as its batch is large.
+    These are sum |m - m_target| and sum m d. Rows are summed one by one, because a batched sum rounds differently with
+    each batch size.
     """
     rows = mass.unbind(dim=0)
     return torch.stack([torch.stack([(row - target.mass).abs().sum(), (row * target.distance).sum()]) for row in rows])
@@ -156,7 +157,7 @@ def contact(
 ) -> Float[Tensor, " batch"]:
     """Return the sum over movable tools of the squared distance to the closest particle [m^2].
 
-    The closest one alone has a gradient: it is found first, and its distance is then the loss.
+    Only the closest particle has a gradient: it is found first, and its distance is then the loss.
     """
     total = x.new_zeros(len(x))
     slot = 0
@@ -172,7 +173,7 @@ def contact(
 def distance_outside(
     tool: Tool, x: Float[Tensor, "*batch 3"], pose: Float[Tensor, "*batch slot 3"]
 ) -> Float[Tensor, "*batch"]:
-    """Return how far points are from a tool [m], 0 inside; `pose` is its position, for a roller then its angles.
+    """Return the distance of points from a tool [m], 0 inside; `pose` is its position, then a roller's angles.
 
     Raises ValueError for a cylinder, which does not move.
     """
@@ -192,18 +193,18 @@ def distance_outside(
             along = (p * axis).sum(dim=-1, keepdim=True).clamp(-size[0], size[0])
             gap = (p - along * axis).norm(dim=-1) - size[1]
         case Kind.CYLINDER:
-            raise ValueError("a post does not move: it has no part in the contact term")
+            raise ValueError("a post does not move, so it has no contact term")
     outer: Tensor = gap.clamp_min(0)
     return outer
 
 
 def load_or_make(name: str, content: str, make: Callable[[], np.ndarray]) -> np.ndarray:
-    """Return what `make` returns, from the user's cache if it was made from the same `content` before."""
+    """Return the result of `make`, from the user's cache if it was made from the same `content` before."""
     digest = hashlib.sha256(content.encode()).hexdigest()[:16]
     path = user_cache_path("gradscape") / "targets" / f"{name}-{digest}.npy"
     found = _read(path)
     if found is None:
-        log.info("%s: making the target by its demonstration", name)
+        log.info("%s: simulating the demonstration to make its target", name)
         found = make()
         with moved_by("XDG_CACHE_HOME", "targets"), replacing(path) as partial, partial.open("wb") as file:
             np.save(file, found)

@@ -1,4 +1,4 @@
-"""A thing that Newton throws: the parameters are its velocity, the loss is how far from a target it ends."""
+"""An object that Newton throws: the parameters are its velocity, the loss is its final distance from a target."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ SPEED = ("velocity x", "velocity y", "velocity z")
 
 @dataclass(frozen=True)
 class NewtonOptions(EpisodeOptions):
-    """`solver`: which of Newton's solvers makes the steps."""
+    """`solver`: the Newton solver that makes the steps."""
 
     solver: Literal["semi-implicit", "featherstone", "xpbd"] = "semi-implicit"
 
 
 class NewtonScene(Environment):
-    """A thing that Newton throws at a target.
+    """An object that Newton throws at a target.
 
-    A scene derives from this class and says: `duration` [s], the `target` [m], `rows`, how many are simulated at once
-    at most, what is thrown (`_thing`), and what ground there is (`_ground`). The engine computes in float32, and its
-    tape supplies the gradients, whatever they are worth. A row whose end or gradient is not finite has failed.
+    A scene derives from this class and defines: `duration` [s], the `target` [m], `rows`, the most episodes to simulate
+    at once, the thrown object (`_thing`), and the ground (`_ground`). The engine computes in float32. Its tape supplies
+    the gradients, right or wrong. A row whose end or gradient is not finite has failed.
     """
 
     model_version = 1
@@ -62,11 +62,11 @@ class NewtonScene(Environment):
         return (self.steps + 1) * self.bytes_per_step[self.options.solver]
 
     def work(self) -> Work:
-        """Count steps of the thing."""
+        """Count steps of the object."""
         return Work(self.steps, "body-step")
 
     def episode(self, x: Float[Tensor, " dim"]) -> Episode:
-        """Return where the thing is during the episode at one point."""
+        """Return the positions of the object during the episode at one point."""
         with self._solvers.lend() as rollout:
             frames = rollout.frames(self._start(self._row(x)))[:, 0]
         shown = torch.linspace(0, len(frames) - 1, min(FRAMES, len(frames))).round().long()
@@ -81,22 +81,21 @@ class NewtonScene(Environment):
 
     @abc.abstractmethod
     def _thing(self) -> Any:
-        """Return what is thrown: a Sphere, a Particle or a Cloth of the engine's."""
+        """Return the thrown object: the engine's Sphere, Particle or Cloth."""
 
     def _ground(self) -> Any:
         """Return the engine's Ground, or None where there is none."""
         return None
 
     def _parts(self, at: Float[Tensor, "frame point 3"]) -> tuple[Part, ...]:
-        """Return what of the thing is drawn."""
+        """Return the parts to draw."""
         radius = self._thing().radius
         return Part("sphere", "rubber", at, (radius,)), Part("trail", "rubber", at, (radius / 8,))
 
     def _setup(self) -> None:
         if self.fidelity.precision != "float32":
             raise ValueError(
-                f"{self.name} is simulated by Newton, which computes in float32 only; got precision "
-                f"{self.fidelity.precision!r}"
+                f"{self.name} runs on Newton, which computes in float32 only; got precision {self.fidelity.precision!r}"
             )
         engine = self._engine("rollout")
         self._capacity = max(1, min(self.rows, self._max_rows, BUDGET // self.memory()))
@@ -111,11 +110,11 @@ class NewtonScene(Environment):
         return Evaluation.from_results(self._loss(end[: len(x)]), self._slope(slope))
 
     def _start(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch start"]:
-        """Return velocities [m/s], and by what particles are moved at first [m] where parameters say that."""
+        """Return velocities [m/s], and initial displacements of particles [m] where parameters set them."""
         return x
 
     def _slope(self, start: Float[Tensor, "batch start"]) -> Float[Tensor, "batch dim"]:
-        """Return the gradient by parameters from that by starts."""
+        """Return the gradient by parameters from the gradient by initial states."""
         return start
 
     def _loss(self, end: Float[Tensor, "batch point 3"]) -> Float[Tensor, " batch"]:
@@ -123,11 +122,11 @@ class NewtonScene(Environment):
         return self._miss(end).square().sum(dim=1)
 
     def _miss(self, end: Float[Tensor, "batch point 3"]) -> Float[Tensor, "batch 3"]:
-        """Return how far from the target the middle of the points is [m]."""
+        """Return the distance vector from the target to the mean of the points [m]."""
         return end.mean(dim=1) - torch.tensor(self.target, dtype=torch.float64)
 
     def _adjoint(self, end: Float[Tensor, "batch point 3"]) -> Float[Tensor, "batch point 3"]:
-        """Return the loss's gradient by where the points are."""
+        """Return the loss's gradient by the positions of the points."""
         return (2 / end.shape[1] * self._miss(end))[:, None].expand_as(end)
 
 

@@ -25,11 +25,11 @@ MASS = 1.0  # of the ball [kg]
 class Flight(NewtonScene):
     """Throw a sphere so that it is at the target after 0.5 s; it touches nothing.
 
-    Model: Newton's: a rigid sphere of radius 1 m and mass 1 kg starts from (0, 1, 0) m and falls freely; dt 1/240 s
-    at standard, float32.
+    Model: Newton's. A rigid sphere of radius 1 m and mass 1 kg starts from (0, 1, 0) m and falls freely; dt 1/240 s at
+    standard, float32.
     Parameters: initial velocity x, y, z [m/s], y upwards.
-    Loss: squared distance of its centre to the target (1, 1, 0) m at the end [m^2]. Where it ends has the derivative T
-    by the velocity, T being the time it flies, whatever the solver: the scene is there to hold solvers against that.
+    Loss: squared distance of its centre to the target (1, 1, 0) m at the end [m^2]. The derivative of its final
+    position by the velocity is T, its flight time, for every solver. The scene exists to test solvers against that.
     """
 
     name = "newton-flight"
@@ -62,9 +62,9 @@ class BallOptions(NewtonOptions):
 
 
 class Ball(NewtonScene):
-    """Throw a ball so that it is at the target after 2 s, having bounced off the ground, as in `bounce`, by Newton.
+    """Throw a ball so that it is at the target after 2 s and a bounce off the ground, as in `bounce`, by Newton.
 
-    Model: Newton's: a particle of radius 0.1 m and mass 1 kg flies from (-0.5, 1, 0) m under gravity; the ground y = 0
+    Model: Newton's. A particle of radius 0.1 m and mass 1 kg flies from (-0.5, 1, 0) m under gravity. The ground y = 0
     pushes back by Newton's contact of particles with the constants of `bounce`; dt 1/480 s at standard, float32.
     Parameters: initial velocity x, y, z [m/s], y upwards, as in `bounce`.
     Loss: squared distance of the ball's centre to the target (2, 1, 0) m after 2 s [m^2].
@@ -96,19 +96,19 @@ class Ball(NewtonScene):
 
 @dataclass(frozen=True)
 class ClothOptions(NewtonOptions):
-    """`solver`: which of Newton's solvers makes the steps; featherstone has none of its own for cloth."""
+    """`solver`: the Newton solver that makes the steps; featherstone has no cloth solver of its own."""
 
     solver: Literal["semi-implicit", "xpbd"] = "semi-implicit"
 
 
 class ClothThrow(NewtonScene):
-    """Throw a cloth so that its middle is at the target after 0.75 s, having bounced off an elastic floor.
+    """Throw a cloth so that its middle is at the target after 0.75 s and a bounce off an elastic floor.
 
-    Model: Newton's: a square of 0.5 m and 0.1 kg, 6 x 6 cells of particles and springs (50 N/m), starts tilted 1 m over
-    the floor y = 0, which pushes back (100 N/m a particle, no damping) and rubs (0.3); dt 1/1600 s at standard,
-    float32.
-    Under solver=xpbd it does not bounce: there restitution is zero, and one of 1 changes little but the gradients.
-    Parameters: initial velocity x, y, z of all of it [m/s], y upwards.
+    Model: Newton's. A square of 0.5 m and 0.1 kg, 6 x 6 cells of particles and springs (50 N/m), starts tilted 1 m
+    above the floor y = 0. The floor pushes back (100 N/m per particle, no damping) and has friction (0.3); dt 1/1600 s
+    at standard, float32. With solver=xpbd it does not bounce, because restitution is zero there; a restitution of 1
+    changes little except the gradients.
+    Parameters: initial velocity x, y, z of the whole cloth [m/s], y upwards.
     Loss: squared distance of the mean of its particles to the target (1, 0.5, 0) m at the end [m^2].
     Source: Newton's example `diffsim_cloth`, with springs and a floor instead of triangles and air.
     """
@@ -141,16 +141,16 @@ class ClothThrow(NewtonScene):
 
 @dataclass(frozen=True)
 class ImpactOptions(EpisodeOptions):
-    """`solver`: which of Newton's solvers makes the steps; featherstone leaves particles to semi-implicit."""
+    """`solver`: the Newton solver that makes the steps; featherstone uses semi-implicit for particles."""
 
     solver: Literal["semi-implicit", "xpbd"] = "semi-implicit"
 
 
 class ImpactScene(NewtonScene):
-    """A ball in an upright plane whose place and velocity at first are the parameters, as in the scene it names.
+    """A ball in an upright plane, whose initial position and velocity are the parameters, as in the scene it names.
 
-    Model: Newton's: a particle of radius 0.1 m and mass 1 kg; what it meets pushes back by Newton's contact of
-    particles with stiffness 1e4 N/m, under xpbd with a restitution instead, and does not rub; dt 1/480 s at standard,
+    Model: Newton's. A particle of radius 0.1 m and mass 1 kg. Ground and wall push back by Newton's contact of
+    particles with stiffness 1e4 N/m, or with a restitution under xpbd, without friction; dt 1/480 s at standard,
     float32.
     Parameters: initial position x, y [m] and velocity x, y [m/s], y upwards.
     """
@@ -169,7 +169,7 @@ class ImpactScene(NewtonScene):
 
     @property
     def time(self) -> float:
-        """How long an episode is [s]."""
+        """Duration of an episode [s]."""
         return self.steps * self.fidelity.dt
 
     def _thing(self) -> Any:
@@ -221,7 +221,7 @@ class NewtonGroundWall(ImpactScene):
     """Throw a ball at the ground and a wall, as in `ground-wall`, by Newton, so that it comes back to the target.
 
     Loss: squared distance of the ball's centre to (-2, 1.5) m after 0.6 s [m²]. The semi-implicit solver damps the
-    approach with 10 N s/m, after which a rebound is 0.92 times as fast.
+    approach with 10 N s/m, so that the rebound has 0.92 times the speed.
     """
 
     name = "newton-ground-wall"

@@ -34,10 +34,10 @@ LOWER, UPPER = (-0.075, -0.075, -0.6), (0.075, 0.15, 0.6)  # of a waypoint [m], 
 
 @dataclass(frozen=True)
 class FlipOptions(SheetOptions):
-    """`damping` is that of springs [N s/m], `drag` that of air [1/s]; `bending` is the bending springs' share.
+    """`damping` of the springs [N s/m], `drag` of the air [1/s]; `bending` is the share of the bending springs.
 
-    `rim` says whether the pan has its bent edge, or is a flat disc of its whole radius; `floor` whether there is one
-    beneath; `friction` is Coulomb's coefficient of both.
+    `rim`: the pan has a bent edge, or is a flat disc of the full radius. `floor`: whether there is a floor below the
+    pan. `friction` is Coulomb's coefficient of pan and floor.
     """
 
     damping: float = DAMPING
@@ -51,20 +51,21 @@ class FlipOptions(SheetOptions):
 class Flip(SheetScene):
     """Toss a pancake with a pan so that it ends on its other side.
 
-    Model: the pancake (20 cm across, 3 kg/m^2, stretching resisted by 60 N/m, much softer for its weight than the
-    cloth) starts at rest in the middle of the pan; x right, y up, z to the front. The pan has a radius of 0.2 m and an
-    edge that bends up along an arc of 7 cm, to 3.4 cm; it moves in x and y and tilts about z, through the middle of its
-    bottom, whatever it carries. A floor lies 0.25 m below where the pan starts, 5 cm below the lowest place that the
-    pan's underside reaches in the box. An episode is 1 s.
-    Parameters: x [m], y [m] and tilt [rad] of the pan at the end of each of 5 segments of 0.2 s, from 0 and linear in
-    between.
-    Loss [m]: mean distance of the left-, right-, back- and frontmost vertices to where they were at the start, left and
-    right exchanged. Example `flip` was found by CMA-ES at draft (2400 episodes) and flips at every fidelity.
+    Model: the pancake is 20 cm across, weighs 3 kg/m^2 and resists stretching by 60 N/m, which is much softer for its
+    weight than the cloth. It starts at rest in the middle of the pan; x right, y up, z to the front. The pan has a
+    radius of 0.2 m and an edge that bends up along an arc of 7 cm, to 3.4 cm. It moves in x and y and tilts about z,
+    through the middle of its bottom, regardless of its load. A floor lies 0.25 m below the start of the pan. That is 5
+    cm below the lowest point that the underside of the pan can reach in the box. An episode lasts 1 s.
+    Parameters: x [m], y [m] and tilt [rad] of the pan at the end of each of 5 segments of 0.2 s, starting at 0 and
+    linear in between.
+    Loss: mean distance [m] of the left-, right-, back- and frontmost vertices from their initial positions with left
+    and right exchanged. CMA-ES at draft found the example `flip` in 2400 episodes; it flips the pancake at every
+    fidelity.
     Preset paper: contact changes the velocity of vertices that are in contact, as the supplement says (contact=start).
-    Simplifications: the pan has no handle and no mass; the pancake is a sheet without thickness; pan and floor are
-    smooth, as contact takes the normal part of a velocity alone.
+    Simplifications: the pan has no handle and no mass. The pancake is a sheet without thickness. Pan and floor are
+    frictionless, because contact removes only the normal part of a velocity.
     Source: task Flip of "Rethinking Optimization with Differentiable Simulation from a Global Perspective" (CoRL 2022),
-    appendix A.2.3; geometry and material where it is silent are ours.
+    appendix A.2.3; we chose the geometry and material that it does not give.
     """
 
     name = "flip"
@@ -102,7 +103,7 @@ class Flip(SheetScene):
 
     @property
     def pan(self) -> Pan:
-        """The pan, with its edge or without."""
+        """The pan, with or without its edge."""
         flat = {} if self.options.rim else {"flat": PAN.radius, "sweep": 0.0}
         return replace(PAN, friction=self.options.friction, **flat)
 
@@ -136,7 +137,7 @@ class Flip(SheetScene):
         return loss
 
     def _goal(self) -> Float[Tensor, "vertex 3"]:
-        """Return where those vertices are wanted [m]."""
+        """Return the target positions of those vertices [m]."""
         return torch.from_numpy(self.sheet.x[self._extremes()] * (-1.0, 1.0, 1.0))
 
     def _surroundings(self, poses: Float[Tensor, "frame 3"]) -> Mapping[str, Float[Tensor, "frame 3"]]:

@@ -19,15 +19,15 @@ def disc(cells: int) -> np.ndarray:
     Raises ValueError where `cells` is odd.
     """
     if cells % 2:
-        raise ValueError(f"a disc is an even number of cells across; got {cells}")
+        raise ValueError(f"disc takes an even number of cells; got {cells}")
     points = square(cells) - cells // 2
     return np.asarray(points[(points**2).sum(axis=1) <= (cells / 2) ** 2])
 
 
 def areas(points: np.ndarray) -> np.ndarray:
-    """Return the area that each lattice point stands for, in cells, shape (vertex,).
+    """Return the area of each lattice point's share of the sheet, in cells, shape (vertex,).
 
-    A cell belongs to its four corners alike; one of which a corner is missing is the triangle of the others.
+    A cell belongs equally to its four corners; a cell with a missing corner is the triangle of the others.
     """
     number = {tuple(point): i for i, point in enumerate(points.tolist())}
     area = np.zeros(len(points))
@@ -43,9 +43,9 @@ def springs(
 
     Structural springs join neighbours along the lattice, shear springs those along its diagonals. Bending springs join
     what is `reach` cells apart along the lattice and take the share `bend` of the structural springs' stiffness.
-    `shear` scales the shear springs. At 1 the membrane is isotropic (Poisson's ratio 1/3), as stiff at every
-    resolution, and at the same reach in metres its bending is, too: a spring weighs what its share of the sheet's area
-    is, so that those along an edge weigh half.
+    `shear` scales the shear springs. At 1 the membrane is isotropic (Poisson's ratio 1/3) and equally stiff at every
+    resolution. At the same reach in metres, so is its bending. The weight of a spring is its share of the sheet's area,
+    so springs along an edge weigh half.
     """
     number = {tuple(point): i for i, point in enumerate(points.tolist())}
     weights: defaultdict[tuple[int, int], float] = defaultdict(float)
@@ -63,12 +63,12 @@ def springs(
 
 
 def plate(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return pairs of lattice points and how they attract so that the sheet resists bending.
+    """Return pairs of lattice points and the attractions between them that make the sheet resist bending.
 
-    The energy of a plate of bending stiffness D [N m] without Poisson's effect, D / 2 times the integral of
-    |x_uu|^2 + 2 |x_uv|^2 + |x_vv|^2, is a sum of squares c |a_1 x_1 + a_2 x_2 + ...|^2 of second differences. Since
-    the a sum to 0, it is the sum over pairs of -c a_i a_j |x_i - x_j|^2: linear attractions, some of them negative,
-    that are to be multiplied by D over the square of a cell's width. Rotations do no work against them.
+    The energy of a plate of bending stiffness D [N m] without Poisson's effect, D / 2 times the integral of |x_uu|^2 +
+    2 |x_uv|^2 + |x_vv|^2, is a sum of squares c |a_1 x_1 + a_2 x_2 + ...|^2 of second differences. Since the a sum to
+    0, it is the sum over pairs of -c a_i a_j |x_i - x_j|^2: linear attractions, some negative, to be multiplied by D
+    over the square of a cell's width. Rotations do no work against them.
     """
     number = {tuple(point): i for i, point in enumerate(points.tolist())}
     squares: list[tuple[list[int], tuple[float, ...], float]] = []

@@ -1,4 +1,4 @@
-"""What the sheet scenes (cloth, pancake) share: a mass-spring sheet, its drive, and losses by where vertices end."""
+"""Common parts of the sheet scenes (cloth, pancake): a mass-spring sheet, its drive, and its final losses."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ REACH = 0.1  # what a policy measures lengths by [m]
 
 @dataclass(frozen=True, eq=False)
 class Drive:
-    """What parameters set: the sheet's first `velocity` [m/s], vertices' `stiffness` [N/m], the surface's `poses`."""
+    """What the parameters set: initial `velocity` [m/s], vertex `stiffness` [N/m], `poses` of the surface."""
 
     velocity: Float[Tensor, "batch 3"]
     stiffness: Float[Tensor, "batch vertex"]
@@ -40,10 +40,10 @@ class Drive:
 
 @dataclass(frozen=True)
 class SheetOptions(EpisodeOptions):
-    """`contact`: which vertices a surface stops, and so how exactly they are stopped where it is.
+    """`contact`: which vertices a surface stops, and thus how exactly they stop at the surface.
 
-    `end`: those that would be inside at the end of a step, which end on it. `start`: those that are inside when a step
-    starts, which leaves each as deep as it fell in a step, so that losses jump by what a vertex moves in a step.
+    `end`: vertices that would be inside at the end of a step end on the surface. `start`: vertices that are inside at
+    the start of a step stop at their depth, so losses jump by the distance a vertex moves in a step.
     """
 
     contact: Rule = dataclasses.field(default="end", kw_only=True)
@@ -52,10 +52,10 @@ class SheetOptions(EpisodeOptions):
 class SheetScene(Environment):
     """A sheet is a square lattice of vertices joined by damped springs, integrated by semi-implicit Euler.
 
-    Springs run along the lattice and along its diagonals. Vertices and springs weigh what their shares of the area are,
-    so that meshes of different resolutions are one material. A vertex that would be inside a surface at a step's end
-    is stopped on it: it loses what goes into it of its velocity, v -= min(v.n, 0) n, and keeps the rest, neither
-    restitution nor, unless an option says so, friction. Sheets pass through themselves.
+    Springs run along the lattice and along its diagonals. The weight of vertices and springs is their share of the
+    area, so meshes of different resolutions are one material. A vertex that would be inside a surface at the end of a
+    step is stopped on it. It loses the velocity into the surface, v -= min(v.n, 0) n, and keeps the rest. There is no
+    restitution, and no friction unless an option sets it. Sheets pass through themselves.
     """
 
     model_version = 1
@@ -92,9 +92,9 @@ class SheetScene(Environment):
         return Work(len(self.sheet.x) * self.steps, "vertex-step")
 
     def replicas(self) -> Mapping[str, Environment]:
-        """Return the sheet in time steps a little shorter: it meets a surface elsewhere within a step.
+        """Return the sheet in slightly shorter time steps, which moves its contacts within their steps.
 
-        Its mesh has both diagonals in every cell, and its mirror image is the same mesh.
+        Its mesh has both diagonals in every cell, so its mirror image is the same mesh.
         """
         return self._replicas_of(self._shorter_steps(self.own_steps))
 
@@ -111,7 +111,7 @@ class SheetScene(Environment):
         return Episode(self.fidelity.dt * shown, {"sheet": frames}, self._surroundings(poses), parts, self.view)
 
     def end(self, x: Float[Tensor, " dim"]) -> Float[Tensor, "vertex 3"]:
-        """Return where vertices are at the end of the episode at one point [m]."""
+        """Return vertex positions at the end of the episode at one point [m]."""
         with self._solvers.lend() as solver:
             return copied(solver.run(*self._drive(self._row(x)).detach())[-1, 0])
 
@@ -121,19 +121,19 @@ class SheetScene(Environment):
 
     @abc.abstractmethod
     def _drive(self, x: Float[Tensor, "batch dim"]) -> Drive:
-        """Return what the parameters set, differentiably."""
+        """Return the quantities that the parameters set, differentiably."""
 
     @abc.abstractmethod
     def _loss(self, end: Float[Tensor, "vertex 3"]) -> Float[Tensor, ""]:
-        """Return the loss of one episode by where its vertices end."""
+        """Return the loss of one episode from its final vertex positions."""
 
     @abc.abstractmethod
     def _surroundings(self, poses: Float[Tensor, "frame 3"]) -> Mapping[str, Float[Tensor, "frame 3"]]:
-        """Return what stands around the sheet, from the surface's poses."""
+        """Return the solids around the sheet, from the surface's poses."""
 
     @abc.abstractmethod
     def _parts(self, frames: Float[Tensor, "frame vertex 3"], poses: Float[Tensor, "frame 3"]) -> tuple[Part, ...]:
-        """Return what is to be drawn."""
+        """Return the parts to draw."""
 
     def _setup(self) -> None:
         self.sheet = self._sheet()
@@ -163,7 +163,7 @@ class SheetScene(Environment):
         return Evaluation(loss.detach(), slope, torch.full((len(x),), Status.OK, dtype=torch.int8))
 
     def _observe(self, x: Float[Tensor, "batch dim"], decision: int) -> Float[Tensor, "batch feature"]:
-        """Watch the sheet in tenths of a metre, with its surface's pose."""
+        """Observe the sheet in tenths of a metre, with its surface's pose."""
         if self.decisions == 1:
             return super()._observe(x, decision)
         drive, step = self._drive(x), decision * self.steps // self.decisions

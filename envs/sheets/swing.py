@@ -34,14 +34,13 @@ DAMPING, DRAG, GRAVITY = 8e-3, 0.5, 9.81  # [N s/m], [1/s], [m/s^2]
 
 @dataclass(frozen=True)
 class SwingOptions(SheetOptions):
-    """`loss`: the distance of the centre of mass (single), or the mean one of the corners or of the whole cloth (mesh).
+    """`loss`: distance of the centre of mass (single), or mean distance of corners (corner) or all vertices (mesh).
 
-    `damping` is that of springs [N s/m], `drag` that of air [1/s], `gravity` [m/s^2]; `bending` is the stiffness
-    against it [N m], `shear` scales the shear springs; `friction` is the floor's coefficient.
-
-    `anchors`: still, or swing, where they set out at (1, -0.5, 0) m/s and slow down evenly, to rest after 0.4 s, 20 cm
-    to the right on the floor. `bending_springs`: the share of the springs along the lattice
-    that join what is a sixth of the edge apart instead, so that what is stiffer bends less, too.
+    `damping` of the springs [N s/m], `drag` of the air [1/s], `gravity` [m/s^2]. `bending` is the bending stiffness [N
+    m], `shear` scales the shear springs, and `friction` is the floor's coefficient. `anchors`: still or swing. With
+    swing they start at (1, -0.5, 0) m/s and slow down evenly, to rest after 0.4 s, 20 cm to the right on the floor.
+    `bending_springs`: the share of the springs along the lattice that instead join points a sixth of the edge apart. So
+    a stiffer part also bends less.
     """
 
     loss: Literal["single", "corner", "mesh"] = "single"
@@ -56,26 +55,27 @@ class SwingOptions(SheetOptions):
 
 
 class Swing(SheetScene):
-    """The cloth swings down from where it is held and drags over the floor.
+    """A cloth swings down from its two held corners and drags over the floor.
 
-    Model: a cloth (20 cm x 20 cm, 0.2 kg/m^2) starts level, 10 cm above the floor, held fast at its two right corners;
-    x right, y up, z to the front. Springs resist stretching and shear; a plate's stiffness of 3e-4 N m resists bending.
-    An episode is 0.5 s: longer ones sway on, and meshes differ more.
-    Loss [m] against where example `target` brings the cloth at the same fidelity: the centre of mass's distance
-    (single), or the mean distance of the corners (corner) or of all vertices (mesh), by option. Two of the four corners
-    are held: where anchors stand still these never miss their places, and `corner` is half the mean of the other two.
+    Model: a cloth (20 cm x 20 cm, 0.2 kg/m^2) starts level, 10 cm above the floor, held at its two right corners; x
+    right, y up, z to the front. Springs resist stretching and shear; a plate stiffness of 3e-4 N m resists bending. An
+    episode lasts 0.5 s. In longer ones the cloth sways on, and meshes differ more.
+    Loss: distance [m] from the final state of example `target` at the same fidelity. An option chooses the distance of
+    the centre of mass (single), or the mean distance of the corners (corner) or of all vertices (mesh). Two of the four
+    corners are held. Still anchors never miss their targets, so `corner` is half the mean of the other two.
     Preset paper: the supplement's two anchors swing the cloth onto the floor (anchors=swing), and contact changes the
-    velocity of vertices that are in contact (contact=start). Its cloth is springs alone: bending springs, four fifths
-    of those along the lattice (bending_springs=0.8, as in flip), resist bending instead of a plate (bending=0), so that
-    patches of stiffness decide how it folds: their random losses reach 33 mm instead of 8. How anchors swing is ours.
-    They do so alike whatever velocity the cloth starts with: its landscape is then as rugged, and its gradients are as
-    often opposite to the slope, as the paper shows; with anchors that set out at that velocity it is smooth.
-    Simplifications: by default the anchors stand still, since what they hold makes the cloth swing anyway, and contact
-    stops vertices on the floor, since what else it does hangs on the time step; air is felt as a drag
-    of 0.5/s; stretching is resisted by 10 N/m, softer than fabric, so that a step may be long; the resistance to
-    bending is ours, so that folds are wider than a few cells. Coarse meshes do not fold as fine ones do: of 32 points
-    against 40 cells (1/10000 s), losses of standard (28 cells) have rank correlations of 0.99 (velocity and stiffness)
-    and 95 % are within 5.5 and 7.5 % of the spread; of draft (12 cells) 0.97 and 0.63, within 19 and 75 %.
+    velocity of vertices that are in contact (contact=start). Its cloth consists of springs only. Bending springs, four
+    fifths of those along the lattice (bending_springs=0.8, as in flip), resist bending instead of a plate (bending=0).
+    So stiffness patches decide how it folds, and their random losses reach 33 mm instead of 8. The motion of the
+    anchors is our choice, and is the same for every initial velocity of the cloth. Then the landscape is as rugged as
+    the paper shows, and its gradients are as often opposite to the slope. With anchors that start at that velocity, it
+    is smooth.
+    Simplifications: by default the anchors are still, because the held cloth swings anyway. By default contact stops
+    vertices on the floor, because the alternative depends on the time step. Air is a drag of 0.5/s. Stretching is
+    resisted by 10 N/m, softer than fabric, which permits long steps. The bending resistance is ours, to make folds
+    wider than a few cells. Coarse meshes fold differently from fine ones. On 32 points, compared with 40 cells (1/10000
+    s), losses of standard (28 cells) have rank correlations of 0.99 (velocity and stiffness), and 95 % are within 5.5
+    and 7.5 % of the spread. Losses of draft (12 cells) have 0.97 and 0.63, within 19 and 75 %.
     Source: task Swing of "Rethinking Optimization with Differentiable Simulation from a Global Perspective" (CoRL
     2022), appendix A.2.3; geometry and material are ours.
     """
@@ -102,7 +102,7 @@ class Swing(SheetScene):
 
     @property
     def view(self) -> View:  # type: ignore[override] # read only
-        """How it is seen, to where the anchors swing it."""
+        """The view, which includes the path of the anchors."""
         right = 0.15 if self.options.anchors == "still" else 0.3
         return View((-0.2, 0.0, -0.11), (right, 0.12, 0.11), eye=(-0.45, 0.5, 1.0), ground=-0.003)
 
@@ -112,7 +112,7 @@ class Swing(SheetScene):
         return (Floor if self.options.anchors == "still" else AnchoredFloor)(friction=self.options.friction)
 
     def replicas(self) -> Mapping[str, Environment]:
-        """Return the cloth in shorter time steps, and of a cell more or less along its edges, with its own target."""
+        """Return the cloth in shorter time steps, and with one cell more or less along its edges."""
         cells, dt, steps = self.fidelity.resolution, self.fidelity.dt, self.own_steps
         finer = dt * steps / math.ceil(steps * (1 + 1 / cells) ** 2)  # as far from instability
         meshes: dict[str, dict[str, Any]] = {
@@ -146,7 +146,7 @@ class Swing(SheetScene):
         )
 
     def _energy(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch step"] | None:
-        """Return kinetic energy, that of height above the floor, and that of the springs, where no anchor drives it."""
+        """Return the sum of kinetic, gravitational and spring energy, where no anchor drives the cloth."""
         if self.options.anchors != "still":
             return None
         drive, sheet = self._drive(x), self.sheet
@@ -197,7 +197,7 @@ class Swing(SheetScene):
         )
 
     def _course(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch step_plus_1 3"]:
-        """Return how far the anchors have gone [m]: nowhere, or as what slows down evenly to rest."""
+        """Return the displacement of the anchors [m]: zero, or an even deceleration to rest."""
         if self.options.anchors == "still":
             return x.new_zeros(1, 1, 3).expand(len(x), self.steps + 1, 3)
         time = (self.fidelity.dt * torch.arange(self.steps + 1, dtype=x.dtype)).clamp(max=BRAKING)
@@ -209,7 +209,7 @@ class Swing(SheetScene):
 
     @cached_property
     def _target(self) -> Float[Tensor, "vertex 3"]:
-        """Where the example `target` brings the vertices, on the CPU whatever this device."""
+        """Final vertex positions of the example `target`, on the CPU whatever this device."""
         own = {field.name: getattr(self.options, field.name) for field in fields(self.options)}
         own["horizon"] = 1.0
         return type(self)(fidelity=self.fidelity, device="cpu", **own).end(self.example("target"))
@@ -230,11 +230,11 @@ class SwingVelocity(Swing):
 
 
 class SwingStiffness(Swing):
-    """Choose how stiff the patches of a swinging cloth are, so that it ends like a target.
+    """Choose the stiffness of the patches of a swinging cloth, so that it ends like a target.
 
-    Parameters: stiffness [N/m] of 4 x 4 patches, from left to right and within that from back to front; a vertex on the
-    border between patches has the mean of theirs, and a spring that of its ends'. The swing is fixed: initial velocity
-    (1, -0.5, 0) m/s.
+    Parameters: stiffness [N/m] of 4 x 4 patches, from left to right and, within a column, from back to front. A vertex
+    on the border between patches has their mean, and a spring has the mean of its ends. The swing is fixed: initial
+    velocity (1, -0.5, 0) m/s.
     """
 
     name = "swing-stiffness"
@@ -254,7 +254,7 @@ class SwingStiffness(Swing):
         return Drive(x.new_tensor(SWING).expand(len(x), 3), stiffness, self._course(x))
 
     def _patch_shares(self) -> Float[Tensor, "vertex patch"]:
-        """Return how much of what a vertex stands for along an edge lies in each patch: a cell's width, or half."""
+        """Return how much of a vertex's width along an edge lies in each patch; its width is one cell, or half."""
         cells = self.fidelity.resolution
         middle = torch.arange(cells + 1, dtype=torch.float64) / cells
         low, high = (middle - 0.5 / cells).clamp(min=0.0), (middle + 0.5 / cells).clamp(max=1.0)

@@ -1,10 +1,10 @@
-"""The static site: what is in the figures' data, as pages that need no network and no server.
+"""The static site: the figures' data as pages that need no network and no server.
 
-Whatever of `surface.png`, `.html`, `.gltf` and `.glb` lies in a figure's folder beside what `..files` names is shown,
-too. Runs are laid over every slice of their environment and options; trade-offs are shown with every slice of theirs.
+A page also shows `surface.png`, `.html`, `.gltf` and `.glb` if they are in the figure's folder. Runs are drawn over
+every slice of their environment and options. Trade-offs are shown with every slice of their environment.
 
-`manifest.json` lists all of it for programs. Its `files` are all that the site has: a folder is built again only where
-it holds nothing else.
+`manifest.json` lists all of it for programs. Its `files` are all files of the site. `build_site` replaces a folder only
+if it contains nothing else.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ SCHEMA = 3  # counts up whenever the meaning of a name in the manifest changes
 
 @dataclass(frozen=True)
 class Manifest:
-    """All of a site: its environments, its slices and studies, slices that are not sampled yet, and its files."""
+    """The contents of a site: environments, slices, studies, slices that are not sampled yet, and files."""
 
     schema: int
     gradscape: str
@@ -78,17 +78,17 @@ class Manifest:
 def build_site(
     figures: Sequence[Figure], data: Path, out: Path, follow: Callable[[int], None] = lambda count: None
 ) -> Manifest:
-    """Build the site of the figures that `data` has into `out`, whole or not at all, and return its manifest.
+    """Build the site of the figures in `data` into `out`, whole or not at all, and return its manifest.
 
-    What is in `out` is replaced if a site built earlier is all that is there. `follow` hears how many figures are
-    drawn, before the first is. Raises ValueError where `out` holds anything else, where `data` holds no figure, and,
-    naming it, for a file of it that is damaged.
+    An earlier site in `out` is replaced. `follow` is called with the number of figures before the first is drawn.
+    Raises ValueError if `out` contains anything else than a site, if `data` contains no figure, or if a file of `data`
+    is damaged.
     """
     out = resolve(out)
     _check(out)
     there = [figure for figure in figures if _has_samples(data / figure.id / files.STORE)]
     if not there:
-        raise ValueError(f"{data} holds no slice of a figure; `landscape gallery compute` samples them")
+        raise ValueError(f"{data} contains no slice of a figure; `landscape gallery compute` samples them")
     tables = read_runs(data)
     with placing(out, overwrite=True, check=partial(_check, out)) as new:
         follow(len(there))
@@ -115,7 +115,7 @@ def build_site(
 
 
 def _check(out: Path) -> None:
-    """Refuse a folder that holds anything but a site whose manifest lists all of it."""
+    """Refuse a folder that contains anything except a site with all files in its manifest."""
     if not out.exists():
         return
     if not out.is_dir():
@@ -133,7 +133,7 @@ def _has_samples(store: Path) -> bool:
 
 
 def _templates(card: Card | None, league: LeaguePage | None) -> Environment:
-    """Return the templates, which know the pages that every page leads to."""
+    """Return the templates, with the pages that every page links to."""
     pages = templates(HERE / "templates")
     doors = (
         ("All landscapes", "index.html", True),
@@ -151,15 +151,15 @@ def _templates(card: Card | None, league: LeaguePage | None) -> Environment:
 
 
 def _describe_companion(one: Companion, unit: str) -> str:
-    """Say what the losses of a slice next to a page's own range over."""
+    """Describe the range of the losses of a companion slice."""
     if one.lowest is None or one.highest is None:
-        return f"through {one.through} all failed"
+        return f"through {one.through} all episodes failed"
     return f"through {one.through} from {number(one.lowest)} to {number(one.highest)}{unit}"
 
 
 @dataclass(frozen=True)
 class _Site:
-    """A site under way in `folder`, with what its pages share."""
+    """A site that is being built in `folder`, with the data that its pages share."""
 
     folder: Path
     data: Path
@@ -169,11 +169,11 @@ class _Site:
     studies: Mapping[str, Sequence[StudyEntry]]
 
     def write_page(self, name: str, template: str = "", **shown: Any) -> None:
-        """Write a page from a template, by default the one of its name."""
+        """Write a page from a template, by default the one with its name."""
         (self.folder / name).write_text(self.pages.get_template(template or name).render(**shown))
 
     def write_slice(self, figure: Figure) -> FigureEntry:
-        """Write a slice's page and all it shows, and return its entry in the manifest."""
+        """Write the page of a slice with all its files, and return its entry in the manifest."""
         source, folder = self.data / figure.id, self.folder / figure.id
         dataset = open_slice(source / files.STORE)
         episodes, runs = read_episodes(source, dataset), lay_own(dataset, self.tables)
@@ -224,7 +224,7 @@ class _Site:
         )
 
     def write_league(self, page: LeaguePage) -> None:
-        """Write the page of all races, and a page of each."""
+        """Write the page of all races, and a page for each race."""
         self.write_page(LEAGUE_PAGE, page=page)
         for scene in page.league.scenes:
             self.write_page(
@@ -244,9 +244,9 @@ class _Site:
         given: Sequence[str],
         tables: Mapping[str, Sequence[Mapping[str, Any]]],
     ) -> list[str]:
-        """Write a slice and tables, copy the files that are `given` and others that are there; return all names.
+        """Write a slice and tables, copy the `given` files and other existing ones, and return all names.
 
-        Those of pictures come with those of their dark variants; what is drawn has its own.
+        Each picture comes with its dark variant.
         """
         for name, rows in tables.items():
             save_table(rows, folder / name)
@@ -272,7 +272,7 @@ class _Site:
         card: Card | None,
         league: LeaguePage | None,
     ) -> Manifest:
-        """Write the front page and the manifest, and return that."""
+        """Write the front page and the manifest, and return the manifest."""
         manifest = Manifest(SCHEMA, __version__, tiles, shown, self.studies, missing, [])
         said = {word for tile in tiles for word in tile.fitting()} | {word for entry in shown for word in entry.words}
         sizes = {size_class(tile.dim) for tile in tiles}

@@ -1,4 +1,4 @@
-"""What a visitor takes along of a picture: its data as CSV, and a slice's as zarr."""
+"""Downloads: the data of a picture as CSV, and that of a slice also as zarr."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from ..files import CSV, ZARR
 
 
 def save_slice(dataset: xr.Dataset, store: Path, folder: Path) -> list[str]:
-    """Write a slice as CSV and, as it lies in its finished store, as zarr in one file; return their names.
+    """Write a slice as CSV and, from its finished store, as one zarr file; return their names.
 
-    The CSV has a row for each sample: its place, its loss, its status and, where there are gradients, the loss's slope
-    along each axis and the gradient's length in all dimensions. A slice that is not finished has no zarr.
+    The CSV has a row for each sample: its position, loss and status. With gradients it also has the slope of the loss
+    along each axis and the gradient norm over all parameters. An unfinished slice has no zarr file.
     """
     table = frame(dataset.drop_vars("grad", errors="ignore"))
     for name, column in _slopes(dataset).items():
@@ -46,7 +46,7 @@ def _slopes(dataset: xr.Dataset) -> dict[str, np.ndarray[Any, Any]]:
 
 
 def save_table(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """Write records as CSV, a row each; what is in a record of a record has a column of its own, named by both."""
+    """Write records as CSV, one row each; a nested field has its own column, named by both fields."""
     flat = [{quoted(name): quoted(cell) for name, cell in _flatten(row)} for row in rows]
     columns = list(dict.fromkeys(name for row in flat for name in row))
     with path.open("w", newline="", encoding="utf-8") as file:

@@ -1,4 +1,4 @@
-"""The pages of the league: methods against scenes, what the paper claims of them, and the race of each scene."""
+"""The pages of the league: methods against scenes, the paper's claims, and the race of each scene."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ VERDICTS = {
 
 @dataclass(frozen=True)
 class LeaguePage:
-    """All that the page says: ranks, verdicts on claims, why others are none, and the races themselves.
+    """The contents of the page: ranks, verdicts on the paper's claims, `silences` of the paper, and the races.
 
-    `verdicts` are claims of the paper in a scene with what the league makes of them, and in a word. `slices` says by
-    scene which command samples the slice through its best point, of those that have one.
+    `verdicts` are the paper's claims about a scene, each with the league's finding and its name. `slices` maps a scene
+    to the command that samples the slice through its best point, if it has one.
     """
 
     league: League
@@ -47,76 +47,76 @@ class LeaguePage:
 
     @classmethod
     def of(cls, league: League, paper: Paper, slices: Mapping[str, str]) -> LeaguePage:
-        """Return what is to be said of a league compared with the paper."""
+        """Compare a league with the paper."""
         found = [(scene, paper.claims_about(scene.env)) for scene in league.scenes]
         verdicts = [(scene.env, one, VERDICTS[one.verdict]) for scene, said in found for one in scene.findings(said)]
         return cls(league, verdicts, [(scene.env, said.silence) for scene, said in found if said.silence], slices)
 
     @property
     def counts(self) -> str:
-        """How many claims are confirmed, refuted, and so on, in words."""
+        """The numbers of claims that are confirmed, refuted, and so on, as text."""
         found = Counter(word for _, _, word in self.verdicts)
         return ", ".join(f"{found[word]} {word}" for word in VERDICTS.values() if found[word])
 
     @property
     def fidelities(self) -> str:
-        """In how many scenes races ran at which fidelity, in words."""
+        """The number of races at each fidelity, as text."""
         found = Counter(scene.fidelity for scene in self.league.scenes)
         return ", ".join(f"{count} at {fidelity}" for fidelity, count in sorted(found.items()))
 
     @property
     def first(self) -> Sequence[str]:
-        """The scenes in which a method is ahead of every other after the correction, with its name."""
+        """The scenes in which a method is ahead of every other after the correction, with that method."""
         return [f"{scene.env} ({scene.lead.method})" for scene in self.league.scenes if scene.lead.is_first]
 
     @property
     def moves(self) -> Sequence[str]:
-        """The scenes in which the best mean rank moves, or is shared, at equal forward equivalents, and with whom."""
+        """The scenes in which another method has or shares the best mean rank at equal cost, with the methods."""
         return [
-            f"{scene.env} ({scene.lead.method} after all episodes, {' and '.join(scene.moved_to)} within the same cost)"
+            f"{scene.env} ({scene.lead.method} after all episodes, {' and '.join(scene.moved_to)} at equal cost)"
             for scene in self.league.scenes
             if scene.moved_to
         ]
 
     @property
     def size(self) -> str:
-        """How many methods, seeds and episodes it has, by its first scene."""
+        """The numbers of methods, seeds and episodes, from the first scene."""
         first = self.league.scenes[0]
         return f"{len(self.league.methods)} methods, {first.seeds} seeds each, {first.budget} episodes a run"
 
     def python(self, scenes: Sequence[SceneStandings]) -> str:
-        """Return the lines of Python that race scenes again, all with as many seeds and episodes as the first."""
+        """Return Python code that races the scenes again, all with the seeds and episodes of the first."""
         first, names = scenes[0], [f"{scene.env}@{scene.fidelity}" for scene in scenes]
         methods = list(self.league.methods if len(scenes) > 1 else first.methods)
         call = f"league = gs.league({names!r}, {methods!r}, budget={first.budget}, seeds={first.seeds})"
         return "\n".join(["import gradscape as gs", "", call, "league.plot()"])
 
     def claims(self, env: str) -> Sequence[tuple[ClaimFinding, str]]:
-        """Return the paper's claims of a scene, each with what this league makes of it in a word."""
+        """Return the paper's claims about a scene, each with the name of this league's finding."""
         return [(finding, word) for name, finding, word in self.verdicts if name == env]
 
     def describe(self) -> str:
-        """Say what the map of ranks shows."""
+        """Describe the map of ranks."""
         return f"Mean ranks of {len(self.league.methods)} methods in {len(self.league.scenes)} scenes; {self.best}"
 
     @property
     def best(self) -> str:
-        """Which method has the best mean rank over all scenes, in words."""
+        """The method with the best mean rank over all scenes, as text."""
         best = self.league.overall[0]
         interval = f"95 % interval {best.low:.2f} to {best.high:.2f}"
-        return f"over all scenes {best.method} has the best, {best.rank:.2f} ({interval})"
+        return f"{best.method} has the best mean rank over all scenes, {best.rank:.2f} ({interval})"
 
     @property
     def answer(self) -> str:
-        """Which optimiser gets anywhere, in a sentence."""
+        """The answer to which optimiser gets anywhere, in two sentences."""
         many = len(self.league.scenes)
         first = f"A method is ahead of all others in {len(self.first)} of {many} scenes"
         named = f": {', '.join(self.first)}" if self.first else ""
-        return f"Of mean ranks of {len(self.league.methods)} methods {self.best}. {first}{named}."
+        return f"Of {len(self.league.methods)} methods, {self.best}. {first}{named}."
 
 
 def place_league(data: Path, out: Path, paper: Paper) -> LeaguePage | None:
-    """Put the league of the figures' data into the site, and return what its page says; None where there is none."""
+    """Copy the league of the figures' data into the site, and return its page, or None without a league."""
     league = read_league(data)
     if league is None:
         return None
@@ -140,7 +140,7 @@ def place_league(data: Path, out: Path, paper: Paper) -> LeaguePage | None:
 
 
 def place_slice(data: Path, out: Path, env: str) -> str | None:
-    """Put the slice through a scene's best point into the site, and return its command; None where there is none."""
+    """Copy the slice through a scene's best point into the site, and return its command, or None without one."""
     source, target = (LeagueFiles.of(root, env).slice for root in (data, out))
     store = source.record.parent / STORE
     if not (source.there() and source.dark.is_file() and is_finished(store)):
@@ -156,7 +156,7 @@ def place_slice(data: Path, out: Path, env: str) -> str | None:
 
 
 def rank_style(rank: float, methods: int) -> str:
-    """Return the style of the cell of a mean rank among so many methods, in the colours of the league's picture."""
+    """Return the style of a cell with a mean rank, in the colours of the league's picture."""
     from ...landscapes.draw.style import RANK_MAP, text_on
 
     colour = RANK_MAP((rank - 1) / max(methods - 1, 1))
@@ -165,7 +165,7 @@ def rank_style(rank: float, methods: int) -> str:
 
 
 def _came_off(scene: SceneStandings, one: Standing) -> Mapping[str, Any]:
-    """Return how a method came off in a scene: its best loss, its rank, and its episodes to each goal."""
+    """Return a method's results in a scene: best loss, rank, and episodes to each goal."""
     times = {f"episodes to {goal:.6g}": time for goal, time in zip(scene.goals, one.times, strict=True)}
     best = {"mean best loss": one.mean, "low": one.low, "high": one.high, "unsuccessful seeds": one.unsuccessful}
     rank = {"mean rank": one.rank, "rank low": one.rank_low, "rank high": one.rank_high}

@@ -1,4 +1,4 @@
-"""What a page needs of a slice: its numbers, its nodes for the map to hover over, its films, and its searches."""
+"""The data on a slice's page: its numbers, the nodes of its map, its films, and its searches."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ from ..records import Companion, Node, SweepRecord, open_run, read_nodes, read_s
 
 @dataclass(frozen=True)
 class Numbers:
-    """Say how a slice's points ended, the ends of their losses, and at what share of them the gradient is zero.
+    """Counts of how a slice's points ended, the range of their losses, and the share with a zero gradient.
 
-    `undersampled` is the share of its cells whose loss its samples do not show, with its interval, where it is known;
-    `floor` is its numerical floor in words.
+    `undersampled` is the share of undersampled cells with its interval, where it is known. `floor` describes the
+    numerical floor.
     """
 
     points: int
@@ -50,15 +50,15 @@ class Numbers:
 
     @property
     def spread(self) -> float:
-        """How far its losses range, 0 where none is finite."""
+        """The range of the losses, 0 if none is finite."""
         return 0.0 if self.lowest is None or self.highest is None else self.highest - self.lowest
 
 
 @dataclass(frozen=True)
 class ReportEntry:
-    """What `landscape report` found of a slice; `picture` says what the picture of gradient quality shows.
+    """The results of `landscape report` on a slice; `picture` describes the picture of gradient quality.
 
-    `notes` say what is not resolved, and what limits every word.
+    `notes` list what is not resolved, and what limits every verdict.
     """
 
     words: Sequence[Word]
@@ -72,9 +72,9 @@ class ReportEntry:
 
 @dataclass(frozen=True)
 class FigureEntry:
-    """A slice of the gallery, and all that its page shows.
+    """A slice of the gallery with the contents of its page.
 
-    `changed` holds the settings of its fidelity that changed since it was sampled: what they were, and what they are.
+    `changed` maps the settings of its fidelity that changed since it was sampled to the old and the new value.
     """
 
     id: str
@@ -104,7 +104,7 @@ class FigureEntry:
 
     @classmethod
     def of(cls, figure: Figure, dataset: xr.Dataset, source: Path) -> FigureEntry:
-        """Return the entry of a slice; its other files are added later."""
+        """Return the entry of a slice, to which other files are added later."""
         identity, provenance = stored_identity(dataset), stored_provenance(dataset)
         device = identity.get("device", "auto")
         return cls(
@@ -130,18 +130,18 @@ class FigureEntry:
 
     @property
     def dim(self) -> int:
-        """How many parameters its environment has."""
+        """The number of parameters of its environment."""
         named = entries().get(self.env)
         return int(named.dim) if named and named.dim.isdigit() else len(self.identity.get("parameters", self.dims))
 
     @property
     def words(self) -> list[str]:
-        """The words that were measured of it."""
+        """The measured verdict, as a list of words."""
         return [one.word for one in self.report.words if one.measured] if self.report is not None else []
 
 
 def count_numbers(dataset: xr.Dataset) -> Numbers:
-    """Count how the points of a slice ended, and find the range of their losses."""
+    """Count how the points of a slice ended, and return the range of their losses."""
     loss, status, flat = dataset["loss"].to_numpy(), dataset["status"].to_numpy(), flat_points(dataset)
     between, floor = Undersampled.of(dataset), floor_of(dataset)
     finite, evaluated = loss[np.isfinite(loss)], int(np.isin(status, NOT_EVALUATED, invert=True).sum())
@@ -157,7 +157,7 @@ def count_numbers(dataset: xr.Dataset) -> Numbers:
 
 
 def read_episodes(folder: Path, dataset: xr.Dataset) -> list[EpisodeShown]:
-    """Return the episodes that `episodes.json` lists and that have a film or a picture, one a node."""
+    """Return the episodes in `episodes.json` that have a film or a picture, one for each node."""
     listed = folder / EPISODES
     if not listed.exists():
         return []
@@ -182,7 +182,7 @@ def _episode(node: Node, folder: Path, plane: Plane) -> EpisodeShown:
 
 
 def read_report(folder: Path) -> Report | None:
-    """Return what `landscape report` found of a slice, None where there is no report."""
+    """Return the report of a slice, or None if there is none."""
     if not (folder / REPORT).exists():
         return None
     with reading(folder / REPORT, REMAKE.format("reports")):
@@ -190,7 +190,7 @@ def read_report(folder: Path) -> Report | None:
 
 
 def enter_report(report: Report) -> ReportEntry:
-    """Return what a page shows of a report."""
+    """Return the part of a report that a page shows."""
     where = report.paper.where if report.paper else ""
     verdict, picture = report.profile.verdict, _describe_quality(report.profile)
     notes = (*verdict.open, *verdict.lines)
@@ -206,28 +206,28 @@ def enter_report(report: Report) -> ReportEntry:
 
 
 def _describe_quality(profile: Profile) -> str:
-    """Say what the picture of gradient quality shows."""
+    """Describe the picture of gradient quality."""
     following = profile.verdict.following
     parts = [following.sentence] if following is not None and following.scales else []
     for row in profile.smoothing:
         if math.isfinite(row.biased.value):
             biased = round(row.biased.value * row.points)
-            parts.append(f"smoothed over {row.width:.0%} of it, first order is biased at {biased} of {row.points}")
+            parts.append(f"smoothed over {row.width:.0%} of the box, first order is biased at {biased} of {row.points}")
     return "Gradient quality over the slice: " + ("; ".join(parts) or "no slope above the noise")
 
 
 def quality_rows(profile: Profile) -> list[dict[str, Any]]:
-    """Return what the picture of gradient quality shows by scale, a row for each scale of each of its three parts."""
+    """Return the data by scale behind the picture of gradient quality, a row for each scale of its three parts."""
     parts = ("differences", "differences_of_samples", "smoothing")
     return [{"part": part.replace("_", " "), **to_json(row)} for part in parts for row in getattr(profile, part)]
 
 
 def read_runs(data: Path) -> list[xr.Dataset]:
-    """Return every run that `save_run` left in the gallery's data and that has an episode."""
+    """Return every run in the gallery's data that has at least one episode."""
     tables = [open_run(file) for file in sorted((data / RUNS).glob(f"*/*{RUN_SUFFIX}"))]
     return [table for table in tables if table.sizes["evaluation"]]
 
 
 def lay_own(dataset: xr.Dataset, tables: Sequence[xr.Dataset]) -> list[Trajectory]:
-    """Lay the runs of a slice's environment and options over it, the least loss first."""
+    """Project the runs of a slice's environment and options onto it, the lowest loss first."""
     return lay_runs(dataset, [one for one in tables if searched(stored_identity(one), stored_identity(dataset))])

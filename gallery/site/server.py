@@ -1,4 +1,4 @@
-"""The site, served to browsers of this machine."""
+"""A server of the site for browsers on this machine."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from ...landscapes.draw.loopback import LoopbackHandler, LoopbackServer
 
 
 class SiteHandler(LoopbackHandler, SimpleHTTPRequestHandler):
-    """Serve the files that lie in a folder, and none to which a link leads out of it; folders are not listed."""
+    """Serve the files in a folder, without directory listings and without links that lead out of it."""
 
     def send_head(self) -> Any:
-        """Open what is asked for, where it is there."""
+        """Open the requested file if it exists."""
         asked = Path(self.translate_path(self.path))
         with contextlib.suppress(OSError, RuntimeError, ValueError):  # no name of a file, a loop of links
             file = (asked / "index.html" if asked.is_dir() else asked).resolve(strict=True)
@@ -28,7 +28,7 @@ class SiteHandler(LoopbackHandler, SimpleHTTPRequestHandler):
 
 
 def open_server(out: str, port: int) -> LoopbackServer:
-    """Return a server of the site in a folder. Raises ValueError where there is none, OSError for a port in use."""
+    """Return a server of the site in a folder. Raises ValueError without a site, OSError for a port in use."""
     if not (Path(out) / "index.html").exists():
-        raise ValueError(f"{out} holds no gallery; build it with `landscape gallery build --out {shlex.quote(out)}`")
+        raise ValueError(f"{out} contains no gallery; build it with `landscape gallery build --out {shlex.quote(out)}`")
     return LoopbackServer(port, partial(SiteHandler, directory=out))

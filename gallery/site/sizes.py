@@ -1,4 +1,4 @@
-"""The sizes of a site's pictures, in its pages: a browser then keeps their room before they are there."""
+"""Sizes of the pictures in a site's pages, so that a browser reserves their space before they load."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ SHOWN = re.compile(r'<(?:img|video)\b(?![^>]*\swidth=)(?:[^>]*?\s(?:src|poster)=
 
 
 def give_sizes(site: Path) -> None:
-    """Write width and height of each picture, and of each film that has a picture of its end, where it is shown."""
+    """Write width and height into the tag of each picture, and of each film with a picture of its last frame."""
     for page in sorted(site.rglob("*.html")):
         text = page.read_text()
         sized = SHOWN.sub(partial(_sized, folder=page.parent), text)
@@ -21,7 +21,7 @@ def give_sizes(site: Path) -> None:
 
 
 def _sized(found: re.Match[str], folder: Path) -> str:
-    """Return a tag with the size of its picture, or as it was where that is not there or cannot be read."""
+    """Return a tag with the size of its picture, or unchanged if the picture is missing or cannot be read."""
     try:
         with Image.open(folder / found["file"]) as picture:
             width, height = picture.size

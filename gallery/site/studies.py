@@ -1,4 +1,4 @@
-"""What the pages of an environment show of its studies: accuracy against time, convergence, parts of the model."""
+"""Studies on the pages of an environment: accuracy against time, convergence, parts of the model."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ TOLERANCE = 0.05  # of the loss error that a picture's description names the qui
 
 @dataclass(frozen=True)
 class StudyEntry:
-    """A study of an environment on a device: its record with its files in the site, and what its picture shows, `alt`.
+    """A study of an environment on a device: its record, its files in the site, and `alt`, which describes its picture.
 
-    `front` names the variants of a study of fidelities that nothing beats in both time and error.
+    `front` names the variants of a fidelity study that no other one beats in both time and error.
     """
 
     kind: str
@@ -42,7 +42,7 @@ class StudyEntry:
 def place_studies(data: Path, out: Path, envs: Sequence[str], studio: Studio) -> dict[str, list[StudyEntry]]:
     """Copy the studies of these environments into the site, and return them by environment.
 
-    A study of convergence of another model than that whose fidelities were compared is copied alone.
+    A convergence study of another model version than the fidelity study is copied, but not shown with it.
     """
     placed: dict[str, list[StudyEntry]] = {env: [] for env in envs}
     for env, device in ((env, device) for env in placed for device in DEVICES):
@@ -67,7 +67,7 @@ def _entry(record: StudyRecord, device: str, files: StudyFiles) -> StudyEntry:
 
 
 def _rows(record: StudyRecord) -> list[Mapping[str, Any]]:
-    """Return what a study measured as rows of a table."""
+    """Return the measurements of a study as rows of a table."""
     if isinstance(record, ConvergenceRecord):
         moves = [{"setting": one.setting, **asdict(move)} for one in record.settings for move in one.moves]
         return [*moves, *({"left of": one.name, **asdict(one)} for one in record.remainders)]
@@ -77,26 +77,26 @@ def _rows(record: StudyRecord) -> list[Mapping[str, Any]]:
 
 
 def _describe(record: StudyRecord) -> str:
-    """Say what the picture of a study shows."""
+    """Describe the picture of a study."""
     if isinstance(record, FidelityRecord):
         return _describe_accuracy(record)
     if isinstance(record, ConvergenceRecord):
         settings = ", ".join(one.setting for one in record.settings)
-        return f"How far losses of {record.env} move as {settings} are refined: {record.rule.sentence()}"
+        return f"Change of the losses of {record.env} under refinement of {settings}: {record.rule.sentence()}"
     assert isinstance(record, ModelRecord)
     effects = {effect: [part.name for part in record.parts if part.effect == effect] for effect in Effect}
     said = [f"{', '.join(names)}: {effect}" for effect, names in effects.items() if names]
-    return f"How far changing each part of {record.env} moves losses over the time it saves: " + "; ".join(said)
+    return f"Change of the loss against time saved, for each part of {record.env}: " + "; ".join(said)
 
 
 def _describe_accuracy(record: FidelityRecord) -> str:
     named = [one for one in record.by_time if one.changed == "named" and one.name != record.reference]
     parts = [f"{one.name} takes {_milliseconds(one)} and is off by {_share(one, record)}" for one in named]
     if quickest := record.cheapest(TOLERANCE):
-        parts.append(f"the quickest within {TOLERANCE:.0%} is {quickest.name} with {_milliseconds(quickest)}")
+        parts.append(f"the fastest within {TOLERANCE:.0%} is {quickest.name} with {_milliseconds(quickest)}")
     parts.append(f"the reference takes {_milliseconds(record.variant(record.reference))}")
     count = len(record.variants)
-    return f"Loss error of {count} ways to simulate {record.env} over the time of an episode: {'; '.join(parts)}"
+    return f"Loss error of {count} variants of {record.env} against the time of an episode: {'; '.join(parts)}"
 
 
 def _milliseconds(one: MeasuredVariant) -> str:
@@ -106,5 +106,5 @@ def _milliseconds(one: MeasuredVariant) -> str:
 def _share(one: MeasuredVariant, record: FidelityRecord) -> str:
     error = one.p95(relative=record.spread is not None)
     if error is None:
-        return "more than a number can say (it failed too often)"
+        return "an unknown amount (it failed too often)"
     return f"{error:.2g} {record.loss_unit}".rstrip() if record.spread is None else f"{100 * error:.2g} %"

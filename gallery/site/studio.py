@@ -1,8 +1,8 @@
-"""Where a site's pictures are made while its pages are written: slices by processes, dark variants by a thread.
+"""Draw a site's pictures while its pages are written: slices in processes, dark variants in a thread.
 
     python -m gradscape.gallery.site.studio SOURCE FOLDER [SOURCE FOLDER ...]
 
-draws the slices of figures' folders into those of their pages. What it fails at it pickles to its standard output.
+draws the slices in the figures' folders into the folders of their pages. It pickles an error to its standard output.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ Reading = Callable[[], AbstractContextManager[Any]]
 
 
 class Studio:
-    """Draw slices and recolour pictures; leaving it waits for all, and raises what the first that failed did."""
+    """Draw slices and recolour pictures; on exit, wait for all of them and raise the first error."""
 
     def __init__(self, places: Sequence[tuple[Path, Path]]) -> None:
         self._thread = ThreadPoolExecutor(1)  # what recolours lets go of Python
@@ -54,11 +54,11 @@ class Studio:
                 one.result()
 
     def develop(self, source: Path, target: Path, within: Reading = nullcontext) -> None:
-        """Make the dark variant of a picture next to where that goes, within what names the file of a failure."""
+        """Make the dark variant of a picture next to `target`; the context `within` names the file in an error."""
         self._begun.append(self._thread.submit(_develop, source, target, within))
 
     def place(self, source: RecordFiles, target: RecordFiles) -> None:
-        """Copy a record with its picture into the site, and make the dark variant of that."""
+        """Copy a record with its picture into the site, and make the dark variant of the picture."""
         target.record.parent.mkdir(exist_ok=True)
         shutil.copyfile(source.record, target.record)
         shutil.copyfile(source.picture, target.picture)
@@ -66,7 +66,7 @@ class Studio:
 
 
 def _start(places: Sequence[tuple[Path, Path]]) -> list[subprocess.Popen[bytes]]:
-    """Start processes that draw the slices, as many as there are cores; none where there is one."""
+    """Start processes that draw the slices: one for each core up to a limit, or none on a single core."""
     from ...envs.engines.runtime import cores
 
     count = min(cores(), MAX_PROCESSES) if cores() > 1 else 0
@@ -76,12 +76,12 @@ def _start(places: Sequence[tuple[Path, Path]]) -> list[subprocess.Popen[bytes]]
 
 
 def _failure(said: bytes, code: int) -> Exception:
-    """Return what a process failed at, as it said, or that it ended."""
+    """Return the error that a process reported, or one with its exit code."""
     try:
         error = pickle.loads(said)  # of a process of our own
         return error if isinstance(error, Exception) else RuntimeError(str(error))
     except (pickle.UnpicklingError, EOFError, AttributeError, ImportError, IndexError):
-        return RuntimeError(f"a process that draws slices ended with code {code}; see what it said above")
+        return RuntimeError(f"a process that draws slices ended with code {code}; see its output above")
 
 
 def _develop(source: Path, target: Path, within: Reading) -> None:
@@ -92,12 +92,12 @@ def _develop(source: Path, target: Path, within: Reading) -> None:
 
 
 def draws(source: Path, rank: int) -> list[str]:
-    """Return which pictures of a slice are drawn; a line has the one made with it, as its events need episodes."""
+    """Return which pictures of a slice to draw; a line keeps its stored one, because its events need episodes."""
     return [THUMBNAIL] if rank == 1 and (source / PICTURE).exists() else [THUMBNAIL, PICTURE]
 
 
 def draw_slice(source: Path, folder: Path) -> None:
-    """Draw a figure's slice for light and for dark."""
+    """Draw a figure's slice for light and for dark pages."""
     from ...landscapes.draw.figures.contour import landscape_figure
     from ...landscapes.draw.figures.multiples import thumbnail_figure
     from ...landscapes.draw.figures.profile import profile_figure
@@ -113,7 +113,7 @@ def draw_slice(source: Path, folder: Path) -> None:
 
 
 def main() -> None:
-    """Draw what is asked for."""
+    """Draw the slices named on the command line."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # who began it ends it
     places = [Path(one) for one in sys.argv[1:]]
     try:

@@ -1,4 +1,4 @@
-"""The front page: a slice of every environment with what its census says of many, and the report card of engines."""
+"""The front page: a slice of every environment with the results of its census, and the report card of engines."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ SIZES = {"1-3": "1 to 3", "4-16": "4 to 16", "17-": "17 or more"}  # numbers of 
 
 @dataclass(frozen=True)
 class WordShare:
-    """A word, the share of an environment's slices that it fits, and its interval, None where there is none."""
+    """A verdict word, the share of an environment's slices that it fits, and the interval if there is one."""
 
     word: str
     share: float
@@ -54,11 +54,11 @@ class WordShare:
 
 @dataclass(frozen=True)
 class Tile:
-    """An environment on the wall: the slice that is shown, and which words fit which share of how many slices.
+    """An environment on the wall: the slice that is shown, and the share of slices that each word fits.
 
-    They are those of its `census`, with the command, the picture and the table of that, or of the gallery's own slices.
-    Of a census `flat` slices are not among them, and `most` has what is true of most slices: of more than half of
-    all by the lower end of its 95 % interval.
+    The slices are those of its `census`, which has a command, a picture and a table, or else those of the gallery. The
+    `flat` slices of a census are not counted. `most` lists what is true of most slices: the lower end of its 95 %
+    interval is above one half.
     """
 
     env: str
@@ -77,49 +77,50 @@ class Tile:
     most: Sequence[str] = ()
 
     def fitting(self, least: float = MIN_SHARE) -> list[str]:
-        """Return the words that fit such a share of the slices, or more."""
+        """Return the words that fit at least a share of the slices."""
         return [one.word for one in self.words if one.share >= least]
 
     @property
     def shape(self) -> list[WordShare]:
-        """How smooth it is: the words that fit most slices, the most frequent first, none that fits none."""
+        """The most frequent words on smoothness, in descending order of their share."""
         found = [one for one in self.words if one.word in SHAPES and one.share > 0]
         return sorted(found, key=lambda one: -one.share)[:SHOWN_WORDS]
 
     def __str__(self) -> str:
         if not self.slices:
             return "not measured yet"
-        said = ", ".join(map(str, self.shape)) or "none of the words"
+        said = ", ".join(map(str, self.shape)) or "no verdict"
         flat = f"; {self.flat} more are flat" if self.flat else ""
         return f"{said} of {self.slices} slice{'s' if self.slices > 1 else ''}{'' if self.census else ' here'}{flat}"
 
     def share(self, word: str) -> WordShare | None:
-        """Return the share of a word, None where nothing is known of it."""
+        """Return the share of a word, or None if it is not known."""
         return next((one for one in self.words if one.word == word), None)
 
 
 def answers(tiles: Sequence[Tile]) -> tuple[str, str]:
-    """Say how smooth the environments are, and in which of them gradients follow, by those that have a census."""
+    """Say how smooth the environments with a census are, and in which of them gradients follow."""
     counted = [tile for tile in tiles if tile.census and tile.slices]
     if not counted:
-        return ("No environment was cut many times yet.",) * 2
+        return ("No environment has a census yet.",) * 2
     smooth, minima, rugged, follow = (_names(counted, said) for said in MOSTLY)
     many = f"{len(counted)} environment{'s' if len(counted) > 1 else ''}"
     return (
-        f"Of {many} many slices were measured. Most are very smooth in {smooth}, smooth with local minima in {minima}, "
-        f"and rugged in {rugged}. For the others this many slices cannot tell, or no word fits most of them.",
+        f"A census has measured many slices of {many}. Most slices are very smooth in {smooth}, smooth with local "
+        f"minima in {minima}, and rugged in {rugged}. In the others no verdict fits most slices, or the slices are too "
+        "few to tell.",
         f"Gradients follow the loss over 1 % of the box in most slices of {follow}. In the others they follow loosely, "
-        "in fewer slices, or not at all, or this many slices cannot tell.",
+        "in fewer slices or not at all, or the slices are too few to tell.",
     )
 
 
 def _names(tiles: Sequence[Tile], said: str) -> str:
-    """Return the environments of whose slices something is true in most cases."""
+    """Return the names of the environments in which something is true of most slices."""
     return " and ".join(", ".join(tile.env for tile in tiles if said in tile.most).rsplit(", ", 1)) or "none"
 
 
 def size_class(dim: int) -> str:
-    """Return the name of the class of a number of parameters, of `SIZES`."""
+    """Return the class of a number of parameters, a key of `SIZES`."""
     return "1-3" if dim <= 3 else "4-16" if dim <= 16 else "17-"
 
 
@@ -154,7 +155,7 @@ def _word_share(word: str, share: Estimate) -> WordShare:
 
 
 def _place_census(env: str, data: Path, out: Path, studio: Studio) -> tuple[Census, RecordFiles] | None:
-    """Copy a census into the site with the table of its slices; return it with where it is, None where none is."""
+    """Copy a census with the table of its slices into the site, and return it with its files, or None without one."""
     for device in DEVICES:
         source, target = (RecordFiles.of_census(root, env, device) for root in (data, out))
         if not source.there():
@@ -169,7 +170,7 @@ def _place_census(env: str, data: Path, out: Path, studio: Studio) -> tuple[Cens
 
 
 def _census_rows(census: Census) -> Iterator[Mapping[str, Any]]:
-    """Yield what is known of each slice of a census."""
+    """Yield a row for each slice of a census."""
     unit = f" [{census.loss_unit}]" if census.loss_unit else ""
     for one in census.slices:
         low, high = one.range or (None, None)
@@ -180,7 +181,7 @@ def _census_rows(census: Census) -> Iterator[Mapping[str, Any]]:
 
 
 def draw_wall(tiles: Sequence[Tile], data: Path, out: Path) -> None:
-    """Draw the wall, and write its table."""
+    """Draw the wall and write its table."""
     from ...landscapes.draw.figures.multiples import Landscape, wall_figure
 
     hung = [Landscape(tile.env, str(tile), open_slice(data / tile.figure / STORE)) for tile in tiles]
@@ -194,7 +195,7 @@ def draw_wall(tiles: Sequence[Tile], data: Path, out: Path) -> None:
 
 
 def place_card(data: Path, out: Path, studio: Studio) -> Card | None:
-    """Copy the report card of the figures' data into the site, and return it; None where there is none."""
+    """Copy the report card of the figures' data into the site, and return it, or None without one."""
     source, target = (RecordFiles(root / CARD / CARD_RECORD) for root in (data, out))
     if not source.there():
         return None

@@ -1,4 +1,4 @@
-"""Conclude from what was measured what is wrong with gradients: a diagnosis for each kind of finding."""
+"""Conclude what is wrong with gradients from the measurements: a diagnosis for each kind of finding."""
 
 from __future__ import annotations
 
@@ -35,10 +35,10 @@ Texts = dict[str, str]
 
 @dataclass(frozen=True)
 class Further:
-    """What can be asked about a point whose gradient is NaN or wrong, once there is one.
+    """Further questions about a point whose gradient is NaN or wrong.
 
-    `nan_origin` and `wrong_origin` say where that begins, and `first_wrong` from which length of an episode on, at a
-    random point or, numbered from -1 down, at a special place; `has_length` says that episodes have one.
+    `nan_origin` and `wrong_origin` return where that begins. `first_wrong` returns the first wrong length of an
+    episode, at a random point or, numbered from -1 down, at a special place. `has_length`: episodes have a length.
     """
 
     nan_origin: Callable[[int], str] = lambda row: ""
@@ -48,7 +48,7 @@ class Further:
 
 
 def conclude(seen: Examination, calls: Evidence, further: Further | None = None) -> tuple[Diagnosis, ...]:
-    """Return a diagnosis for each kind of finding, what fails and is certain first."""
+    """Return a diagnosis for each kind of finding, failures and the most certain first."""
     further, calls = further or Further(), dict.fromkeys(OF_CALLS, 0.0) | calls
     found = [one for judge in (_of_calls, _of_grain) for one in judge(seen, calls)]
     explained = any(one.outcome == FAIL for one in found)
@@ -96,7 +96,7 @@ def _of_calls(seen: Examination, calls: Evidence) -> Iterator[Diagnosis]:
     how = "they add up from call to call" if calls.get("grows") else "a call returns the gradient of the one before"
     short = f"{calls.get('batch', 1.0):.3g} times shorter"
     what = "the loss" if calls.get("leaks") else "the gradient"
-    how_batch = "all rows have the same" if calls.get("alike") else short
+    how_batch = "all rows have the same gradient" if calls.get("alike") else short
     yield from _recognised("calls", calls, {"how": how, "how_batch": how_batch, "what": what})
 
 
@@ -115,13 +115,13 @@ def _of_grain(seen: Examination, calls: Evidence) -> Iterator[Diagnosis]:
     }
     consequence = f": gradients cannot be judged below {percent(evidence['limit'])} of the slope"
     if evidence["zero_gradients"] >= 0.5 or evidence.get("rough", 0) > 0.01:
-        consequence = ": differences over small steps are 0, or multiples of that"
+        consequence = ": differences over small steps are 0, or multiples of it"
     exponent = round(math.log2(probe.grain))
     yield from _recognised("grain", evidence, {"grain_text": f"2^{exponent}", "consequence": consequence})
 
 
 def _limit(seen: Examination) -> float:
-    """Return the relative error of a gradient that would have been found at half of the points."""
+    """Return the relative error of a gradient that would be detected at half of the points."""
     limits = [one.limit for one in seen.random.judged if math.isfinite(one.limit) and one.kind not in UNJUDGED]
     return float(np.median(limits)) if limits else 1.0
 
@@ -153,7 +153,7 @@ def _of_wrong(seen: Examination, calls: Evidence, further: Further) -> Iterator[
     rows = seen.rows(Kind.WRONG)
     if not rows and not seen.axes.rows(Kind.WRONG):
         for place in seen.places[1].rows(Kind.WRONG)[:1]:
-            remedy = "Look at what divides by zero or chooses a branch there."
+            remedy = "Look for a division by zero or a branch at this point."
             yield Diagnosis("", FAIL, "certain", seen.describe_place(place), remedy)
         return
     names = _named(seen, seen.blamed)
@@ -185,9 +185,9 @@ def _of_wrong(seen: Examination, calls: Evidence, further: Further) -> Iterator[
 
 
 def _early(seen: Examination) -> set[int]:
-    """Return the first parameters, where gradients are wrong by all that were walked of them and right by the others.
+    """Return the first parameters, if the gradient is wrong by all tested ones of them and right by the others.
 
-    They may be the controls of the first steps. Empty where it is not so.
+    They can be the controls of the first steps. Empty otherwise.
     """
     verdicts = [row.verdict for row in seen.parameters()]
     wrong = [axis for axis, one in enumerate(verdicts) if one in WRONG]
@@ -201,7 +201,7 @@ REMEDY = "Compare the gradient with differences along one parameter, at one of t
 
 
 def _wrong_numbers(seen: Examination) -> Evidence:
-    """Return what wrong gradients have in common: along axes where these are known, else along all at once."""
+    """Return the common features of wrong gradients: along axes where these are known, else along all at once."""
     axes = seen.at_wrong or seen.axes
     wrong, known = Samples.of(axes, wrong=True), Samples.of(axes, wrong=False)
     space, dim = seen.probe.objective.space, len(seen.names)
@@ -261,19 +261,19 @@ def _of_noise(seen: Examination) -> Iterator[Diagnosis]:
 
 
 def conclude_physics(evidence: Evidence) -> tuple[Diagnosis, ...]:
-    """Say that gradients are right for the program and wrong for the physics."""
+    """Conclude that gradients are right for the program but wrong for the physics."""
     texts = {"physics_text": percent(evidence.get("physics", 0.0)), "finest_text": percent(evidence.get("at_4", 0.0))}
     return _recognised("physics", evidence, texts)
 
 
 def conclude_memory(growth: MemoryGrowth) -> tuple[Diagnosis, ...]:
-    """Say that memory grows with every evaluation."""
+    """Conclude that memory grows with every evaluation."""
     evidence = {"growth": growth.per_evaluation if growth.grows else 0.0, "evaluations": float(growth.evaluations)}
     return _recognised("memory", evidence, {"growth_text": f"{growth.per_evaluation:,.0f} bytes"})
 
 
 def conclude_jumps(curve: Sequence[Usefulness]) -> tuple[Diagnosis, ...]:
-    """Say that the loss jumps so regularly that means of gradients are not the slope of the smoothed loss."""
+    """Conclude that regular jumps of the loss make means of gradients differ from the slope of the smoothed loss."""
     for one in sorted(curve, key=lambda one: -one.step):
         evidence = {"step": one.step, "bias": one.bias.value, "low": one.bias.low, "high": one.bias.high}
         evidence["least_bias"] = max(one.bias.low, -one.bias.high)
@@ -285,7 +285,7 @@ def conclude_jumps(curve: Sequence[Usefulness]) -> tuple[Diagnosis, ...]:
 
 
 def _of_length(seen: Examination) -> Iterator[Diagnosis]:
-    """Say that gradients are too long or too short on average, though no single point shows it."""
+    """Conclude that gradients are too long or too short on average, although no single point shows it."""
     lines = [one for one in seen.random.judged if one.slope is not None and one.kind in (Kind.AGREES, Kind.WRONG)]
     clear = [one for one in lines if one.slope and abs(one.slope.error) < UNCLEAR * abs(one.slope.value)]
     if len(clear) < MANY_LINES or any(one.kind == Kind.WRONG for one in lines):

@@ -1,4 +1,4 @@
-"""What a check concludes: what is wrong with a gradient, how sure that is, where it is so, and what to try."""
+"""The conclusion of a check: the error of a gradient, its certainty, its region, and a remedy."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ CERTAINTIES: tuple[Certainty, ...] = ("certain", "likely", "possible")
 
 @dataclass(frozen=True)
 class Region:
-    """Describe where gradients are wrong, by the simplest rule that holds.
+    """Describe where gradients are wrong, by the simplest valid rule.
 
-    `rule` is a sentence's end, such as "a between 0.52 and 0.95". `error` is the share of the points that the rule puts
-    on the wrong side, and `checked` the number of points it was tried at.
+    `rule` ends a sentence, such as "a between 0.52 and 0.95". `error` is the share of points on the wrong side of the
+    rule, and `checked` the number of points it was tested on.
     """
 
     rule: str
@@ -27,11 +27,11 @@ class Region:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """Say what is wrong with a gradient.
+    """Describe what is wrong with a gradient.
 
     `cause` is the name of a file in `causes/`, empty where none fits; `outcome` is fail, or warn where no gradient is
-    wrong. `what` is a sentence with its number, `parameters` are those concerned, empty where all are, and `region` is
-    None where it holds in the whole box. `remedy` says what to try.
+    wrong. `what` is a sentence with its number, `parameters` are the affected ones, empty for all. `region` is None
+    where it applies to the whole box. `remedy` is the advice.
     """
 
     cause: str

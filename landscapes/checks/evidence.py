@@ -1,4 +1,4 @@
-"""Numbers that tell the causes of wrong gradients apart; `causes` holds them against the signatures in its files."""
+"""Numbers that distinguish the causes of wrong gradients; `causes` compares them with the signatures in its files."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Samples:
 
     @classmethod
     def of(cls, axes: Ladder, *, wrong: bool) -> Samples:
-        """Return the lines whose slope by differences is known; where asked, those at which gradients are wrong."""
+        """Return the lines with a known slope by differences, or only those with wrong gradients."""
         rows = [
             row
             for row, one in enumerate(axes.judged)
@@ -77,7 +77,7 @@ Evidence = dict[str, float]
 
 
 def ratios(exact: Array, slope: Array, error: Array) -> Evidence:
-    """Return what ratios of gradients to slopes have in common: `ratio`, `steady`, `zero`, `near`, `below`."""
+    """Return features of the ratios of gradients to slopes: `ratio`, `steady`, `zero`, `near`, `below`."""
     clear = np.abs(slope) > 5 * error
     if not clear.any():
         return {}
@@ -95,7 +95,7 @@ def ratios(exact: Array, slope: Array, error: Array) -> Evidence:
 
 
 def _mode(found: Array, room: Array) -> float:
-    """Return the ratio that most others are close to."""
+    """Return the ratio closest to the most others."""
     support = [int((np.abs(found - one) <= room * max(abs(one), 0.1)).sum()) for one in found]
     best = found[int(np.argmax(support))]
     near = np.abs(found - best) <= room * max(abs(best), 0.1)
@@ -103,7 +103,7 @@ def _mode(found: Array, room: Array) -> float:
 
 
 def per_parameter(samples: Samples, space: ParameterSpace) -> Evidence:
-    """Return whether ratios are the same for each parameter (`own`), and are its range or one over it (`units`)."""
+    """Return whether each parameter has its own constant ratio (`own`), equal to its range or one over it (`units`)."""
     clear = np.abs(samples.slope) > 5 * samples.error
     width = (space.upper - space.lower).numpy()
     own, units = [], []
@@ -124,9 +124,9 @@ def per_parameter(samples: Samples, space: ParameterSpace) -> Evidence:
 
 
 def exchanged(exact: Array, slope: Array) -> Evidence:
-    """Return whether components stand in each other's places: `permuted`, and `transposed` where as in a matrix.
+    """Return whether components are exchanged: `permuted`, and `transposed` where as in a matrix.
 
-    `exact` and `slope` have shape (point, dim), two points at least.
+    `exact` and `slope` have shape (point, dim), with at least two points.
     """
     from scipy.optimize import linear_sum_assignment
 
@@ -154,7 +154,7 @@ def exchanged(exact: Array, slope: Array) -> Evidence:
 
 
 def cut_off(probe: Probe, samples: Samples, others: Samples) -> Evidence:
-    """Return the share of wrong components that have the same length in the parameters' units, the largest there is."""
+    """Return the share of wrong components with the same length in the parameters' units, the largest there is."""
     width = probe.width.numpy()
     wrong = np.abs(samples.exact) / width[samples.axis]
     if len(wrong) < 3:
@@ -168,7 +168,7 @@ def cut_off(probe: Probe, samples: Samples, others: Samples) -> Evidence:
 
 
 def same_length(grad: Float[Tensor, "point dim"]) -> Evidence:
-    """Return the share of gradients that have the length of the longest, in the parameters' units."""
+    """Return the share of gradients with the length of the longest, in the parameters' units."""
     sizes = grad.norm(dim=1)
     sizes = sizes[sizes.isfinite() & (sizes > 0)]
     if len(sizes) < 3:
@@ -178,7 +178,7 @@ def same_length(grad: Float[Tensor, "point dim"]) -> Evidence:
 
 
 def cosine(exact: Array, slope: Array) -> Evidence:
-    """Return the median cosine of gradients and slopes, shape (point, dim), and that of the ratio of their lengths."""
+    """Return the median cosine of gradients and slopes, shape (point, dim), and the median ratio of their lengths."""
     if not len(exact):
         return {}
     sizes = np.linalg.norm(exact, axis=1), np.linalg.norm(slope, axis=1)
@@ -191,7 +191,7 @@ def cosine(exact: Array, slope: Array) -> Evidence:
 
 @dataclass(frozen=True, eq=False)
 class _AxisSlope:
-    """A component of a gradient at a point: what it says, and differences along its axis."""
+    """A component of a gradient at a point: its value, and differences along its axis."""
 
     probe: Probe
     u: Float[Tensor, " dim"]
@@ -199,24 +199,24 @@ class _AxisSlope:
     exact: float
 
     def difference(self, step: float, side: int) -> float:
-        """Return a central difference, or with `side` 1 and 2 one ahead and one behind; NaN beyond the box."""
+        """Return a central difference, or with `side` 1 and 2 one ahead and one behind; NaN outside the box."""
         offset = torch.zeros_like(self.u)
         offset[self.axis] = step
         ahead, here, behind = self.probe.loss(torch.stack([self.u + offset, self.u, self.u - offset])).tolist()
         return float([(ahead - behind) / (2 * step), (ahead - here) / step, (here - behind) / step][side])
 
     def agrees(self, step: float, side: int) -> bool | None:
-        """Say whether the component is the difference over a step; None where that leads beyond the box."""
+        """Return whether the component is the difference over a step; None where that leads outside the box."""
         found = self.difference(step, side)
         if not np.isfinite(found):
             return None
         return abs(found - self.exact) <= SAME_DIFFERENCE * max(abs(self.exact), abs(found))
 
     def matching_steps(self, side: int, width: float) -> list[float]:
-        """Return steps over which the difference is what the component says; `width` is the parameter's range.
+        """Return steps whose difference equals the component; `width` is the parameter's range.
 
-        Those that people take come first, as shares of the box and in the parameter's unit: of a loss that oscillates
-        many others fit by chance.
+        Common choices come first, as fractions of the box and in the parameter's unit: for an oscillating loss, many
+        other steps fit by chance.
         """
         common = [step for one in COMMON_STEPS for step in (one, one / width) if step <= STEPS_TRIED[1]]
         steps = np.geomspace(*STEPS_TRIED, TRIED)
@@ -235,9 +235,9 @@ class _AxisSlope:
 
 
 def as_difference(probe: Probe, axes: Ladder, rows: Sequence[int]) -> Evidence:
-    """Look for the step of the difference that a gradient may be: `difference_step`, as a share of the box.
+    """Find the step of the finite difference behind a gradient: `difference_step`, as a fraction of the box.
 
-    The step is found at one component by trying many, and has to hold at others, as a share of the box or in the
+    The step is found at one component by trying many. It has to fit at others, as a fraction of the box or in the
     parameters' own units.
     """
     lines, width = axes.lines, probe.width
@@ -257,7 +257,7 @@ def as_difference(probe: Probe, axes: Ladder, rows: Sequence[int]) -> Evidence:
 
 
 def roughness(probe: Probe, u: Float[Tensor, "point dim"]) -> Evidence:
-    """Return by how much gradients of points that are next to each other differ: `rough`, relative to their length."""
+    """Return the relative difference of gradients at adjacent points: `rough`."""
     apart = NEAR[probe.single]
     near = (u + apart * torch.where(u > 0.5, -1.0, 1.0)).clamp(0, 1)
     here, there = (probe.gradient(one).grad for one in (u, near))

@@ -1,7 +1,7 @@
 """Examine the gradients of an objective: at random points, at special places, by every parameter; where, and why.
 
-Points are as many as find a defect that fills a given share of the box with 95 %, spread evenly (a scrambled Sobol
-sequence), so that no slab of that width lies between them.
+The number of points finds a defect in a given share of the box with 95 % probability. They are spread evenly (a
+scrambled Sobol sequence), so that no slab of that width lies between them.
 """
 
 from __future__ import annotations
@@ -37,21 +37,21 @@ MANY_AXES, FEW_POINTS = 200, 2  # and of so many at fewer points
 
 
 def points_for(power: float) -> int:
-    """Return how many random points find a defect that fills a share of the box with 95 %."""
+    """Return how many random points find a defect in a share of the box with 95 % probability."""
     return max(FEWEST_POINTS, math.ceil(math.log(1 - CONFIDENCE) / math.log1p(-power)))
 
 
 def could_be_missed(judged: int) -> float:
-    """Return the largest share of the box that a defect may fill without being met by so many points with 95 %."""
+    """Return the largest share of the box in which this many points can miss a defect, at 95 %."""
     return 1.0 if judged == 0 else 1 - (1 - CONFIDENCE) ** (1 / judged)
 
 
 @dataclass(frozen=True)
 class Share:
-    """How many of the judged points are wrong, the interval of their share of the box, and what could be missed.
+    """The number of wrong ones among the judged points, the interval of their share, and what could be missed.
 
-    `low` and `high` bound the share with 95 % (Clopper & Pearson 1934). A defect that fills less than `missed` of the
-    box may not have been met.
+    `low` and `high` bound the share of the box with 95 % (Clopper & Pearson 1934). A defect in less than `missed` of
+    the box could be undetected.
     """
 
     wrong: int
@@ -70,7 +70,7 @@ class Share:
         return cls(wrong, len(told), len(judged), found.low, found.high, could_be_missed(len(told)))
 
     def describe(self) -> str:
-        """Say it: "wrong at 42 % (30 to 55 %) of 64 points"."""
+        """Give it in words: "wrong at 42 % (30 to 55 %) of 64 points"."""
         value = self.wrong / self.judged if self.judged else math.nan
         return f"{percent(value)} ({percent(self.low, bare=True)} to {percent(self.high)}) of {self.judged} points"
 
@@ -83,7 +83,7 @@ def percent(value: float, *, bare: bool = False) -> str:
 
 @dataclass(eq=False)
 class Examination:
-    """All that was measured of the gradients of one objective."""
+    """All measurements of the gradients of one objective."""
 
     probe: Probe
     seed: int
@@ -104,7 +104,7 @@ class Examination:
 
     @property
     def share(self) -> Share:
-        """How many random points are wrong."""
+        """The share of wrong random points."""
         return Share.of(self.random.judged)
 
     def rows(self, *kinds: Kind) -> list[int]:
@@ -112,7 +112,7 @@ class Examination:
         return self.random.rows(*kinds)
 
     def describe_place(self, row: int) -> str:
-        """Say what is wrong along a line through a special place."""
+        """Describe the error along a line through a special place."""
         (names, ladder), one = self.places, self.places[1].judged[row]
         axis, loss = int(ladder.axis[row]), float(ladder.lines.loss[row])
         if one.kind == Kind.NAN:
@@ -120,14 +120,14 @@ class Examination:
         sides = [side.value for side in (one.behind, one.ahead) if side is not None]
         rise = " and ".join(f"{value:.3g}" for value in sides) or f"{one.slope.value:.3g}" if one.slope else "otherwise"
         gradient = f"by {self.names[axis]}, the gradient is {one.exact:.3g}"
-        return f"at {names[row]}, {gradient} and the loss rises by {rise} to either side"
+        return f"at {names[row]}, {gradient}, but the loss rises by {rise} to either side"
 
     def parameters(self) -> tuple[ParameterRow, ...]:
         """Return the table of parameters."""
         return by_parameter.table(self.names, self.found, self.axes, self.blamed or set(), self.stepped)
 
     def table(self) -> tuple[dict[str, float | None], ...]:
-        """Return a row for each step of the ladder: how slopes of gradients compare with differences over it."""
+        """Return a row for each step of the ladder: the comparison of gradients with differences over it."""
         differences, exact = self.random.differences.numpy(), self.random.lines.slope.numpy()
         rows = []
         for step, slope in zip(self.random.steps, differences, strict=True):
@@ -145,14 +145,14 @@ class Examination:
 
 
 def evaluations(dim: int, power: float) -> tuple[int, int]:
-    """Return about how many losses alone, and with gradients, `examine` takes of a gradient that is right."""
+    """Return the approximate numbers of losses alone and with gradients that `examine` takes for a right gradient."""
     points = 2 ** math.ceil(math.log2(points_for(power)))
     axes = 2 * len(by_parameter.STEPS) * by_parameter.axis_lines(dim)
     return 2 * len(STEPS) * points + axes + place_losses(dim), 2 * points + INNER_GRADIENTS
 
 
 def examine(probe: Probe, power: float, seed: int, say: Callable[[str], None] = lambda text: None) -> Examination:
-    """Judge gradients at random points, at special places and by every parameter; look closer where some are wrong."""
+    """Judge gradients at random points, at special places and by every parameter; examine wrong ones further."""
     say("gradients at random points")
     engine = SobolEngine(probe.objective.space.dim, scramble=True, seed=seed)  # type: ignore[no-untyped-call]
     wanted = points_for(power)
@@ -187,7 +187,7 @@ def _random(probe: Probe, engine: SobolEngine, count: int, seed: int) -> Drawn:
 
 
 def _more(probe: Probe, engine: SobolEngine, count: int, seed: int, before: Drawn) -> Drawn:
-    """Draw as many points once more."""
+    """Draw the same number of points once more."""
     u, found, ladder = _random(probe, engine, count, seed + len(before[0]))
     first, lines = before[2], ladder.lines
     steps = tuple(sorted({*first.steps, *ladder.steps}))
@@ -223,7 +223,7 @@ def _look_closer(result: Examination) -> None:
 
 
 def _walk_at_wrong(result: Examination, points: Sequence[int]) -> None:
-    """Walk along axes at points whose gradient is wrong: all, or those that are blamed, or some."""
+    """Walk along axes at points with a wrong gradient: all axes, or the blamed ones, or some."""
     dim = result.u.shape[1]
     generator = torch.Generator().manual_seed(result.seed)
     axes = torch.arange(dim)

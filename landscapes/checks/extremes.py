@@ -33,10 +33,10 @@ NAMED = 4  # parameters of a point that are named, at most
 
 @dataclass(frozen=True)
 class ExtremeCase:
-    """Push an objective another way: `make` returns it, or raises ValueError where it refuses that.
+    """Stress an objective in another way: `make` returns it, or raises ValueError where it refuses that.
 
-    It is evaluated at `x`, or else at the first few of the points, and what was made has to answer there. `why` is
-    worth knowing with the answer, or says why there is nothing to make.
+    It is evaluated at `x`, or else at the first few of the points, and must return a result there. `why` adds to the
+    result, or explains why the case does not exist.
     """
 
     name: str
@@ -48,7 +48,7 @@ class ExtremeCase:
 def checks(
     subject: Subject, other: Callable[[], Subject] | None, variants: Sequence[ExtremeCase]
 ) -> Iterator[tuple[str, Callable[[], Finding]]]:
-    """Yield the name of each extreme and what checks it."""
+    """Yield the name of each extreme and its check."""
     space, objective = subject.objective.space, subject.objective
     ends = corners(space.dim)
     some = f"{len(ends)} of 2^{space.dim} corners, every two parameters in all four combinations"
@@ -65,7 +65,7 @@ def checks(
 
 
 def corners(dim: int) -> Float[Tensor, "corner dim"]:
-    """Return all corners of the unit cube, or few where every two parameters meet in all four combinations.
+    """Return all corners of the unit cube, or a few where every two parameters meet in all four combinations.
 
     Of n rows, the first all zero, columns are the different choices of ceil(n / 2) others (Kleitman and Spencer 1973,
     Families of k-independent sets): two of them share a row, and each has one the other lacks.
@@ -80,7 +80,7 @@ def corners(dim: int) -> Float[Tensor, "corner dim"]:
 
 
 def count_endings(found: Evaluation) -> tuple[dict[str, float | None], str]:
-    """Count how rows ended, and say what is wrong with them: loss and gradient are finite where the status says so."""
+    """Count rows by status, and describe errors: loss and gradient must be finite exactly where the status says so."""
     status, none = found.status, found.status == Status.NO_GRADIENT
     counts: dict[str, float | None] = {kind: float((status == code).sum()) for kind, code in KINDS.items()}
     finite = found.loss.isfinite()
@@ -98,14 +98,14 @@ def count_endings(found: Evaluation) -> tuple[dict[str, float | None], str]:
 
 
 def describe_counts(counts: Mapping[str, float | None]) -> str:
-    """Say in a line how rows ended."""
+    """Describe in a line the statuses of rows."""
     ends = ", ".join(f"{counts[kind]:.0f} {kind}" for kind in KINDS if counts[kind])
     largest = counts.get("largest_gradient")
     return ends + ("" if largest is None else f"; largest |grad| {largest:.1e}")
 
 
 def describe_missing(space: ParameterSpace, x: Float[Tensor, "batch dim"], found: Evaluation, place: str = "") -> str:
-    """Say where the gradient is NaN though the loss is finite, nothing where it is nowhere; `place` names one point."""
+    """Describe where the gradient is NaN although the loss is finite, empty for nowhere; `place` names one point."""
     rows = (found.status == Status.NO_GRADIENT).nonzero().flatten()
     if not len(rows):
         return ""
@@ -118,7 +118,7 @@ def describe_missing(space: ParameterSpace, x: Float[Tensor, "batch dim"], found
 
 
 def _check_inside(objective: Objective, x: Float[Tensor, "batch dim"], what: str = "") -> Finding:
-    """Check points of the box itself, where a finite loss has a gradient."""
+    """Check points of the box itself, where a finite loss needs a gradient."""
     found = objective.evaluate(x)
     judged = _judge(found, what)
     missing = describe_missing(objective.space, x, found, "" if len(x) > 1 else "the centre")
@@ -127,7 +127,7 @@ def _check_inside(objective: Objective, x: Float[Tensor, "batch dim"], what: str
 
 def _check_beyond(objective: Objective, x: Float[Tensor, "batch dim"]) -> Finding:
     if not objective.beyond_box:
-        return skip("not asked", "it does not invite points beyond its box (beyond_box = True does)")
+        return skip("not asked", "it is undefined outside its bounds; beyond_box = True allows points there")
     try:
         return _judge(objective.evaluate(x))
     except ValueError as refusal:
@@ -156,30 +156,30 @@ def _check_variant(subject: Subject, variant: ExtremeCase) -> Finding:
 
 
 def _check_energy(subject: Subject) -> Finding:
-    """Check that the energy of undriven motions does not rise, where the objective offers `energy`.
+    """Check that the energy of undriven motions does not rise, where the objective has `energy`.
 
-    `energy(x)` returns it over time, shape (batch, step), counted from rest at the lowest place, or None.
+    `energy(x)` returns it over time, shape (batch, step), relative to rest at the lowest point, or None.
     """
     found = subject.objective.energy(subject.x[:ROWS])
     if found is None:
-        return skip("n/a", "the objective offers no energy")
+        return skip("n/a", "the objective has no energy")
     first = found[:, :1]
     rise = difference((found - found.cummin(dim=1).values) / first, torch.zeros_like(found))
     left = float((found[:, -1:] / first).mean())
-    figure = f"rises by up to {rise:.1e} of what there is at first, of which {left:.4g} are left at the end"
-    why = f"at most {RISE:g} is wanted: the steps add energy"
+    figure = f"rises by up to {rise:.1e} of its initial value, of which {left:.4g} remains at the end"
+    why = f"at most {RISE:g} is allowed: the time steps add energy"
     return verdict(rise <= RISE, figure, why, {"rise": rise, "left": left, "limit": RISE})
 
 
 def _check_precisions(subject: Subject, other: Callable[[], Subject] | None) -> Finding:
-    """Hold an objective against itself in the other precision: gradients agree as a third of float32's digits."""
+    """Compare an objective with itself in the other precision: gradients agree to a third of float32's digits."""
     if other is None:
         return skip("n/a", f"it computes in {subject.precision} only")
     twin = other()
     both = (subject.first.status == Status.OK) & (twin.first.status == Status.OK)
     loss = difference(subject.first.loss[both], twin.first.loss[both]) / subject.scale
     numbers: dict[str, float | None] = {"both_finite": float(both.sum()), "loss": loss, "gradient": None}
-    figure = f"{int(both.sum())} of {len(both)} points finite in both, losses up to {loss:.1e} of their range apart"
+    figure = f"{int(both.sum())} of {len(both)} points finite in both, losses differ by up to {loss:.1e} of their range"
     if subject.first.grad is None or twin.first.grad is None or not bool(both.any()):
         return skip(figure, "no gradients to compare", numbers)
     space, flat = subject.objective.space, max(one.flat(one.first.loss[both]) for one in (subject, twin))
@@ -189,5 +189,5 @@ def _check_precisions(subject: Subject, other: Callable[[], Subject] | None) -> 
     apart = torch.where(length > flat, (ours - theirs).norm(dim=1) / length, 0.0)
     error = float(apart.quantile(0.5))
     limit = 10 * max(subject.eps, twin.eps) ** (1 / 3)
-    figure, numbers = f"{figure}, gradients {error:.1e} (median)", {**numbers, "gradient": error, "limit": limit}
-    return verdict(error <= limit, figure, f"wanted: at most {limit:.0e}", numbers)
+    figure, numbers = f"{figure}, gradients by {error:.1e} (median)", {**numbers, "gradient": error, "limit": limit}
+    return verdict(error <= limit, figure, f"allowed: at most {limit:.0e}", numbers)

@@ -1,4 +1,4 @@
-"""How gradients behave in time: growth over horizons, and a second backward pass through one graph."""
+"""Gradients in time: growth over horizons, and a second backward pass through one graph."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ MOST_POINTS = 0.5  # share of the points
 
 
 def second_backward(subject: Subject) -> Finding:
-    """Go back twice through one graph: the second gradient is the first."""
+    """Go back twice through one graph: the second gradient must equal the first."""
     u = subject.objective.space.to_unit(subject.x[:2]).requires_grad_()
     total = _unit(subject)(u).nansum()
     first, second = (torch.autograd.grad(total, u, retain_graph=True)[0] for _ in range(2))
     apart = difference(first, second) / size(first)
-    figure = f"{apart:.1e} of the largest component apart"
+    figure = f"the two differ by {apart:.1e} of the largest component"
     return within(apart, subject.tolerances[1], figure, "the first backward changes its tape")
 
 
@@ -40,19 +40,18 @@ def _unit(subject: Subject) -> Callable[[Tensor], Tensor]:
 
 
 def growth_episodes(horizons: int) -> tuple[int, int]:
-    """Return how many losses, and losses with gradients, `check_growth` takes over so many horizons."""
+    """Return the numbers of losses alone and with gradients that `check_growth` takes over this many horizons."""
     return horizons * GROWTH_ROWS * 2 * GROWTH_STEPS, horizons * GROWTH_ROWS
 
 
 def check_growth(subject: Subject, horizons: Mapping[float, Callable[[], Objective]]) -> Finding:
-    """Hold |gradient| against the rise of the loss along it, in episodes of several lengths.
+    """Compare |gradient| with the rise of the loss along it, in episodes of several lengths.
 
-    A tape that keeps too little, or a solver's rule of differentiation, may be right for a short episode and grow
-    without bounds in a longer one, in which the motion stays tame. Where neighbours part, large gradients are true.
-
-    A gradient is too steep where the loss rises along it by less than a tenth of what it says, over the shortest step
-    at which that would be seen, over ten times that step and over 1e-6 of the box, while neighbours stay within a
-    hundredth of the losses' range. It fails where most points are too steep at one length. `horizons` makes the
+    A truncated tape, or a solver's own differentiation rule, can be right for a short episode but grow without bounds
+    in a longer one although the motion stays tame. Where neighbouring motions diverge, large gradients are right. A
+    gradient is too steep if the loss rises along it by less than a tenth of its prediction. That has to happen over the
+    shortest step that could show it, over ten times that step and over 1e-6 of the box, while neighbours stay within a
+    hundredth of the losses' range. The check fails where most points are too steep at one length. `horizons` makes the
     objective for a factor of its length.
     """
     if not horizons:
@@ -77,7 +76,7 @@ def check_growth(subject: Subject, horizons: Mapping[float, Callable[[], Objecti
     figure = f"|gradient| {told} the length; the loss rises along it by {rises}"
     steep = [row for row in judged if row["steep"] > MOST_POINTS * row["judged"]]
     said = [f"{row['steep']:.0f} of {row['judged']:.0f} points at {row['horizon']:g}x" for row in steep]
-    why = f"gradients grow where motions do not part: too steep at {', '.join(said)}"
+    why = f"gradients grow although motions do not diverge: too steep at {', '.join(said)}"
     found = verdict(not steep, figure, why, judged[-1])
     return replace(found, why="; ".join(filter(None, (found.why, refused))))
 

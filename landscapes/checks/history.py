@@ -1,4 +1,4 @@
-"""What an evaluation remembers of those before it, and of other rows: the same points, called in several orders."""
+"""What an evaluation remembers of earlier ones, and of other rows: the same points, called in several orders."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ SAME = 1e-9  # relative difference of losses that are the same
 
 
 def observe(objective: Objective, x: Float[Tensor, "batch dim"]) -> Evidence:
-    """Evaluate two points alone in several orders, and both in a batch; return how that changes what is found.
+    """Evaluate two points alone in several orders, and both in a batch; return how that changes the results.
 
-    `loss_moves` and `gradient_moves` are relative differences between two calls at one point; `random` says that these
-    cannot be reproduced by the same calls, and do not drift, and `hidden` that losses move otherwise. `stale` says that
-    a call returns the gradient of the one before, `grows` that gradients add up from call to call. `batch` is a
-    gradient alone over that within a batch of so many `rows`, and `alike` says that all gradients of a batch are the
-    same, though alone they are not. `leaks` says that the loss of a row in a batch is another one than alone, and
-    `gradient_leak` is the relative difference of its gradients. Raises what the objective raises.
+    `loss_moves` and `gradient_moves` are relative differences between two calls at one point. `random`: the same calls
+    do not reproduce these, and they do not drift. `hidden`: losses move in another way. `stale`: a call returns the
+    gradient of the previous one. `grows`: gradients add up from call to call. `batch` is a gradient alone over that
+    within a batch of `rows`. `alike`: all gradients of a batch are the same, although alone they are not. `leaks`: the
+    loss of a row differs between a batch and alone, and `gradient_leak` is the relative difference of its gradients.
+    Raises any error of the objective.
     """
     a, b = x[:1], x[1:2]
     order = [a, b, a, a, b, a, a]
@@ -56,13 +56,13 @@ def observe(objective: Objective, x: Float[Tensor, "batch dim"]) -> Evidence:
 
 
 def _drifts(losses: list[float]) -> bool:
-    """Say whether losses of the same call go one way, or come nearer to something: chance does neither for so long."""
+    """Return whether losses of the same call go one way, or converge: chance does neither for so long."""
     steps = [late - early for early, late in pairwise(losses)]
     return all(step > 0 for step in steps) or all(step < 0 for step in steps)
 
 
 def _varies(found: Evaluation, again: Evaluation, other: Evaluation) -> bool:
-    """Say whether gradients at one point differ, and the same order of calls does not give the same."""
+    """Return whether gradients at one point differ, and the same order of calls does not reproduce them."""
     same_loss = _apart(found.loss, other.loss) <= SAME
     return same_loss and SAME < _gap(found, other) < 10 * _gap(found, again) and not _grows(found, again)
 
@@ -80,14 +80,14 @@ def _apart(one: Tensor, other: Tensor) -> float:
 
 
 def _gap(one: Evaluation, other: Evaluation) -> float:
-    """Return how far two gradients are apart, relative to the longer."""
+    """Return the difference of two gradients, relative to the longer."""
     if one.grad is None or other.grad is None or not bool((one.has_gradient & other.has_gradient).all()):
         return 0.0
     return _apart(one.grad, other.grad)
 
 
 def _grows(*found: Evaluation) -> bool:
-    """Say whether gradients at one point, called again and again, keep on growing along one direction."""
+    """Return whether repeated gradients at one point keep growing along one direction."""
     grads = [one.grad for one in found if one.grad is not None and bool(one.has_gradient.all())]
     if len(grads) < len(found):
         return False

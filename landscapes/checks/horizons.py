@@ -1,4 +1,4 @@
-"""Where in time a gradient goes wrong: the shortest episode whose gradient is wrong, by bisection."""
+"""Find the time at which a gradient goes wrong: the shortest episode with a wrong gradient, by bisection."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ Made = TypeVar("Made")
 
 @dataclass(frozen=True)
 class FirstWrong:
-    """Hold the shortest length of an episode with a wrong gradient, in the unit of the horizon.
+    """The shortest length of an episode with a wrong gradient, in the unit of the horizon.
 
-    `right` is the next shorter one, whose gradient is right, None where the shortest of all is wrong already.
+    `right` is the next shorter one, whose gradient is right, None where the shortest of all is already wrong.
     """
 
     length: float
@@ -23,10 +23,10 @@ class FirstWrong:
 def first_wrong_step(
     make: Callable[[float], Made], lengths: Iterable[float], is_wrong: Callable[[Made], bool]
 ) -> FirstWrong | None:
-    """Return the shortest length that is wrong, None where the longest is right or all are refused.
+    """Return the shortest wrong length, None where the longest is right or all are refused.
 
-    A gradient that is wrong is taken to stay so in longer episodes: that makes the number of trials the logarithm of
-    the number of lengths. `make` or `is_wrong` may refuse a length by ValueError; then the next one is tried.
+    It assumes that a wrong gradient stays wrong in longer episodes, so the number of trials is the logarithm of the
+    number of lengths. `make` or `is_wrong` can refuse a length by ValueError; then the next one is tried.
     """
     ahead = sorted(set(lengths))
 

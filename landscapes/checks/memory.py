@@ -1,4 +1,4 @@
-"""Whether memory grows while the same batch is evaluated again and again: tapes, graphs or results that are kept."""
+"""Whether memory grows when the same batch is evaluated repeatedly: retained tapes, graphs or results."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ RISING = 0.7  # share of the blocks after which there is more, in what grows
 
 @dataclass(frozen=True)
 class MemoryGrowth:
-    """Say how much more memory is held after evaluations than before.
+    """The growth of memory over evaluations.
 
-    `per_evaluation` is the median slope [bytes], which a jump, such as a cache, leaves at zero. `total` is its growth
-    over all `evaluations` after the warm-up [bytes].
+    `per_evaluation` is the median slope [bytes], which ignores a jump, such as a cache. `total` is its growth over all
+    `evaluations` after the warm-up [bytes].
     """
 
     where: Where
@@ -48,10 +48,10 @@ class MemoryGrowth:
 def memory_growth(
     objective: Objective, x: Float[Tensor, "batch dim"], *, grad: bool = True, seconds: float = SECONDS
 ) -> MemoryGrowth:
-    """Evaluate a batch again and again, and return how the memory of the process grows, or that of a GPU.
+    """Evaluate a batch repeatedly, and return the growth of the memory of the process, or of a GPU.
 
-    All takes about so many seconds, or `FEWEST_BLOCKS` evaluations. What grows is measured once more while garbage is
-    collected: what can be collected is not kept. Raises what the objective raises.
+    It takes about `seconds`, or `FEWEST_BLOCKS` evaluations. Growth is measured once more with garbage collection:
+    collectable memory is not retained. Raises any error of the objective.
     """
 
     def evaluate() -> None:
@@ -80,7 +80,7 @@ def memory_growth(
 def _measure(
     evaluate: Callable[[], None], read: Callable[[], int], blocks: int, count: int, between: Callable[[], object]
 ) -> list[int]:
-    """Return how much memory is held after each block of evaluations, the warm-up left out."""
+    """Return the held memory after each block of evaluations, without the warm-up."""
     held = []
     for _ in range(blocks):
         for _ in range(count):
@@ -98,7 +98,7 @@ def _judge(where: Where, held: list[int], count: int, least: float) -> MemoryGro
 
 
 class _Heap(ctypes.Structure):
-    """What the C library says of its memory: `mallinfo2` of glibc 2.33 and later."""
+    """The memory report of the C library: `mallinfo2` of glibc 2.33 and later."""
 
     _fields_ = [
         *((name, ctypes.c_size_t) for name in ("arena", "ordblks", "smblks", "hblks", "hblkhd")),
@@ -111,7 +111,7 @@ Read = tuple[Where, Callable[[], int], float]  # of what memory, how it is read 
 
 @cache
 def _of_process() -> Read:
-    """Return how the memory of the process is read: what is in use, as a heap with holes grows late; else its peak."""
+    """Return a reader of the process's memory: bytes in use, because a fragmented heap grows late; else its peak."""
     try:
         ask = ctypes.CDLL(None).mallinfo2
     except (AttributeError, OSError, TypeError):
@@ -126,7 +126,7 @@ def _of_process() -> Read:
 
 
 def _taken_on_gpu() -> int:
-    """Return how much memory of the GPU is taken [bytes], whichever library holds it."""
+    """Return the used memory of the GPU [bytes], by all libraries together."""
     torch.cuda.synchronize()
     free, whole = torch.cuda.mem_get_info()
     return whole - free

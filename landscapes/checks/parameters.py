@@ -1,4 +1,4 @@
-"""Say by which parameters a gradient is wrong: along axes where they are few, by halving groups where they are many."""
+"""Find the parameters by which a gradient is wrong: along axes if there are few, by halving groups if many."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ MOST_GROUPS = 32  # wrong ones, of which halves are looked at
 class ParameterRow:
     """One line of the table of parameters.
 
-    `zero` is the share of points whose component is exactly 0, `ratio` the median of the component over the slope
-    along a hundredth of the box, NaN where that was not walked; `walked` and `wrong` count lines along the axis.
+    `zero` is the share of points whose component is exactly 0. `ratio` is the median of the component over the slope
+    along a hundredth of the box, NaN where not measured; `walked` and `wrong` count lines along the axis.
     """
 
     parameter: str
@@ -41,7 +41,7 @@ class ParameterRow:
 
 
 def walk_axes(probe: Probe, u: Float[Tensor, "batch dim"], found: Evaluation, seed: int) -> Ladder:
-    """Walk along axes through some of the points: every parameter's, or some of them where they are many."""
+    """Walk along axes through some of the points: of every parameter, or of some if there are many."""
     dim, generator = u.shape[1], torch.Generator().manual_seed(seed)
     usable = found.loss.isfinite().nonzero().flatten()
     if not len(usable):
@@ -57,12 +57,12 @@ def walk_axes(probe: Probe, u: Float[Tensor, "batch dim"], found: Evaluation, se
 
 
 def axis_lines(dim: int) -> int:
-    """Return along how many lines axes are walked."""
+    """Return the number of lines along axes."""
     return min(AXIS_LINES, max(FEWEST_LINES, min(dim, AXES_AT_MOST) * 2, LINES_EACH * min(dim, FEW_AXES)))
 
 
 def along(probe: Probe, u: Tensor, found: Evaluation, point: Tensor, axis: Tensor) -> Ladder:
-    """Judge lines along the axes given, each through the point given."""
+    """Judge lines along the given axes, each through the given point."""
     direction = torch.eye(u.shape[1], dtype=torch.float64)[axis]
     direction = torch.where(u[point] > 0.5, -1.0, 1.0) * direction
     lines = Lines.through(probe, u, direction, point, found)
@@ -70,7 +70,7 @@ def along(probe: Probe, u: Tensor, found: Evaluation, point: Tensor, axis: Tenso
 
 
 def never_moves(found: Evaluation, dim: int) -> Bool[Tensor, " dim"]:
-    """Say whose component of the gradient is exactly 0 wherever there is one."""
+    """Return the parameters whose gradient component is always exactly 0."""
     if found.grad is None:
         return torch.zeros(dim, dtype=torch.bool)
     known = found.grad[found.has_gradient]
@@ -78,7 +78,7 @@ def never_moves(found: Evaluation, dim: int) -> Bool[Tensor, " dim"]:
 
 
 def find_detached(probe: Probe, u: Float[Tensor, "batch dim"], found: Evaluation) -> tuple[set[int], set[int]]:
-    """Return parameters whose gradient is always 0 though losses change by them: smoothly, and in steps."""
+    """Return parameters whose gradient is always 0 although losses depend on them: smoothly, and in steps."""
     dead = never_moves(found, u.shape[1])
     rows = found.has_gradient.nonzero().flatten()[:BLAMED_POINTS]
     if not bool(dead.any()) or not len(rows) or u.shape[1] <= AXES_AT_MOST:
@@ -112,7 +112,7 @@ def halve(
     groups: list[list[int]],
     is_wrong: Callable[[Judgement], bool],
 ) -> set[int] | None:
-    """Halve groups of parameters for as long as moving all of a group shows a wrong slope; None where most do."""
+    """Halve groups of parameters as long as moving a whole group shows a wrong slope; None where most do."""
     first = True
     blamed: set[int] = set()
     while groups:

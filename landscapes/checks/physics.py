@@ -1,4 +1,4 @@
-"""Gradients that are right for the program and wrong for the physics: they change with the time step, slopes do not."""
+"""Gradients that are right for the program but wrong for the physics: the time step changes them, but not slopes."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ STABLE = 0.2  # relative difference of slopes over both, where the motion has on
 
 
 def compare_time_steps(seen: Examination, finer: Mapping[float, Callable[[], Objective]]) -> Evidence:
-    """Hold gradients at the time step, half and a quarter of it against differences at the finest.
+    """Compare gradients at the time step, half and a quarter of it with differences at the finest.
 
-    Returns `physics`, the median relative difference of gradients and these slopes; the same of gradients at the other
-    steps, as `at_2` and `at_4`; and `ratio`, the median of gradients over slopes. Empty where slopes are not the same
-    over a hundredth of the box and three, where time steps are refused, or where too few lines are left.
+    Returns `physics`, the median relative difference of gradients and these slopes; the same for gradients at the other
+    steps, as `at_2` and `at_4`; and `ratio`, the median of gradients over slopes. Empty where slopes over one and three
+    hundredths of the box differ, where time steps are refused, or where too few lines remain.
     """
     rows = seen.rows(Kind.AGREES, Kind.KINK)[:LINES]
     if len(rows) < FEWEST_LINES or not finer:

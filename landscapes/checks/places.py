@@ -1,4 +1,4 @@
-"""Special places of a box, which random points never meet: its centre, zeros, equal parameters, edges and corners."""
+"""Special points of a box, which random points never hit: its centre, zeros, equal parameters, edges and corners."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ INSIDE = 1e-9  # of the box: how far inside a bound a zero lies
 
 
 def places(objective: Objective, seed: int) -> dict[str, Float[Tensor, " dim"]]:
-    """Return the places by name, in the unit cube: those that are there, and differ."""
+    """Return the existing, distinct special points by name, in the unit cube."""
     space, dim = objective.space, objective.space.dim
     generator = torch.Generator().manual_seed(seed)
     drawn = 0.1 + 0.8 * torch.rand(dim, generator=generator, dtype=torch.float64)
@@ -46,14 +46,14 @@ def places(objective: Objective, seed: int) -> dict[str, Float[Tensor, " dim"]]:
 
 
 def place_losses(dim: int) -> int:
-    """Return how many losses `measure_places` takes, about."""
+    """Return the approximate number of losses that `measure_places` takes."""
     return 2 * len(STEPS) * 7 * min(AXES, dim)
 
 
 def measure_places(probe: Probe, seed: int) -> tuple[tuple[str, ...], Ladder]:
-    """Judge gradients at special places along some axes; returns the name of the place of each line, and the lines.
+    """Judge gradients at special points along some axes; returns the name of the point of each line, and the lines.
 
-    At a kink several gradients are as good: one is none too, where it lies within the range of those around it.
+    At a kink, any gradient within the range of those around it is right.
     """
     found = places(probe.objective, seed)
     u, dim = torch.stack(list(found.values())), probe.objective.space.dim
@@ -72,10 +72,9 @@ def measure_places(probe: Probe, seed: int) -> tuple[tuple[str, ...], Ladder]:
 
 
 def _is_within_neighbours(probe: Probe, lines: Lines, row: int) -> bool:
-    """Say whether gradients around a place differ, as at a kink, and that of the place lies within their range.
+    """Return whether gradients around a point differ, as at a kink, and that of the point is within their range.
 
-    Where several branches meet, a rule of differentiation may take any mean of them: the range is that of all
-    components.
+    Where several branches meet, a differentiation rule can take any mean of them: the range is that of all components.
     """
     generator = torch.Generator().manual_seed(row)
     off = torch.randn(NEARBY, lines.u.shape[1], generator=generator, dtype=torch.float64)

@@ -1,4 +1,4 @@
-"""What evaluates an objective for the checks: losses along lines in the unit cube, and gradients at points."""
+"""Evaluate an objective for the checks: losses along lines in the unit cube, and gradients at points."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ class Probe:
     """Evaluate an objective at points of the unit cube.
 
     `repeats` is the largest difference of losses between repeats [loss unit], and `gradient_repeats` that of gradients
-    as a share of the largest component; `precision` is what the objective says
-    that it computes in. `seen` gathers losses, from which their grain is told. `losses` and `gradients` count rows.
+    as a share of the largest component. `precision` is the objective's stated precision. `seen` collects losses, to
+    find their grain. `losses` and `gradients` count rows.
     """
 
     objective: Objective
@@ -41,7 +41,7 @@ class Probe:
         return self.objective.space.upper - self.objective.space.lower
 
     def loss(self, u: Float[Tensor, "*shape dim"]) -> Float[Tensor, " *shape"]:
-        """Return losses, NaN where a point lies outside the cube or has none."""
+        """Return losses, NaN where a point is outside the cube or has none."""
         flat = u.reshape(-1, u.shape[-1])
         found = flat.new_full((len(flat),), torch.nan)
         inside = ((flat >= 0) & (flat <= 1)).all(dim=1)
@@ -61,7 +61,7 @@ class Probe:
 
     @property
     def eps(self) -> float:
-        """Spacing of numbers at one, of the type that losses are computed in: float32 where all are numbers of it."""
+        """Spacing of numbers at one, of the type of the losses: float32 where all are float32 numbers."""
         if self.precision == "float32":
             return EPS["float32"]
         loss = self._different
@@ -77,14 +77,14 @@ class Probe:
 
     @property
     def grain(self) -> float:
-        """Largest power of two that all losses are multiples of, 0 where it is no coarser than float64 [loss unit]."""
+        """Largest power of two of which all losses are multiples, 0 if no coarser than float64 [loss unit]."""
         loss, found = self._different, self._lowest_bit
         clear = len(loss) >= FEW_LOSSES and found > CLEAR_GRAIN * EPS["float64"] * float(loss.abs().max())
         return found if clear else 0.0
 
     @property
     def _different(self) -> Float[Tensor, " some"]:
-        """Return the different losses that were seen, but for 0."""
+        """Return the different losses seen, except 0."""
         loss = torch.from_numpy(np.unique(torch.cat(self.seen).numpy())) if self.seen else torch.zeros(0)
         return loss[loss.isfinite() & (loss != 0)]
 
@@ -95,10 +95,10 @@ class Probe:
 
 @dataclass(frozen=True, eq=False)
 class Lines:
-    """Lines through points of the unit cube: where, along what, and what the gradient says of the slope there.
+    """Lines through points of the unit cube: their points, directions, and the gradient's slope.
 
-    `u` and `direction` have shape (line, dim), no component of a direction is larger than one; `loss` is that at the
-    point, `grad` the gradient [loss unit per side of the cube], and `point` numbers the points that lines go through.
+    `u` and `direction` have shape (line, dim), with components of a direction at most one. `loss` is that at the point,
+    `grad` the gradient [loss unit per side of the cube], and `point` the number of the point of each line.
     """
 
     u: Float[Tensor, "line dim"]
@@ -110,7 +110,7 @@ class Lines:
 
     @classmethod
     def through(cls, probe: Probe, u: Tensor, direction: Tensor, point: Tensor, found: Evaluation) -> Lines:
-        """Return lines through evaluated points; `point` says which of the rows of `u` each line goes through."""
+        """Return lines through evaluated points; `point` is the row of `u` for each line."""
         grad = torch.full_like(u, torch.nan) if found.grad is None else found.grad * probe.width
         missing = found.status == Status.NO_GRADIENT
         return cls(u[point], direction, found.loss[point], grad[point], missing[point], point)
@@ -120,13 +120,13 @@ class Lines:
 
     @property
     def slope(self) -> Float[Tensor, " line"]:
-        """What the gradient says of the slope along each line [loss unit per side of the cube]."""
+        """The gradient's slope along each line [loss unit per side of the cube]."""
         used = torch.where(self.direction == 0, 0.0, self.grad)  # a NaN of a parameter that does not move is none
         return (used * self.direction).sum(dim=1)
 
     @property
     def parts(self) -> Float[Tensor, " line"]:
-        """The sum of what each parameter adds to that slope, without signs."""
+        """The sum of each parameter's contribution to that slope, without signs."""
         return torch.where(self.direction == 0, 0.0, self.grad * self.direction).abs().sum(dim=1)
 
     def rows(self, rows: Tensor) -> Lines:
@@ -140,6 +140,6 @@ class Lines:
 
 
 def _lowest_bit(value: float) -> float:
-    """Return the largest power of two that a number is a multiple of."""
+    """Return the largest power of two of which a number is a multiple."""
     numerator, denominator = value.as_integer_ratio()
     return math.ldexp(1.0, (numerator & -numerator).bit_length() - 1) / denominator

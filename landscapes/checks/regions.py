@@ -1,4 +1,4 @@
-"""Describe where gradients are wrong, by the simplest rule that holds: an interval of one parameter, or of two."""
+"""Describe where gradients are wrong, by the simplest valid rule: an interval of one parameter, or of two."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Points = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class _Interval:
-    """An interval of a feature that holds most of the wrong points and few of the others."""
+    """An interval of a feature that contains most wrong points and few others."""
 
     feature: int
     low: float
@@ -30,7 +30,7 @@ class _Interval:
     score: int
 
     def holds(self, values: Points) -> NDArray[np.bool_]:
-        """Say which points lie in it."""
+        """Return which points are inside it."""
         found: NDArray[np.bool_] = (values[:, self.feature] >= self.low) & (values[:, self.feature] <= self.high)
         return found
 
@@ -38,10 +38,10 @@ class _Interval:
 def find_region(
     values: Points, names: Sequence[str], wrong: NDArray[np.bool_], events: Mapping[str, Points] | None = None
 ) -> Region | None:
-    """Return the simplest rule that tells wrong points from others; None where all are wrong, or no rule holds.
+    """Return the simplest rule that separates wrong points from others; None where all are wrong, or no rule fits.
 
-    `values` has shape (point, parameter), in the parameters' own units. `events` are counts of what happens at each
-    point, features like parameters.
+    `values` has shape (point, parameter), in the parameters' own units. `events` are event counts at each point,
+    features like parameters.
     """
     few = min(int(wrong.sum()), int((~wrong).sum()))
     if few < FEWEST:
@@ -73,14 +73,14 @@ def find_region(
 
 
 def _fits_by_chance(points: int, few: int, features: int, conditions: int) -> bool:
-    """Say whether some rule would tell so few points from the others by chance: there are more rules than choices."""
+    """Return whether some rule would separate this few points by chance: there are more rules than choices."""
     choices = math.lgamma(points + 1) - math.lgamma(few + 1) - math.lgamma(points - few + 1)
     rules = conditions * math.log(features * points**2 / 2)
     return choices < rules + CLEARLY
 
 
 def _narrowest(features: Points, wrong: NDArray[np.bool_]) -> list[int]:
-    """Return the features within whose span of wrong points the fewest right ones lie."""
+    """Return the features with the fewest right points within the span of the wrong ones."""
     low, high = features[wrong].min(axis=0), features[wrong].max(axis=0)
     right = features[~wrong]
     within = ((right >= low) & (right <= high)).sum(axis=0)
@@ -88,7 +88,7 @@ def _narrowest(features: Points, wrong: NDArray[np.bool_]) -> list[int]:
 
 
 def _best_pair(features: Points, first: int, other: int, wrong: NDArray[np.bool_]) -> list[_Interval]:
-    """Return intervals of two features that hold wrong points and few others: the span of one, then each in turn."""
+    """Return intervals of two features with wrong points and few others: the span of one, then each in turn."""
     at = features[wrong, first]
     one = _Interval(first, float(at.min()), float(at.max()), 0)
     for _ in range(2):
@@ -102,7 +102,7 @@ def _best_pair(features: Points, first: int, other: int, wrong: NDArray[np.bool_
 
 
 def _best_interval(features: Points, feature: int, wrong: NDArray[np.bool_]) -> _Interval:
-    """Return the interval in which wrong points outnumber right ones the most (the largest sum of a run)."""
+    """Return the interval with the largest excess of wrong over right points (the largest sum of a run)."""
     order = np.argsort(features[:, feature], kind="stable")
     gains = np.where(wrong[order], 1, -1)
     best, low, high, total, start = 0, 0, -1, 0, 0
@@ -128,7 +128,7 @@ def _error(features: Points, intervals: Sequence[_Interval], wrong: NDArray[np.b
 def _describe(
     one: _Interval, features: Points, labels: Sequence[str], wrong: NDArray[np.bool_], spans: NDArray[np.float64]
 ) -> str:
-    """Write an interval; an end at which no right point lies beyond is none."""
+    """Write an interval; an end without right points beyond it is left out."""
     values, label = features[:, one.feature], labels[one.feature]
     right = values[~wrong]
     below, above = right[right < one.low], right[right > one.high]
@@ -148,6 +148,6 @@ def _describe(
 
 
 def _rounded(value: float, span: float) -> str:
-    """Write a number to a hundredth of the range it lies in."""
+    """Write a number to a hundredth of its range."""
     digits = max(0, 2 - int(np.floor(np.log10(span))))
     return f"{value:z.{digits}f}" if digits <= 9 and abs(value) < 1e6 else f"{value:.3g}"

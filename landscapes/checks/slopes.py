@@ -1,9 +1,9 @@
-"""Hold the slopes that gradients give against differences of losses, by a model of the error of each difference.
+"""Compare the slopes of gradients with differences of losses, by a model of the error of each difference.
 
-A difference over a step h of losses that are known to +-noise is off by noise / h, and by its truncation. The second
-is told from the next larger step: over a ladder of steps differences form a plateau, where two that follow each other
-agree within both. A gradient is wrong where the plateau of the smallest steps differs from it by more than its error.
-Steps are shares of the box, slopes [loss unit per side of the box].
+A difference over a step h of losses known to +-noise has the error noise / h, plus its truncation error. The next
+larger step shows the latter: over a ladder of steps, differences form a plateau, where consecutive ones agree within
+both errors. A gradient is wrong if the plateau of the smallest steps differs from it by more than its error. Steps are
+fractions of the box, slopes [loss unit per side of the box].
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ FLAT = 1e-6  # of the typical slope along such lines is none
 
 
 class Kind(StrEnum):
-    """Say how the gradient's slope along a line compares with differences of losses."""
+    """The result of comparing the gradient's slope along a line with differences of losses."""
 
     AGREES = "agrees"
     KINK = "kink"  # slopes to both sides differ, and the gradient is one of them or between
@@ -78,9 +78,9 @@ class Slope(NamedTuple):
 
 @dataclass(frozen=True)
 class Judgement:
-    """Say how a line was judged: the slope by differences, its error and step, and what lies to both sides.
+    """The result for a line: the slope by differences, its error and step, and the one-sided slopes.
 
-    `moves` says that the loss changes along the line by more than its noise, `limit` what would have been found.
+    `moves`: the loss changes along the line by more than its noise. `limit` is the smallest error that would be found.
     """
 
     kind: Kind
@@ -112,25 +112,25 @@ class Ladder:
         return [row for row, one in enumerate(self.judged) if one.kind in kinds]
 
     def along(self, axis: int) -> list[Judgement]:
-        """Return what was judged of the lines along one parameter."""
+        """Return the results of the lines along one parameter."""
         return [self.judged[row] for row in (self.axis == axis).nonzero().flatten().tolist()]
 
     @property
     def differences(self) -> Float[Tensor, "step line"]:
-        """Central differences, one-sided where the box ends, NaN where neither is there."""
+        """Central differences, one-sided at the ends of the box, NaN where neither exists."""
         steps = torch.tensor(self.steps, dtype=torch.float64)[:, None]
         ahead, behind = (self.walked[0] - self.lines.loss) / steps, (self.lines.loss - self.walked[1]) / steps
         central = (ahead + behind) / 2
         return torch.where(central.isfinite(), central, torch.where(ahead.isfinite(), ahead, behind))
 
     def on(self, steps: tuple[float, ...]) -> Float[Tensor, "2 step line"]:
-        """Return what was walked over a ladder of more steps, NaN where that was not."""
+        """Return the losses on a ladder of more steps, NaN where not evaluated."""
         walked = torch.full((2, len(steps), len(self.lines)), torch.nan, dtype=torch.float64)
         walked[:, [steps.index(step) for step in self.steps]] = self.walked
         return walked
 
     def with_kind(self, rows: Sequence[int], kind: Kind) -> Ladder:
-        """Return this ladder with some of its lines judged to be of a kind."""
+        """Return this ladder with a given kind for some of its lines."""
         judged = list(self.judged)
         for row in rows:
             judged[row] = replace(judged[row], kind=kind)
@@ -138,7 +138,7 @@ class Ladder:
 
 
 def measure(probe: Probe, lines: Lines, steps: Sequence[float] = STEPS) -> Ladder:
-    """Walk along lines over a ladder of steps, and over more where that leaves a line undecided, and judge them."""
+    """Walk along lines over a ladder of steps, and over more where a line stays undecided, and judge them."""
     ladder = _judge(probe, lines, tuple(steps), lines.walk(probe, list(steps)))
     open_ = [one for one, found in enumerate(ladder.judged) if _undecided(found)]
     further = [step for step in BETWEEN_STEPS if step not in steps]
@@ -153,17 +153,17 @@ def measure(probe: Probe, lines: Lines, steps: Sequence[float] = STEPS) -> Ladde
 
 
 def _forgive_few(ladder: Ladder) -> Ladder:
-    """Let few small disagreements in float32 be noise: losses that jump between steps of time hide below rounding."""
+    """Treat few small disagreements in float32 as noise: losses that jump between time steps hide below rounding."""
     wrong = [(row, ladder.judged[row]) for row in ladder.rows(Kind.WRONG)]
     small = [row for row, one in wrong if one.slope is not None and _alike(one.slope.value, one.exact, SMALL)]
     return ladder.with_kind(small, Kind.NOISE) if len(small) < MANY * len(ladder.judged) else ladder
 
 
 def _distrust(ladder: Ladder) -> Ladder:
-    """Let no plateau contradict a gradient by steps over which differences are not the slope on other lines either.
+    """Let no plateau contradict a gradient at steps where differences fail on other lines, too.
 
-    Noise may be larger than was seen; and losses that jump between steps of time have slopes below the jumps, where
-    float32 may see none, and others above.
+    The noise can be larger than seen. Losses that jump between time steps have slopes below the jumps, which float32
+    can miss, and other slopes above.
     """
     differences, distrusted = ladder.differences.numpy(), list[int]()
     agreeing = [(row, ladder.judged[row]) for row in ladder.rows(Kind.AGREES)]
@@ -180,19 +180,19 @@ def _distrust(ladder: Ladder) -> Ladder:
 
 
 def _alike(one: float, other: float, share: float) -> bool:
-    """Say whether two slopes differ by at most a share of the larger."""
+    """Return whether two slopes differ by at most a share of the larger."""
     return abs(one - other) <= share * max(abs(one), abs(other))
 
 
 def _undecided(found: Judgement) -> bool:
-    """Say whether more steps may tell more: where none did, or the plateau that contradicts is no clear one."""
+    """Return whether more steps could help: no plateau was found, or the contradicting one is unclear."""
     if found.kind != Kind.WRONG or found.slope is None:
         return found.kind in (Kind.NOISE, Kind.STEEP)
     return found.slope.error > CLEAR * max(abs(found.slope.value), abs(found.exact))
 
 
 def _needs_finer(found: Judgement, probe: Probe, lines: Lines, row: int, smallest: float) -> bool:
-    """Say whether a disagreement may be that of losses which change within the smallest step."""
+    """Return whether a disagreement could come from losses that change within the smallest step."""
     rounding = _rounding(probe.eps, lines, row)
     rough = found.noise > ROUGH * rounding
     return (
@@ -205,7 +205,7 @@ def _rounding(eps: float, lines: Lines, row: int) -> float:
 
 
 def _extend(probe: Probe, ladder: Ladder, rows: Sequence[int], more: Sequence[float]) -> Ladder:
-    """Walk along some of the lines over further steps, and judge these once more."""
+    """Walk along some of the lines over further steps, and judge these again."""
     chosen = torch.tensor(rows)
     part, walked = ladder.lines.rows(chosen), ladder.on(steps := tuple(sorted({*ladder.steps, *more})))
     added = torch.tensor([steps.index(step) for step in more])
@@ -218,7 +218,7 @@ def _extend(probe: Probe, ladder: Ladder, rows: Sequence[int], more: Sequence[fl
 
 
 def _judge(probe: Probe, lines: Lines, steps: tuple[float, ...], walked: Float[Tensor, "2 step line"]) -> Ladder:
-    """Judge lines by what was walked."""
+    """Judge lines from their losses."""
     loss, slope = lines.loss.numpy(), lines.slope.numpy()
     rounding = _rounding_of(probe, lines)
     usual = _typical_noise(steps, loss, walked.numpy()) + NOISE_MARGIN * probe.repeats
@@ -236,7 +236,7 @@ def _judge(probe: Probe, lines: Lines, steps: tuple[float, ...], walked: Float[T
 
 
 def _rounding_of(probe: Probe, lines: Lines) -> NDArray[np.float64]:
-    """Return what rounding of the loss, and of the point, changes of each loss [loss unit]."""
+    """Return the change of each loss by rounding of the loss, and of the point [loss unit]."""
     space = probe.objective.space
     places = (lines.u + space.lower / probe.width).abs() + 1
     parts = torch.where(lines.direction == 0, 0.0, (lines.grad * places).abs()).nan_to_num().sum(dim=1)
@@ -248,7 +248,7 @@ def _rounding_of(probe: Probe, lines: Lines) -> NDArray[np.float64]:
 def _unexplained(
     steps: NDArray[np.float64], walked: NDArray[np.float64], loss: NDArray[np.float64] | float
 ) -> NDArray[np.float64]:
-    """Return half of the second difference over the smallest step, without what that over the next one explains.
+    """Return half of the second difference over the smallest step, minus the part that the next step explains.
 
     Second differences of a smooth loss fall as the square of the step, those of a noisy one do not.
     """
@@ -261,9 +261,9 @@ def _unexplained(
 def _typical_noise(
     steps: Sequence[float], loss: NDArray[np.float64], walked: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return what is usual among lines: half of a second difference over the smallest step.
+    """Return the typical noise among lines: half of a second difference over the smallest step.
 
-    By size and as a share of the loss: losses of several decades, and small differences of large numbers.
+    By size and as a share of the loss: for losses of several decades, and for small differences of large numbers.
     """
     second = _unexplained(np.array(steps), walked, loss)
     known = np.isfinite(second)
@@ -278,7 +278,7 @@ def _typical_noise(
 
 
 def _spread_of(values: NDArray[np.float64]) -> float:
-    """Return what nearly all of the values stay below, told from the middle ones and not from a few large ones."""
+    """Return an upper limit of nearly all values, estimated from the middle ones and not from a few large ones."""
     middle = float(np.median(values))
     high = HIGH_MARGIN * float(np.quantile(values, HIGH))
     return min(max(high, NOISE_MARGIN * middle), MOST_MARGIN * middle)
@@ -310,7 +310,7 @@ class _Line:
 
     @cached_property
     def rises(self) -> NDArray[np.float64]:
-        """How much higher losses are ahead and behind, shape (2, step)."""
+        """The rise of losses ahead and behind, shape (2, step)."""
         found: NDArray[np.float64] = self.walked - self.loss
         return found
 
@@ -351,8 +351,8 @@ class _Line:
     def noise(self) -> float:
         """The noise of losses at this line.
 
-        It is what is usual, or half of the second difference over the smallest step; or the first change, where losses
-        do not change at all over smaller steps, as those of rounded numbers do.
+        It is the typical noise, or half of the second difference over the smallest step. Where losses do not change at
+        all over smaller steps, as rounded numbers do, it is the first change.
         """
         moved = np.flatnonzero(self.change > 0)
         first = int(moved[0]) if len(moved) else 0
@@ -360,12 +360,12 @@ class _Line:
         return max(self.usual, self._unevenness(), grain, self.rounding)
 
     def _unevenness(self) -> float:
-        """Return what is uneven in losses over the smallest step, and no curvature."""
+        """Return the unevenness of losses over the smallest step that is not curvature."""
         found = float(_unexplained(self.steps, self.walked, self.loss))
         return found if np.isfinite(found) else 0.0
 
     def _is_grain(self) -> bool:
-        """Say whether the first change along a line is that of rounded losses or points, not a step of its own."""
+        """Return whether the first change along a line comes from rounded losses or points, not from a real step."""
         moved = np.flatnonzero(self.change > 0)
         if not len(moved):
             return False
@@ -373,7 +373,7 @@ class _Line:
         return bool(self.steps[first] <= SMALL_GRAIN or self.change[first] <= ROUNDED_BY * self.eps * abs(self.loss))
 
     def _doubt(self, slope: Slope) -> Kind:
-        """Return what a gradient is that a plateau contradicts: wrong, unless something speaks against the plateau."""
+        """Return the kind of a gradient that a plateau contradicts: wrong, unless there is doubt about the plateau."""
         if not self._holds(slope):
             return Kind.STEEP if abs(self.exact) > BEYOND * abs(slope.value) else Kind.NOISE
         if slope.step > LONGEST_STEP:
@@ -381,9 +381,9 @@ class _Line:
         return Kind.AGREES if self._agrees_beyond(slope) else Kind.WRONG
 
     def _agrees_beyond(self, slope: Slope) -> bool:
-        """Say whether the gradient is the slope over longer steps, and lacks less below than any solver tolerates.
+        """Return whether the gradient is the slope over longer steps, and below differs less than any solver tolerates.
 
-        Time steps that a solver adapts make losses uneven there.
+        Adaptive time steps of a solver make losses uneven there.
         """
         ahead, behind = self.rises
         with np.errstate(invalid="ignore"):
@@ -395,7 +395,7 @@ class _Line:
         return bool(off[: longer[0]].max() <= TOLERATED * max(abs(self.loss), float(np.nanmax(self.change))))
 
     def _holds(self, slope: Slope) -> bool:
-        """Say whether differences over steps that are smaller than a plateau's are those of it, within their noise."""
+        """Return whether differences over smaller steps agree with a plateau, within their noise."""
         smaller = self.steps < slope.step
         (ahead, behind), steps, central = self.rises[:, smaller], self.steps[smaller], self.central[smaller]
         found = np.where(np.isfinite(central), central, np.where(np.isfinite(ahead), ahead, -behind) / steps)
@@ -403,7 +403,7 @@ class _Line:
         return bool((np.abs(found - slope.value) <= allowed).all())
 
     def _plateau(self, found: Iterator[tuple[float, float, float]]) -> Slope | None:
-        """Return the slope by the smallest steps whose differences agree, made more exact by larger ones."""
+        """Return the slope by the smallest steps whose differences agree, refined by larger ones."""
         known = [Slope(*map(float, one)) for one in found if np.isfinite(one[1])]
         best: Slope | None = None
         for small, large in pairwise(known):
@@ -449,7 +449,7 @@ class _Line:
         return Kind.WRONG, found
 
     def _one_sided(self, front: Slope | None, back: Slope | None) -> Kind | None:
-        """Return what a line is whose gradient is the slope to one side, or between both."""
+        """Return the kind of a line whose gradient is the slope to one side, or between both."""
         noise = self.noise if np.isfinite(self.noise) else 0.0
         jumps = self.change[0] > BEYOND * noise + BEYOND * abs(self.exact) * self.steps[0]
         if front is not None and back is not None:
@@ -463,7 +463,7 @@ class _Line:
         return None
 
     def _is_rough(self) -> bool:
-        """Say whether losses change unevenly over the smallest step, in which the gradient foresees more."""
+        """Return whether losses change unevenly over the smallest step, where the gradient predicts more."""
         change, next_ = self.change, min(1, len(self.steps) - 1)
         saturated = (
             change[0] > SATURATED * np.nanmax(change) and abs(self.exact) * self.steps[0] > SATURATED * change[0]
@@ -475,7 +475,7 @@ class _Line:
 
 
 def counts(judged: Sequence[Judgement]) -> dict[Kind, int]:
-    """Count lines by what they are."""
+    """Count lines by kind."""
     kinds = [one.kind for one in judged]
     return {kind: kinds.count(kind) for kind in Kind}
 
@@ -483,9 +483,9 @@ def counts(judged: Sequence[Judgement]) -> dict[Kind, int]:
 def directions(
     dim: int, u: Float[Tensor, "line dim"], sensitivity: Float[Tensor, " dim"], seed: int
 ) -> Float[Tensor, "line dim"]:
-    """Draw a direction through each point, all parameters at once, into the box, of no component above one.
+    """Draw a direction through each point, all parameters at once, into the box, with no component above one.
 
-    Every other direction moves parameters the less, the more the loss depends on them, so that all count alike.
+    In every other direction, parameters with a strong effect on the loss move less, so that all count alike.
     """
     generator = torch.Generator().manual_seed(seed)
     signs = torch.randint(0, 2, u.shape, generator=generator, dtype=torch.float64) * 2 - 1

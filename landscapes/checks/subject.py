@@ -14,7 +14,7 @@ from ..objective import Evaluation, Objective, evaluate
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """Hold an objective, points of its box, shape (batch, dim), and what it says there.
+    """An objective, points of its box, shape (batch, dim), and its evaluation there.
 
     `noise` is the largest difference between repeats: of losses, as a share of their range, and of gradients, as a
     share of the largest.
@@ -31,7 +31,7 @@ class Subject:
     def observe(
         cls, objective: Objective, x: Float[Tensor, "batch dim"], *, precision: str, seed: int, repeats: int
     ) -> Subject:
-        """Evaluate the points as often as `repeats` says."""
+        """Evaluate the points `repeats` times."""
         first = evaluate(objective, x, grad=True)
         still = cls(objective, x, first, precision, seed)
         again = [still.differences(evaluate(objective, x, grad=True), first) for _ in range(repeats - 1)]
@@ -40,29 +40,29 @@ class Subject:
 
     @property
     def eps(self) -> float:
-        """Spacing of numbers at one, in the precision the objective computes in."""
+        """Spacing of numbers at one, in the objective's precision."""
         return float(torch.finfo(getattr(torch, self.precision)).eps)
 
     @property
     def rounding(self) -> float:
-        """Share of the range that sums in another order may make: half of the digits."""
+        """Share of the range that another order of sums can change: half of the digits."""
         return math.sqrt(self.eps)
 
     @property
     def repeatable(self) -> tuple[float, float]:
-        """What repeats may differ by, losses and gradients, as shares.
+        """Allowed differences of repeats, losses and gradients, as shares.
 
         Many threads that add in any order make losses differ by rounding. Gradients multiply that, in a contact a
-        thousandfold; a tenth of the error that is allowed of a slope cannot be mistaken for one.
+        thousandfold. A tenth of the allowed error of a slope cannot be mistaken for one.
         """
         return self.rounding, self.eps ** (1 / 3)
 
     @property
     def tolerances(self) -> tuple[float, float]:
-        """What losses and gradients may differ by where they ought to be the same, as shares.
+        """Allowed differences of losses and gradients that should be equal, as shares.
 
-        Few repeats understate the noise: allow ten times as much. An objective that repeats exactly may still add in
-        another order for another number of rows.
+        Few repeats understate the noise, so ten times as much is allowed. An objective that repeats exactly can still
+        add in another order for another number of rows.
         """
         loss, grad = self.noise
         return max(10 * loss, 1e3 * self.eps), max(10 * grad, 1e3 * self.eps)
@@ -78,19 +78,19 @@ class Subject:
         return size(self.first.grad)
 
     def flat(self, loss: Float[Tensor, " batch"]) -> float:
-        """Return the slope [loss unit per side of the box] below which a landscape of such losses is flat.
+        """Return the slope [loss unit per side of the box] below which a landscape with such losses is flat.
 
-        It changes them by less than half of their digits over the whole box: solvers that iterate end no nearer.
+        It changes them by less than half of their digits over the whole box; iterative solvers are not more accurate.
         """
         finite = loss[loss.isfinite()].abs()
         return self.rounding * (float(finite.max()) if len(finite) else 0.0)
 
     def blur(self, loss: Float[Tensor, " batch"]) -> float:
-        """Return what noise and rounding change of such losses."""
+        """Return the change of such losses by noise and rounding."""
         return self.noise[0] * self.scale + self.eps * float(loss.abs().nan_to_num().max())
 
     def evaluate(self, x: Float[Tensor, "batch dim"]) -> Evaluation:
-        """Return losses and gradients at other points, held against the protocol."""
+        """Return losses and gradients at other points, checked against the protocol."""
         return evaluate(self.objective, x, grad=True)
 
     def differences(self, found: Evaluation, wanted: Evaluation) -> tuple[float, float]:
@@ -103,18 +103,18 @@ class Subject:
         return loss, difference(found.grad, wanted.grad) / self.steepness
 
     def agree(self, found: Evaluation, wanted: Evaluation) -> bool:
-        """Say whether two evaluations agree within what is tolerated."""
+        """Return whether two evaluations agree within the tolerance."""
         return all(gap <= limit for gap, limit in zip(self.differences(found, wanted), self.tolerances, strict=True))
 
 
 def difference(a: Tensor, b: Tensor) -> float:
-    """Return the largest |a - b|, where two NaN are alike, and infinity where only one is."""
+    """Return the largest |a - b|, where two NaN are equal, and infinity where only one is NaN."""
     gap = (a - b).abs().masked_fill(a.isnan() & b.isnan(), 0.0)
     return float(gap.nan_to_num(nan=torch.inf).max()) if gap.numel() else 0.0
 
 
 def spread(loss: Float[Tensor, " batch"]) -> float:
-    """Return the range of the finite losses; their size where all are the same, one where there is none."""
+    """Return the range of the finite losses; their magnitude where all are equal, one where there is none."""
     finite = loss[loss.isfinite()]
     if not len(finite):
         return 1.0

@@ -50,7 +50,7 @@ LEAST_SHARE = 0.25  # share of slopes to compare for a step to be judged by
 
 @dataclass(eq=False)
 class Results:
-    """What `check` gathers besides findings, once it is done: what was measured, also of calls, and is concluded."""
+    """The results of `check` besides findings: measurements, also of calls, and conclusions."""
 
     examination: Examination | None = None
     calls: Evidence = dataclasses.field(default_factory=dict)
@@ -60,16 +60,15 @@ class Results:
 
 @dataclass(frozen=True)
 class Settings:
-    """How an objective is checked, and what else can be made of it.
+    """How to check an objective, and its variants.
 
-    `power` is the share of the box that a defect fills which would be found with 95 %. `precision`, float32 or float64,
-    is what the objective computes in; `twin` makes it in the other precision: gradients are judged in float64 where
-    there is one. `variants` are further ways to push it. `horizons` make it with episodes so many times as long, in
-    float64 where there is a twin; `other_mode` makes it with gradients by the other mode of automatic differentiation,
-    forward or reverse; `finer` makes it with shorter time steps, by factor, and `make_length` with episodes of one of
-    the `lengths`. `expected` holds the checks that are known to fail, with the reason: such a failure is excused, and a
-    pass is not. `memory_seconds` are spent on whether memory grows. `follow` is called with the name of each check
-    before it runs.
+    `power` is the share of the box in which a defect would be found with 95 % probability. `precision`, float32 or
+    float64, is the objective's. `twin` makes it in the other precision; gradients are judged in float64 if possible.
+    `variants` are further ways to stress it. `horizons` make it with episodes that many times as long, in float64 if
+    possible. `other_mode` makes it with gradients by the other mode of automatic differentiation, forward or reverse.
+    `finer` makes it with shorter time steps, by factor, and `make_length` with episodes of one of the `lengths`.
+    `expected` has the reason for each expected failure: such a failure is excused, but a pass is not. `memory_seconds`
+    are spent on whether memory grows. `follow` receives the name of each check before it runs.
     """
 
     power: float = POWER
@@ -88,9 +87,9 @@ class Settings:
 
 
 def count_others(how: Settings, itself: Callable[[], Objective]) -> float:
-    """Count what a check makes besides the objective `itself`, by the time that it takes to compile.
+    """Count the objectives that a check makes besides `itself`, weighted by their compile time.
 
-    Most are asked at a few points, of which a program is compiled sooner than one of a whole batch, which counts 1.
+    Most are evaluated at a few points. Such a program compiles faster than that of a whole batch, which counts 1.
     """
     whole = {how.twin, how.other_mode, *how.finer.values()} - {None, itself}
     few = {*how.horizons.values(), *(one.make for one in how.variants)} - {None, itself, *whole}
@@ -98,9 +97,9 @@ def count_others(how: Settings, itself: Callable[[], Objective]) -> float:
 
 
 def check(objective: Objective, settings: Settings | None = None, results: Results | None = None) -> Iterator[Finding]:
-    """Check an objective and yield what was found, check by check; the rest of it is left in `results`.
+    """Check an objective and yield the findings, check by check; everything else is left in `results`.
 
-    What the objective raises is a finding.
+    An error of the objective is a finding.
     """
     how, results = settings or Settings(), results or Results()
     x = objective.space.uniform(PROMISE_POINTS, seed=how.seed)
@@ -111,7 +110,7 @@ def check(objective: Objective, settings: Settings | None = None, results: Resul
         if "writes to what it has read" in shapes.why or "modified by an inplace operation" in shapes.why:
             (cause,) = [one for one in causes() if one.name == "tape overwritten"]
             results.diagnoses = (Diagnosis(cause.name, FAIL, "certain", shapes.why, cause.remedy),)
-        yield Finding("all else", SKIP, "not checked", "evaluations of the wrong form can be judged no further")
+        yield Finding("all else", SKIP, "not checked", "evaluations of the wrong form cannot be checked further")
         return
     how.follow("repeats")
     try:
@@ -128,11 +127,11 @@ def check(objective: Objective, settings: Settings | None = None, results: Resul
             _give_back(made)
         yield _try(name, run).excuse(how.expected)
     for name in left:
-        yield Finding(name, UNEXPECTED, "not checked", "a failure is expected of it, but there is no such check")
+        yield Finding(name, UNEXPECTED, "not checked", "a failure is expected, but there is no such check")
 
 
 def episodes(dim: int, power: float, horizons: Sequence[float] = ()) -> tuple[int, int]:
-    """Return about how many episodes `check` takes without variants: losses alone, and with gradients.
+    """Return the approximate numbers of episodes of `check` without variants: losses alone, and with gradients.
 
     Those of other `horizons`, factors of the length, count by their lengths.
     """
@@ -144,7 +143,7 @@ def episodes(dim: int, power: float, horizons: Sequence[float] = ()) -> tuple[in
 def _other(
     subject: Subject, twin: Callable[[], Objective] | None, made: list[Objective]
 ) -> Callable[[], Subject] | None:
-    """Return what evaluates the twin at the same points, once; it is added to what was `made`."""
+    """Return a cached evaluation of the twin at the same points; it is added to `made`."""
     if twin is None:
         return None
     precision = "float32" if subject.precision == "float64" else "float64"
@@ -157,7 +156,7 @@ def _other(
 
 
 def _give_back(made: Sequence[Objective]) -> None:
-    """Give back the memory of a device that environments hold between evaluations: another one takes all there is."""
+    """Free the device memory that environments hold between evaluations, because another one takes all there is."""
     if any(one.device != "cpu" for one in made):
         for one in made:
             one.release()
@@ -197,13 +196,13 @@ def _keep_promise(run: Callable[[Subject], Finding], subject: Subject, results: 
 
 
 def _check_calls(subject: Subject, results: Results) -> Finding:
-    """Call the same points in several orders: what an evaluation gives depends on no other."""
+    """Call the same points in several orders: an evaluation must not depend on others."""
     seen = observe(subject.objective, subject.x)
     results.calls |= seen
     loss, gradient, limits = seen["loss_moves"], seen["gradient_moves"], subject.repeatable
-    figure = f"losses {loss:.1e} and gradients {gradient:.1e} of themselves apart"
+    figure = f"losses differ by {loss:.1e} and gradients by {gradient:.1e} of themselves"
     ok = loss <= limits[0] and gradient <= limits[1] and not (seen["stale"] or seen["grows"])
-    return verdict(ok, "same bits" if max(loss, gradient) == 0 else figure, "an evaluation remembers others")
+    return verdict(ok, "same bits" if max(loss, gradient) == 0 else figure, "an evaluation depends on earlier ones")
 
 
 def _check_gradient(subject: Subject, how: Settings, results: Results) -> Finding:
@@ -237,18 +236,16 @@ def _judge_gradient(seen: Examination, results: Results) -> Finding:
         figure = f"wrong at {share.describe()}: {told}" if share.wrong else f"{share.points} points: {told}"
         return Finding("", FAIL, figure, "; ".join(failing), numbers, seen.table())
     if counted[Kind.FAILED] == share.points:
-        return Finding(
-            "", FAIL, f"none of {share.points} points has a loss", "nothing can be said of the gradient", numbers
-        )
+        return Finding("", FAIL, f"none of {share.points} points has a loss", "the gradient cannot be checked", numbers)
     if share.judged < CANNOT_TELL * share.points:
-        why = f"only {share.judged} of {share.points} points could be judged, so nothing is said of the gradient"
+        why = f"only {share.judged} of {share.points} points could be judged, too few for a verdict on the gradient"
         return Finding("", WARN, f"cannot tell: {told}", why, numbers, seen.table())
-    figure = f"{share.points} points: {told}; a defect in less than {percent(share.missed)} of the box may be missed"
+    figure = f"{share.points} points: {told}; a defect in less than {percent(share.missed)} of the box could be missed"
     return Finding("", PASS, figure, "", numbers, seen.table())
 
 
 def _further(objective: Objective, seen: Examination, how: Settings) -> Further:
-    """Return what can be asked about points whose gradient is NaN or wrong."""
+    """Return further questions about points whose gradient is NaN or wrong."""
 
     def point(row: int) -> Float[Tensor, " dim"]:
         u = seen.u[row] if row >= 0 else seen.places[1].lines.u[-1 - row]
@@ -268,7 +265,7 @@ def _further(objective: Objective, seen: Examination, how: Settings) -> Further:
 
 
 def _quietly(ask: Callable[[Tensor], str], x: Float[Tensor, " dim"]) -> str:
-    """Return an answer that is worth a word, and no error."""
+    """Return a result, or nothing after an error."""
     try:
         return ask(x)
     except Exception:
@@ -276,7 +273,7 @@ def _quietly(ask: Callable[[Tensor], str], x: Float[Tensor, " dim"]) -> str:
 
 
 def _is_wrong(seen: Examination, rows: Sequence[int], objective: Objective) -> bool:
-    """Say whether gradients at some of the points are wrong for another objective, such as one of shorter episodes."""
+    """Return whether gradients at some of the points are wrong for another objective, such as a shorter episode."""
     probe, chosen = Probe(objective, objective.precision), torch.tensor(rows)
     lines = seen.random.lines.rows(chosen)
     found = probe.gradient(lines.u)
@@ -292,16 +289,16 @@ def _check_time_steps(how: Settings, results: Results) -> Finding:
     evidence = compare_time_steps(seen, how.finer)
     if not evidence:
         return skip(
-            "not compared", "slopes are not the same over a hundredth of the box and three, or steps are refused"
+            "not compared", "slopes over one and three hundredths of the box differ, or the scene refuses the steps"
         )
     found = conclude_physics(evidence)
     results.diagnoses += found
-    figure = f"gradients {percent(evidence['physics'])} off differences at a quarter of the step (median)"
+    figure = f"gradients differ by {percent(evidence['physics'])} from slopes at a quarter of the step (median)"
     return Finding("", WARN if found else PASS, figure, "; ".join(one.what for one in found), evidence)
 
 
 def _check_memory(subject: Subject, seconds: float, results: Results) -> Finding:
-    """Say whether memory grows with every evaluation."""
+    """Check whether memory grows with every evaluation."""
     growth = memory_growth(subject.objective, subject.x[:2], seconds=seconds)
     found = conclude_memory(growth)
     results.diagnoses += found
@@ -320,7 +317,7 @@ def _check_places(seen: Examination, results: Results) -> Finding:
     bad = ladder.rows(*BAD)
     if not bad:
         told = sum(one.kind not in UNJUDGED for one in ladder.judged)
-        return verdict(True, f"{told} slopes at {places}: between those to either side") if told else skip(places)
+        return verdict(True, f"{told} slopes at {places}: all between the one-sided slopes") if told else skip(places)
     said = (seen.describe_place(row) for row in bad)
     figure = f"{len(bad)} of {len(ladder.judged)} slopes at {places} are wrong"
     numbers: dict[str, float | None] = {"wrong": float(len(bad)), "compared": float(len(ladder.judged))}
@@ -336,13 +333,13 @@ def _check_parameters(seen: Examination, results: Results) -> Finding:
     if wrong:
         return Finding("", FAIL, figure, f"wrong by {', '.join(wrong[:MANY])}{' and others' * (len(wrong) > MANY)}")
     if stepped:
-        said = f"by {', '.join(stepped[:MANY])} the gradient is 0 at all points, and the loss moves in steps"
+        said = f"by {', '.join(stepped[:MANY])} the gradient is 0 at all points, but the loss moves in steps"
         return Finding("", WARN, figure, said)
     return verdict(True, figure)
 
 
 def _check_usefulness(seen: Examination, results: Results) -> Finding:
-    """Say how far a gradient holds: useless over an optimiser's step is the landscape's fault, and a warning."""
+    """Check the reach of a gradient: useless over an optimiser's step is a warning about the landscape."""
     results.usefulness = usefulness(seen.probe, seen.random)
     if not any(one.outcome == FAIL for one in results.diagnoses):
         results.diagnoses += conclude_jumps(results.usefulness)
@@ -354,7 +351,10 @@ def _check_usefulness(seen: Examination, results: Results) -> Finding:
         f"over {at.step:g} of the box: sign right {percent(at.sign.value)} ({percent(at.sign.low, bare=True)} to "
         f"{percent(at.sign.high)}), median relative error {at.error:.2g}"
     )
-    why = f"slopes do not hold that far: wanted are sign right {SIGNS:.0%} and an error of {USEFUL:g} for a search"
+    why = (
+        f"gradients are not accurate that far: a search needs the right sign at {SIGNS:.0%} of points and an error of "
+        f"at most {USEFUL:g}"
+    )
     numbers = {
         "step": at.step,
         "sign": at.sign.value,
@@ -377,20 +377,20 @@ def _check_second_backward(subject: Subject, results: Results) -> Finding:
 
 
 def _check_modes(subject: Subject, other_mode: Callable[[], Objective] | None) -> Finding:
-    """Hold gradients of the forward mode of automatic differentiation against those of the reverse mode."""
+    """Compare gradients of the forward mode of automatic differentiation with those of the reverse mode."""
     if other_mode is None:
-        return skip("n/a", "it has one mode of differentiation only")
+        return skip("n/a", "it has only one mode of differentiation")
     try:
         found = evaluate(other_mode(), subject.x, grad=True)
     except ValueError as refusal:
         return skip("not checked", one_line(refusal))
     apart, limit = subject.differences(found, subject.first), 10 * subject.eps ** (1 / 3)
-    figure = f"gradients up to {apart[1]:.1e} of the largest component apart"
+    figure = f"gradients differ by up to {apart[1]:.1e} of the largest component"
     return within(max(apart), limit, figure, "one of the two is wrong")
 
 
 def _try(name: str, run: Callable[[], Finding]) -> Finding:
-    """Run a check; what it raises is a failure of the objective's, whatever it is."""
+    """Run a check; any error is a failure of the objective."""
     try:
         return replace(run(), check=name)
     except Exception as error:
@@ -404,7 +404,7 @@ def _failure(name: str, error: Exception) -> Finding:
 
 
 def _check_shapes(objective: Objective, x: Float[Tensor, "batch dim"]) -> Finding:
-    """Hold losses, gradients and statuses of several rows and of one against the protocol."""
+    """Check losses, gradients and statuses of several rows and of one against the protocol."""
     wrong = []
     for rows in (x, x[:1]):
         raw = objective.evaluate(rows, grad=True)
@@ -421,7 +421,7 @@ def _check_shapes(objective: Objective, x: Float[Tensor, "batch dim"]) -> Findin
 
 
 class _Given(ObjectiveWrapper):
-    """An objective whose evaluation is there already."""
+    """An objective with a given evaluation."""
 
     def __init__(self, objective: Objective, evaluation: Evaluation) -> None:
         super().__init__(objective)
@@ -447,12 +447,12 @@ def _check_refusal_of_shapes(subject: Subject) -> Finding:
             subject.objective.evaluate(wrong)
             continue
         taken.remove(shape)
-    why = f"ValueError is wanted; x of shape {' and '.join(taken)} was taken"
+    why = f"it must raise ValueError; it accepted x of shape {' and '.join(taken)}"
     return verdict(not taken, f"{len(shapes) - len(taken)} of {len(shapes)} shapes refused", why)
 
 
 def _check_refusal_of_nan(subject: Subject) -> Finding:
-    """Check that nan is refused by a ValueError, or by a status of its row that changes no other row."""
+    """Check that NaN gives a ValueError, or a status of its row without changes to other rows."""
     x = subject.x.clone()
     x[0, -1] = torch.nan
     try:
@@ -462,7 +462,7 @@ def _check_refusal_of_nan(subject: Subject) -> Finding:
     others = subject.first.rows(torch.arange(1, len(x)))
     clean = subject.agree(found.rows(slice(1, None)), others)
     status = Status(int(found.status[0]))
-    why = "the other rows changed with it" if not clean else f"a row of nan was given a loss and status {status.name}"
+    why = "it changed the other rows" if not clean else f"a row of nan got a loss and status {status.name}"
     return verdict(bool(failed(status)) and clean, f"answered by status {status.name}", why)
 
 
@@ -473,7 +473,7 @@ def _check_determinism(subject: Subject) -> Finding:
         figure = f"{REPEATS} repeats differ by {loss:.1e} of the loss range, {grad:.1e} of the largest gradient"
     limits = subject.repeatable
     numbers = {"loss": loss, "gradient": grad, "limit": limits[0], "gradient_limit": limits[1]}
-    ok, why = loss <= limits[0] and grad <= limits[1], f"at most {limits[0]:.0e} and {limits[1]:.0e} is wanted"
+    ok, why = loss <= limits[0] and grad <= limits[1], f"at most {limits[0]:.0e} and {limits[1]:.0e} is allowed"
     return verdict(ok, figure, why, numbers)
 
 
@@ -492,8 +492,10 @@ def _check_order_of_rows(subject: Subject) -> Finding:
 def _compare(subject: Subject, found: Evaluation, rows: Tensor) -> Finding:
     apart = subject.differences(found, subject.first.rows(rows))
     limits = subject.tolerances
-    figure = "same bits" if max(apart) == 0 else f"loss {apart[0]:.1e} of its range, gradient {apart[1]:.1e} apart"
-    why = f"at most {limits[0]:.0e} and {limits[1]:.0e} is wanted: a row depends on the rows it is evaluated with"
+    figure = (
+        "same bits" if max(apart) == 0 else f"loss differs by {apart[0]:.1e} of its range, gradient by {apart[1]:.1e}"
+    )
+    why = f"at most {limits[0]:.0e} and {limits[1]:.0e} is allowed: a row depends on the other rows of its batch"
     return verdict(all(a <= limit for a, limit in zip(apart, limits, strict=True)), figure, why)
 
 
@@ -509,7 +511,9 @@ def _check_empty_batch(subject: Subject) -> Finding:
 def _check_loss_without_gradient(subject: Subject) -> Finding:
     found = evaluate(subject.objective, subject.x, grad=False)
     apart = difference(found.loss, subject.first.loss) / subject.scale
-    return within(apart, subject.tolerances[0], f"{apart:.1e} of the loss range apart", "the loss depends on grad=")
+    return within(
+        apart, subject.tolerances[0], f"losses differ by {apart:.1e} of their range", "the loss depends on grad="
+    )
 
 
 PROMISES: Mapping[str, Callable[[Subject], Finding]] = {

@@ -1,4 +1,4 @@
-"""How far a gradient holds: against the loss's change over steps of many lengths, and against the smoothed gradient."""
+"""The reach of a gradient: compared with loss changes over steps of many lengths, and with the smoothed gradient."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ CLEAR = 10  # times the noise is what a change is, to have a sign
 
 @dataclass(frozen=True)
 class Usefulness:
-    """What a gradient says of the loss over one step, a share of the box.
+    """The comparison of a gradient with the loss over one step, a fraction of the box.
 
-    `sign` is the share of slopes whose sign is right, `cosine` that of all slopes with differences over the step,
-    `error` the median relative error, `compared` how many changes were clear of the noise. `bias` is the share of the
-    slope of the smoothed loss that the mean of gradients within the width lacks, NaN where it was not computed: a mean
-    of gradients has no part of what jumps add to the loss.
+    `sign` is the share of slopes with the right sign, `cosine` that of all slopes with differences over the step,
+    `error` the median relative error, `compared` the number of changes above the noise. `bias` is the share of the
+    slope of the smoothed loss that is missing in the mean of gradients within the width, NaN where not computed: a mean
+    of gradients misses the contribution of jumps.
     """
 
     step: float
@@ -123,7 +123,7 @@ def _bias(probe: Probe, lines: Lines, step: float, slope: NDArray[np.float64], s
 
 
 def _lacking(mean: NDArray[np.float64], wanted: NDArray[np.float64]) -> Estimate:
-    """Return the share of the slopes that is wanted and that means of gradients lack, with its interval."""
+    """Return the missing share of the slope in means of gradients, with its interval."""
     known = np.isfinite(mean) & np.isfinite(wanted)
     mean, wanted = mean[known], wanted[known]
     if len(mean) < MEANS or not wanted.any():

@@ -1,1 +1,1 @@
-"""Pictures of landscapes: one file per medium; each takes records and returns the medium's own object."""
+"""Pictures of landscapes, one folder for each medium; each function takes records and returns the medium's object."""

@@ -1,4 +1,4 @@
-"""The picture of a record: `figure_of` finds the function that draws it by the name of the record's class."""
+"""Pictures of records: `figure_of` finds the drawing function by the name of the record's class."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ _PACKAGE = __name__.partition(".landscapes.")[0]
 
 
 class Picture(Figure):
-    """A figure that knows its sheet, draws without a window or any global state, and shows in a notebook.
+    """A figure with its sheet; it draws without a window or global state, and shows in a notebook.
 
-    `settle` lays it out, once. It has no layout engine: `savefig` draws a figure that has one twice.
+    `settle` lays it out once. It has no layout engine, because `savefig` draws a figure with one twice.
     """
 
     def __init__(self, sheet: style.Sheet, height: float) -> None:
@@ -49,7 +49,7 @@ class Picture(Figure):
         FigureCanvasAgg(self)
 
     def _repr_png_(self) -> bytes:
-        """Return the picture as a notebook shows it."""
+        """Return the PNG that a notebook shows."""
         from .style import DPI
 
         with io.BytesIO() as raw:
@@ -58,13 +58,13 @@ class Picture(Figure):
 
 
 def figure_of(record: Any, width: float | None = None, **options: Any) -> Picture:
-    """Draw a record for a screen, or for a page so wide [mm]; `options` are its figure's own.
+    """Draw a record for a screen, or for a page of a width [mm]; `options` are those of its figure.
 
-    Raises TypeError where no figure is made of its class, ValueError where the page is too narrow or too wide.
+    Raises TypeError if records of this class have no figure, ValueError if the page is too narrow or too wide.
     """
     for kind in type(record).__mro__:
         if place := FIGURES.get(kind.__name__):
             module, name = place.split(":")
             draw = getattr(import_module(f"{_PACKAGE}.{module}"), name)
             return cast("Picture", draw(record, width=width, **options))
-    raise TypeError(f"{type(record).__name__} has no figure; those of {', '.join(sorted(FIGURES))} are drawn")
+    raise TypeError(f"a {type(record).__name__} has no figure; these records have one: {', '.join(sorted(FIGURES))}")

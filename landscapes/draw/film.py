@@ -1,4 +1,4 @@
-"""Pictures as a film: MP4 and GIF by the ffmpeg that comes in the wheel of imageio-ffmpeg."""
+"""Films: MP4 and GIF, by the ffmpeg in the wheel of imageio-ffmpeg."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ GIF_PIXELS = 16e6  # most in all frames of a GIF, which then stays near 5 MB
 
 
 def picture(figure: Figure, *, dpi: int) -> Picture:
-    """Return a figure as an RGB picture, shape (height, width, 3), both even as films want them."""
+    """Return a figure as an RGB picture, shape (height, width, 3), with even sides as films need them."""
     figure.set_dpi(dpi)
     width, height = figure.canvas.get_width_height()
     raw = io.BytesIO()
@@ -36,11 +36,11 @@ def picture(figure: Figure, *, dpi: int) -> Picture:
 def save_film(
     pictures: Iterable[Picture], mp4: Path, gif: Path | None, *, count: int, rate: int, loss: int = 18
 ) -> None:
-    """Write `count` pictures of one size as an MP4, and as a GIF with one palette, `rate` of them a second.
+    """Write `count` pictures of one size as an MP4, and as a GIF with one palette, at `rate` pictures a second.
 
-    `loss` is x264's constant rate factor: 18 looks as the pictures do, 28 takes about a third of the bytes.
+    `loss` is x264's constant rate factor: 18 looks like the pictures, 28 takes about a third of the bytes.
 
-    Raises OSError where ffmpeg could not write them.
+    Raises OSError if ffmpeg cannot write them.
     """
     pictures = iter(pictures)
     first = next(pictures)
@@ -77,7 +77,7 @@ def save_still(picture: Picture, path: Path) -> None:
 
 
 def lighten(path: Path) -> None:
-    """Write a PNG again with 256 colours, which is a third of its weight where it is a diagram."""
+    """Rewrite a PNG with 256 colours, which makes a diagram three times smaller."""
     with Image.open(path) as picture, replacing(path) as partial:
         few = picture.convert("RGB").quantize(256, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
         few.save(partial, "PNG", optimize=True)

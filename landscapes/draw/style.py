@@ -187,7 +187,7 @@ EIGENVALUES: dict[str, dict[str, Any]] = {  # of a Hessian, by sign
         "color": QUIET, "marker": "o", "linestyle": "none", "markersize": 5.5, "markerfacecolor": "white"
     },
 }  # fmt: skip
-EIGENVALUE_NAMES = {"positive": "positive", "negative": "negative", "cannot tell": "the sign cannot be told"}
+EIGENVALUE_NAMES = {"positive": "positive", "negative": "negative", "cannot tell": "undetermined sign"}
 INTERVAL_LINE: dict[str, Any] = {"color": FAINT, "linewidth": 1.0, "zorder": 1.5, "solid_capstyle": "butt"}
 CHOSEN_MARK: dict[str, Any] = {  # a ring around a variant that a fidelity's name should mean
     "linestyle": "none", "marker": "o", "markersize": 12.0, "markerfacecolor": "none", "markeredgewidth": 1.3,
@@ -212,7 +212,7 @@ WEIGHTS = {"linewidth": 1, "linewidths": 1, "markersize": 1, "markeredgewidth": 
 
 @dataclass(frozen=True)
 class Sheet:
-    """Sizes of a picture for its medium: a screen, as wide as its panels need, or a printed page of a given width."""
+    """Sizes of a picture for its medium: a screen, as wide as the panels need, or a printed page of a given width."""
 
     width: float  # [inch]
     columns: int  # panels side by side
@@ -226,11 +226,12 @@ class Sheet:
     def of(
         cls, width: float | None, *, pitch: float, columns: int = 1, panels: int | None = None, least: float = NARROWEST
     ) -> Sheet:
-        """Return a screen's, `columns` panels of a `pitch` [inch], or that of a page `width` millimetres wide.
+        """Return the sheet of a screen, `columns` panels of a `pitch` [inch], or of a page `width` millimetres wide.
 
-        There, as many of the `panels` stand side by side as have `least` millimetres each; type has a journal's sizes.
+        On a page, as many of the `panels` are side by side as have at least `least` millimetres each. Type has the
+        sizes of a journal.
 
-        Raises ValueError where the page is narrower or wider than any that is printed.
+        Raises ValueError if the page is narrower or wider than a printed page.
         """
         if width is None:
             return cls(columns * pitch, columns, 1.0)
@@ -243,21 +244,21 @@ class Sheet:
 
     @property
     def pitch(self) -> float:
-        """How much room a panel has with all that belongs to it [inch]."""
+        """The width of a panel with its labels [inch]."""
         return self.width / self.columns
 
     @property
     def type(self) -> float:
-        """How large type is, against a screen's."""
+        """The size of type, relative to a screen."""
         return self.label / Sheet.label
 
     @property
     def weight(self) -> float:
-        """How heavy lines and marks are, against a screen's: they go with the panels, down to what can be printed."""
+        """The weight of lines and marks, relative to a screen: that of the panels, down to a printable minimum."""
         return min(1.0, max(LIGHTEST, self.zoom))
 
     def look(self, look: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the look of lines or marks in the sheet's weight."""
+        """Return a look of lines or marks with the sheet's weight."""
         return {
             name: value * self.weight ** WEIGHTS[name] if name in WEIGHTS else value for name, value in look.items()
         }
@@ -265,14 +266,14 @@ class Sheet:
 
 @dataclass(frozen=True, eq=False)
 class Scale:
-    """Map values to colours; `extend` says at which end of the colour bar values continue beyond it."""
+    """A map from values to colours; `extend` names the ends of the colour bar beyond which values continue."""
 
     norm: Normalize
     extend: str
 
     @classmethod
     def of_loss(cls, values: NDArray[np.float64]) -> Scale:
-        """Span the finite losses: logarithmic from three decades on, without an outermost per cent far out."""
+        """Span the finite losses, logarithmic from three decades on, without the outermost percent if it is far out."""
         low, high, extend = _span(values)
         if low > 0 and high / low >= 1e3:
             return cls(LogNorm(low, high), extend)
@@ -280,12 +281,12 @@ class Scale:
 
     @classmethod
     def between(cls, low: float, high: float, *, logarithmic: bool = False, extend: str = "neither") -> Scale:
-        """Span a range, of positive values where it is logarithmic; `extend` says where values continue beyond it."""
+        """Span a range, which is positive if logarithmic; `extend` names the ends beyond which values continue."""
         return cls(LogNorm(low, high) if logarithmic else Normalize(low, high), extend)
 
     @classmethod
     def symmetric(cls, values: NDArray[np.float64]) -> Scale:
-        """Span finite values to both sides of zero alike, without the largest few where they are far out."""
+        """Span finite values symmetrically about zero, without the largest few if they are far out."""
         _, most, _ = _span(np.abs(values))
         return cls(Normalize(-most, most), "neither").over(values)
 
@@ -303,18 +304,18 @@ class Scale:
 
     @property
     def ends(self) -> tuple[float, float]:
-        """The least and the largest value that have a colour of their own."""
+        """The lowest and the highest value with a distinct colour."""
         return float(self.norm.vmin or 0.0), float(self.norm.vmax or 0.0)
 
     def over(self, values: NDArray[np.float64]) -> Scale:
-        """Return the same scale, with the ends open beyond which some of the values are."""
+        """Return the same scale, open at the ends that some of the values exceed."""
         low, high = self.ends
         finite = values[np.isfinite(values)]
         return Scale(self.norm, EXTEND[bool((finite < low).any()), bool((finite > high).any())])
 
     @property
     def logarithmic(self) -> bool:
-        """Whether equal ratios, not differences, are equally far apart."""
+        """Whether equal ratios, not equal differences, have equal distances."""
         return isinstance(self.norm, LogNorm)
 
     def ticks(self) -> list[float]:
@@ -351,7 +352,7 @@ def _span(values: NDArray[np.float64]) -> tuple[float, float, str]:
 
 
 def stroke(points: int) -> dict[str, Any]:
-    """Return the look of a line of so many points: with markers where they can be told apart."""
+    """Return the look of a line of `points` points, with markers if they are distinguishable."""
     return {"linewidth": 1.1, "marker": "o" if points <= 100 else "", "markersize": 2.4}
 
 
@@ -361,7 +362,7 @@ def method(run: xr.Dataset) -> dict[str, Any]:
 
 
 def point_areas(distance: NDArray[np.float64], reach: float, points: int) -> NDArray[np.float64]:
-    """Return marker areas of so many points [pt^2], which fall with the distance from the plane, at most `reach`."""
+    """Return marker areas [pt^2] of `points` points, which fall with the distance from the plane, at most `reach`."""
     least, most = MARK_AREAS
     area = max(least, min(most, most * (150 / max(points, 1)) ** 0.35))
     share: NDArray[np.float64] = 1 - (1 - FARTHEST_SHARE) * distance / reach if reach else np.ones_like(distance)
@@ -370,19 +371,19 @@ def point_areas(distance: NDArray[np.float64], reach: float, points: int) -> NDA
 
 
 def number(value: float, form: str = ".4g") -> str:
-    """Write a number, with four digits unless `form` says otherwise, the ticks' minus sign, and no negative zero."""
+    """Write a number in a format, by default with four digits, with a proper minus sign and no negative zero."""
     return f"{value:z{form}}".replace("-", "\N{MINUS SIGN}")
 
 
 def text_on(colour: Sequence[float], inks: tuple[str, str] = ("black", "white")) -> str:
-    """Return the ink, the dark or the light one, that is legible on a colour, red, green and blue of 0 to 1."""
+    """Return the dark or the light ink, whichever is legible on a colour (red, green, blue; 0 to 1)."""
     linear = [part / 12.92 if part <= 0.04045 else ((part + 0.055) / 1.055) ** 2.4 for part in colour[:3]]
     luminance = float(np.dot(linear, (0.2126, 0.7152, 0.0722)))  # WCAG 2
     return inks[1.05 / (luminance + 0.05) > (luminance + 0.05) / 0.05]
 
 
 def power(value: float, plain: int = 4) -> str:
-    """Write a round number of a logarithmic axis, beyond so many `plain` digits as a multiple of a power of ten."""
+    """Write a round number of a logarithmic axis, with a power of ten beyond `plain` digits."""
     exponent = math.floor(math.log10(value) + 1e-9)
     if -plain <= exponent < plain:
         return number(value)
@@ -392,12 +393,12 @@ def power(value: float, plain: int = 4) -> str:
 
 
 def hairline_width(lines: int) -> float:
-    """Return the width of so many vertical lines [pt]: hairlines where there are many."""
+    """Return the width [pt] of a number of vertical lines: hairlines if there are many."""
     return max(0.25, min(0.8, 40 / max(lines, 1)))
 
 
 def span_of_line(values: NDArray[np.float64], beside: NDArray[np.float64]) -> tuple[float, float]:
-    """Return limits that show `values` and the bulk of what is drawn `beside` them."""
+    """Return limits that show all `values` and most of the data drawn `beside` them."""
     low, high, _ = _span(values)
     bulk = beside[np.isfinite(beside)]
     if bulk.size:
@@ -415,7 +416,7 @@ DENSE = (range(1, 10), (1, 2, 5))  # multiples of powers of ten, from the denses
 
 
 def decades(low: float, high: float, most: int = WIDE) -> list[float]:
-    """Return the logarithms of about so many round values whose logarithms lie between two ends, ascending."""
+    """Return the logarithms of at most about `most` round values between two logarithms, ascending."""
     whole = range(math.ceil(low - NEAR), math.floor(high + NEAR) + 1)
     if len(whole) >= max(2, most // 2):
         every = -(-len(whole) // most)
@@ -434,15 +435,15 @@ def _multiples(low: float, high: float, factors: Sequence[int]) -> list[float]:
 
 
 def write_power(place: float) -> str:
-    """Write the value whose logarithm this is: a multiple of a power of ten, or else a plain number."""
+    """Write the value with this logarithm: a multiple of a power of ten, or else a plain number."""
     factor = 10.0 ** (place - math.floor(place + NEAR))
     return power(10.0**place, PLAIN) if abs(factor - round(factor)) < 1e-6 else number(10.0**place)
 
 
 def mark_decades(axis: Axis, most: int = WIDE) -> None:
-    """Give a matplotlib axis with its limits, whose coordinates are decimal logarithms, the ticks of the values.
+    """Set the ticks of a matplotlib axis whose coordinates are decimal logarithms; it must have its limits.
 
-    Minor ticks are at 2 to 9 times powers of ten where there is room, else at decades.
+    Minor ticks are at 2 to 9 times powers of ten if there is room, else at decades.
     """
     low, high = sorted(axis.get_view_interval())
     axis.set_major_locator(FixedLocator(decades(low, high, most)))

@@ -1,4 +1,4 @@
-"""The report card of several engines' gradients: what `check` finds of each, and its landscape on one plane."""
+"""The report card of several engines' gradients: the result of `check` for each, and its landscape on one plane."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ UPPER = 0.95  # quantile of the errors against a closed form that is said beside
 
 @dataclass(frozen=True)
 class FailedCheck:
-    """Say which check failed, what it measured and why that is wrong."""
+    """A failed check, its measurement and the reason."""
 
     check: str
     figure: str
@@ -42,10 +42,10 @@ class FailedCheck:
 
 @dataclass(frozen=True)
 class ClosedFormError:
-    """Say how far gradients are from those of the physics, as shares of these: at the box's centre and at random.
+    """The relative distance of gradients from those of the physics: at the box's centre and at random points.
 
-    `median` and `upper`, the 95 % quantile, are of `points`; they are NaN where a gradient is not finite. `loss` is the
-    median error of the losses, as a share of their range: engines whose contact is soft solve another problem.
+    `median` and `upper`, the 95 % quantile, are over `points`; they are NaN where a gradient is not finite. `loss` is
+    the median error of the losses, as a share of their range: engines with soft contact solve another problem.
     """
 
     points: int
@@ -56,7 +56,7 @@ class ClosedFormError:
 
     @classmethod
     def of(cls, found: Evaluation, exact: Evaluation) -> ClosedFormError | None:
-        """Hold an evaluation against the closed form's, the centre being the first row; None without gradients."""
+        """Compare an evaluation with the closed form's, whose first row is the centre; None without gradients."""
         if found.grad is None or exact.grad is None:
             return None
         length = exact.grad.norm(dim=1).numpy()
@@ -69,13 +69,13 @@ class ClosedFormError:
 
 @dataclass(frozen=True)
 class Grade:
-    """Say what was measured of one engine in one scene; its verdict is computed from that.
+    """The measurements of one engine in one scene, which give its verdict.
 
     `env`, `fidelity` and `options` make the environment, `dims` span its slice. `versions` are those of the packages
-    that it is simulated by. `missing` is the line that installs it, empty where it is there. `power` is the share of
-    the box that a defect fills which the check finds with 95 %, `share` how many points are wrong, `failed` the checks
-    that failed, and `diagnosis` the most certain one. `closed_form` is None where the scene has none. `seconds` is what
-    the check took; `check` and `slice` are the commands that make both again.
+    that simulate it. `missing` is the line that installs it, empty if it is installed. `power` is the smallest share of
+    the box for which the check finds a defect with 95 % probability. `share` is the share of wrong points, `failed` the
+    failed checks, and `diagnosis` the most certain one. `closed_form` is None where the scene has none. `seconds` is
+    the duration of the check; `check` and `slice` are the commands that make both again.
     """
 
     scene: str
@@ -99,7 +99,7 @@ class Grade:
 
     @property
     def verdict(self) -> Verdict:
-        """Whether its gradients are right: not decided where a defect of that power may not have been met."""
+        """Whether its gradients are right: undecided where a defect of that size could have been missed."""
         if self.missing:
             return "not installed"
         if self.failed:
@@ -108,7 +108,7 @@ class Grade:
 
     @property
     def margin(self) -> Answer:
-        """Whether gradients are wrong in more of the box than `power`: not decided where the interval holds both."""
+        """Whether gradients are wrong in more of the box than `power`: undecided where the interval contains it."""
         if self.share is None or self.share.judged == 0:
             return "not decided"
         if self.share.low > self.power:
@@ -118,37 +118,37 @@ class Grade:
 
     @property
     def unjudged(self) -> float:
-        """Share of the points at which nothing could be said."""
+        """Share of the points without a result."""
         if self.share is None or self.share.points == 0:
             return np.nan
         return 1 - self.share.judged / self.share.points
 
     @property
     def program_only(self) -> bool:
-        """Whether gradients are right of the program, and not of the physics."""
+        """Whether gradients are right for the program but not for the physics."""
         return self.verdict == "passes" and self.closed_form is not None and self.closed_form.median > WRONG_PHYSICS
 
     @property
     def cause(self) -> str:
-        """The cause of what is wrong, as far as one is known."""
+        """The cause of wrong gradients, as far as known."""
         return self.diagnosis.cause if self.diagnosis is not None else ""
 
     @property
     def finding(self) -> str:
-        """What is worst, in a sentence: the first diagnosis, else the first check that failed."""
+        """The worst finding in a sentence: the first diagnosis, else the first failed check."""
         if self.diagnosis is not None:
             return self.diagnosis.what
         return str(self.failed[0]) if self.failed else self.missing
 
     @property
     def wrong(self) -> str:
-        """The share of points that are wrong, with its interval."""
+        """The share of wrong points, with its interval."""
         return self.share.describe() if self.share is not None and self.share.judged else ""
 
 
 @dataclass(frozen=True, eq=False)
 class CardSlice:
-    """Hold a small slice: where it lies, its losses, their slopes by both axes [loss unit per side], and statuses."""
+    """A small slice: its position, its losses, their derivatives by both axes [loss unit per side], and statuses."""
 
     u: Float[NDArray[Any], " u"]
     v: Float[NDArray[Any], " v"]
@@ -161,7 +161,7 @@ class CardSlice:
 
 @dataclass(frozen=True, eq=False)
 class Card:
-    """Hold the grades, and for drawing the slice of each that was sampled, by its place among them."""
+    """The grades, and the slice of each that was sampled, by its index among them."""
 
     grades: tuple[Grade, ...]
     created: str
@@ -188,22 +188,22 @@ class Card:
         return figure_of(self, width)
 
     def count(self, verdict: Verdict) -> int:
-        """How many engines in scenes have a verdict."""
+        """Count the engines in scenes with a verdict."""
         return sum(one.verdict == verdict for one in self.grades)
 
     def tally(self) -> str:
-        """Say how many engines in scenes have which verdict."""
+        """Count the engines in scenes by verdict, in words."""
         counts = {verdict: self.count(verdict) for verdict in VERDICTS}
         plural = {"passes": "pass", "fails": "fail"}
         said = (f"{n} {verdict if n == 1 else plural.get(verdict, verdict)}" for verdict, n in counts.items() if n)
         return ", ".join(said)
 
     def engines(self) -> list[str]:
-        """Return what was measured, packages with their versions."""
+        """Return the tested packages with their versions."""
         return list(dict.fromkeys(f"{name} {at}" for one in self.grades for name, at in one.versions.items()))
 
     def scenes(self) -> list[tuple[str, list[int]]]:
-        """Return each scene with the places of its grades."""
+        """Return each scene with the indices of its grades."""
         names = dict.fromkeys(one.scene for one in self.grades)
         return [(name, [place for place, one in enumerate(self.grades) if one.scene == name]) for name in names]
 
@@ -216,9 +216,9 @@ def _row(one: Grade) -> Sequence[Any]:
 
 
 def describe_share(value: float) -> str:
-    """Write a share in percent, with a digit where it is small, and one of more than ten times the whole as a factor.
+    """Write a share in percent, with a digit where it is small, and one above ten times the whole as a factor.
 
-    What rounding makes is "none".
+    A share at the level of rounding is "none".
     """
     if not np.isfinite(value):
         return "not finite"

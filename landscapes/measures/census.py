@@ -1,4 +1,4 @@
-"""The census of an environment: slices through random points along random cuts, each measured by itself."""
+"""The census of an environment: slices through random points along random cuts, each measured separately."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 
 @dataclass(frozen=True)
 class PlaneSpec:
-    """Hold the two directions of a slice, and what they are called.
+    """The two directions of a slice, and their labels.
 
     `dims` are the numbers of two parameters; else `directions`, shape (2, dim), are orthonormal in widths of the box.
     """
@@ -87,11 +87,11 @@ class PlaneSpec:
 
 @dataclass(frozen=True, eq=False)
 class CensusDesign:
-    """Hold what is sliced: two cuts through every base point, and every cut through two points or more.
+    """The slices to measure: two cuts through every base point, and every cut through two or more points.
 
-    So what the point and the cut do can be told apart, while there are as many of both as slices allow: slices that
-    share one are alike. `bases` [parameters' units] has shape (base, dim). A slice has gradients at every so many
-    samples along each axis, `gradients`.
+    That separates the effects of point and cut, with as many of both as the number of slices allows, because slices
+    that share one are alike. `bases` [parameters' units] has shape (base, dim). `gradients` is the stride of the
+    samples with gradients along each axis.
     """
 
     space: ParameterSpace
@@ -104,15 +104,15 @@ class CensusDesign:
     def draw(
         cls, space: ParameterSpace, slices: int, *, along: str, resolution: int, seed: int, gradients: int = 1
     ) -> CensusDesign:
-        """Draw half as many base points as slices, and as many cuts where there are so many.
+        """Draw half as many base points as slices, and as many cuts, or all there are.
 
-        Of two parameters there is one slice, whatever it goes through. Raises ValueError for other ways to cut, and
-        where the space has one parameter.
+        A space of two parameters has a single slice, whatever point it goes through. Raises ValueError for another way
+        to cut, and for a space with one parameter.
         """
         if along not in ALONG:
-            raise ValueError(f"a census cuts along {' or '.join(ALONG)}; got {along!r}")
+            raise ValueError(f"a census takes along {' or '.join(ALONG)}; got {along!r}")
         if space.dim < 2:
-            raise ValueError("a census takes two parameters and more; got one")
+            raise ValueError("a census needs at least two parameters; got one")
         generator = np.random.default_rng(seed)
         many = max(1, slices // CUTS)
         count = max(many, min(CUTS, slices))
@@ -128,13 +128,13 @@ class CensusDesign:
 
     @property
     def exhausted(self) -> tuple[bool, bool]:
-        """Whether base points and cuts are all that there are, so that others would not say otherwise."""
+        """Whether base points and cuts are a complete enumeration, so that others cannot differ."""
         dim, pairs = self.space.dim, self.cuts[0].dims is not None
         return pairs and dim == 2, pairs and len(self.cuts) == dim * (dim - 1) // 2
 
     @property
     def samples(self) -> tuple[int, int]:
-        """How many samples of a slice are without a gradient, and how many have one."""
+        """The numbers of samples of a slice without and with a gradient."""
         having = count_gradients((self.resolution, self.resolution), self.gradients)
         return self.resolution**2 - having, having
 
@@ -151,7 +151,7 @@ class CensusDesign:
 
 @dataclass(frozen=True, eq=False)
 class SurveyedSlice:
-    """Hold what a slice of a census is like: its losses, measures by the order of `MEASURES`, and words.
+    """The results of a slice of a census: its losses, measures in the order of `MEASURES`, and words.
 
     `loss` [loss unit] has shape (v, u), NaN where an episode failed or the point is outside the box. `halved` are the
     measures of every second sample along each axis.
@@ -164,7 +164,7 @@ class SurveyedSlice:
     episodes: int
 
     def arrays(self) -> dict[str, Any]:
-        """Return what `of_arrays` takes, for a file."""
+        """Return the input of `of_arrays`, for a file."""
         return {**vars(self), "words": np.array(self.words, dtype=str), "episodes": np.array(self.episodes)}
 
     @classmethod
@@ -187,9 +187,9 @@ def survey(
     """Sample and measure slices, their points in one batch.
 
     `deviation` [loss unit] is the standard deviation of the losses' noise, `floor` the numerical floor and `own_range`
-    the range of the environment's losses, see `judge`. Slices have gradients at every so many samples along each axis,
-    `gradients`. Measures are those of a report, without their intervals within the slice: what counts here is how they
-    differ from slice to slice. Jumps are looked for in at most `STEEP` pairs of samples of a slice.
+    the range of the environment's losses, see `judge`. `gradients` is the stride of the samples with gradients along
+    each axis. Measures are those of a report, without their intervals within the slice, because only the differences
+    between slices count here. Jumps are searched in at most `STEEP` pairs of samples of a slice.
     """
     counted = CountedObjective(objective)
     wholes = sample_cuts(counted, planes, gradients=gradients)
@@ -209,15 +209,15 @@ def survey(
 
 
 def judging_effort() -> tuple[int, int]:
-    """Return how many losses, at most, and how many gradients it takes to judge a slice that is sampled."""
+    """Return the largest number of losses, and the number of gradients, needed to judge a sampled slice."""
     losses = PLACES * EVALUATIONS_PER_PLACE + WAYS * WAY_POINTS + STEEP * EVALUATIONS_PER_PAIR
     return losses + 4 * POINTS * len(SCALES), POINTS
 
 
 def sample_cuts(objective: Objective, planes: Sequence[Plane], *, gradients: int = 1) -> list[xr.Dataset]:
-    """Return losses and gradients of slices, NaN where a sample has none; of each nothing else is said than its plane.
+    """Return losses and gradients of slices, NaN where a sample has none; their only attribute is their plane.
 
-    Gradients are at every so many samples along each axis, `gradients`.
+    `gradients` is the stride of the samples with gradients along each axis.
     """
     grids = [plane.grid() for plane in planes]
     having = torch.zeros(grids[0].shape[:2], dtype=torch.bool)
@@ -238,7 +238,7 @@ def sample_cuts(objective: Objective, planes: Sequence[Plane], *, gradients: int
 
 
 def thin_out(whole: xr.Dataset) -> xr.Dataset:
-    """Return every second sample along each axis, as a slice of half the resolution would have them."""
+    """Return every second sample along each axis, like a slice of half the resolution."""
     plane, thin = plane_of(whole), whole.isel(u=slice(None, None, 2), v=slice(None, None, 2))
     shape = thin.sizes["u"], thin.sizes["v"]
     upper = torch.stack([axis[2 * (count - 1)] for axis, count in zip(plane.axes(), shape, strict=True)])
@@ -253,12 +253,12 @@ def _dataset(plane: Plane, loss: Array, grad: Array, status: Array) -> xr.Datase
 
 
 def _alone(statistic: Any, samples: Array, **bounds: float) -> Estimate:
-    """Return a measure without an interval, which the other slices give."""
+    """Return a measure without an interval, which comes from the other slices."""
     return exactly(statistic(samples))
 
 
 def _measure(dataset: xr.Dataset, verdict: Verdict, surface: Surface) -> Array:
-    """Return the measures of a slice, of the surface that is given."""
+    """Return the measures of a slice with the given surface."""
     found = ruggedness(dataset, floor=surface.floor, estimate=_alone)
     near = None if verdict.following is None else verdict.following.at(CHIEF)
     return np.array(
@@ -282,7 +282,7 @@ def _measure(dataset: xr.Dataset, verdict: Verdict, surface: Surface) -> Array:
 
 
 def ordered(measures: Sequence[Array]) -> list[int]:
-    """Return the numbers of slices by their measures, the least rugged first: how often they turn back, then minima."""
+    """Return the numbers of slices by their measures, the least rugged first: by turns, then minima."""
     keyed = [MEASURES.index(name) for name in ("turns", "notable minima")]
     keys = [tuple(np.nan_to_num(one[keyed], nan=-1.0)) for one in measures]
     return sorted(range(len(keys)), key=lambda number: keys[number])
@@ -290,7 +290,7 @@ def ordered(measures: Sequence[Array]) -> list[int]:
 
 @dataclass(frozen=True)
 class Spread:
-    """Hold how a measure is distributed over the slices: its quantiles, and its median with a 95 % interval."""
+    """The distribution of a measure over the slices: its quantiles, and its median with a 95 % interval."""
 
     quantiles: tuple[float, ...]
     median: Estimate
@@ -298,10 +298,10 @@ class Spread:
 
 @dataclass(frozen=True)
 class VarianceComponents:
-    """Hold what shares of a measure's variance over slices go with what; NaN where it does not vary or is not known.
+    """Shares of a measure's variance over slices by cause; NaN where it does not vary or is unknown.
 
-    `base` and `cut` are what the point and the cut do by themselves, `both` what is left: what they do together.
-    `resolution` and `fidelity` are the variance that measuring otherwise adds, as shares of the same variance.
+    `base` and `cut` are the effects of the point and of the cut alone, `both` the rest: their joint effect.
+    `resolution` and `fidelity` are the variances from another way to measure, as shares of the same variance.
     """
 
     base: float
@@ -313,9 +313,9 @@ class VarianceComponents:
 
 @dataclass(frozen=True)
 class CensusedSlice:
-    """Say what one slice of a census is: the numbers of its base point and cut, its axes, range and words.
+    """One slice of a census: the numbers of its base point and cut, its axes, range and words.
 
-    `range` [loss unit] is from its lowest to its highest loss, None where all failed; `measures` are by the order of
+    `range` [loss unit] is from its lowest to its highest loss, None where all failed. `measures` are in the order of
     `census.MEASURES`; `failed` is the share of its samples without a loss.
     """
 
@@ -330,14 +330,14 @@ class CensusedSlice:
 
 @dataclass(frozen=True)
 class Census:
-    """Hold what many slices of an environment are like.
+    """The results of many slices of an environment.
 
-    `words` says of every word which share of the slices it fits, without those that are flat. `spreads` and `parts`
-    say of every measure how it is distributed and what its variance goes with. `exhausted` says whether base points and
-    cuts are all that there are. `other` is the fidelity that some slices were measured at, too, empty where there is
-    none. Slices have gradients at every so many samples along each axis, `gradients`. `losses` [loss unit] are those of
-    the slices, shape (slice, v, u), in a file of their own. `floor` is what replicas of the
-    environment differ by at random points, against the median range of the slices; None where it has none.
+    `words` has the share of slices for every word, among those that are not flat. `spreads` and `parts` have the
+    distribution and the variance components of every measure. `exhausted`: base points and cuts are a complete
+    enumeration. `other` is the second fidelity of some slices, empty where there is none. `gradients` is the stride of
+    the samples with gradients along each axis. `losses` [loss unit] are those of the slices, shape (slice, v, u), in a
+    separate file. `floor` is the difference between replicas of the environment at random points, relative to the
+    median range of the slices; None where it has no replicas.
     """
 
     env: str
@@ -364,11 +364,11 @@ class Census:
 
     @property
     def solid(self) -> int:
-        """How many slices are not flat: those that shares of other words are of."""
+        """The number of slices that are not flat, the base of the shares of other words."""
         return sum(FLAT not in one.words for one in self.slices)
 
     def share(self, words: Sequence[str]) -> Estimate:
-        """Return the share of slices that any of some words fits, of those that are not flat."""
+        """Return the share of slices with any of some words, among those that are not flat."""
         places = [(one.base, one.cut) for one in self.slices]
         return share_of_any([one.words for one in self.slices], words, places, self.exhausted)
 
@@ -380,8 +380,8 @@ class Census:
     def table(self) -> pd.DataFrame:
         """Return a row for each measure, indexed by `measure`.
 
-        Columns: the quantiles over the slices, `median` with `low` and `high`, and the shares of the variance that go
-        with `base`, `cut`, `both`, `resolution` and `fidelity`.
+        Columns: the quantiles over the slices, `median` with `low` and `high`, and the shares of the variance due to
+        `base`, `cut`, `both`, `resolution` and `fidelity`.
         """
         import pandas as pd
 
@@ -393,7 +393,7 @@ class Census:
         return pd.DataFrame(rows).set_index("measure")
 
     def plot(self, width: float | None = None) -> Picture:
-        """Draw every slice small, the least rugged first, for a screen, or for a page so wide [mm]."""
+        """Draw every slice small, the least rugged first, for a screen, or for a page of this width [mm]."""
         from ..draw.figure import figure_of
 
         return figure_of(self, width)
@@ -404,10 +404,11 @@ class Census:
 
 
 def scale(losses: NDArray[np.float32]) -> dict[str, NDArray[Any]]:
-    """Return the losses of slices, shape (slice, v, u), as a small file holds them.
+    """Return the losses of slices, shape (slice, v, u), in the form of a small file.
 
-    `loss` goes from 0 at a slice's lowest loss, `low`, to 1 at its highest, `high` [loss unit], in half precision: off
-    by 0.025 % of the range at most. It is NaN where a sample has no loss, and so are the ends of a slice without any.
+    `loss` goes from 0 at a slice's lowest loss, `low`, to 1 at its highest, `high` [loss unit], in half precision, with
+    an error of at most 0.025 % of the range. It is NaN where a sample has no loss, and so are the ends of a slice
+    without any.
     """
     known = np.isfinite(losses)
     low, high = (
@@ -433,7 +434,7 @@ def conclude(
     command: str,
     floor: Floor | None = None,
 ) -> Census:
-    """Sum up the slices of a design, and those that were measured at another fidelity, too, by their numbers."""
+    """Summarise the slices of a design, and those that were also measured at another fidelity, by their numbers."""
     drawn = bootstrap(design.places, seed=seed, exhausted=design.exhausted)
     whole, halved = (np.array([getattr(one, name) for one in found]) for name in ("measures", "halved"))
     spreads, parts = {}, {}
@@ -475,10 +476,10 @@ def _sum_up(found: SurveyedSlice, base: int, cut: int, axes: tuple[str, ...]) ->
 def bootstrap(
     places: Sequence[tuple[int, int]], *, seed: int, exhausted: tuple[bool, bool] = (False, False)
 ) -> NDArray[np.int64]:
-    """Draw how often each slice counts, shape (resample, slice): base points and cuts are drawn, each by themselves.
+    """Draw the weight of each slice, shape (resample, slice): base points and cuts are drawn independently.
 
-    Slices that share a point or a cut depend on each other (pigeonhole bootstrap: Owen 2007, Ann. Appl. Stat. 1(2)).
-    Where there is but one of either it is kept, and so are all of them where there are no others.
+    Slices that share a point or a cut depend on each other (pigeonhole bootstrap: Owen 2007, Ann. Appl. Stat. 1(2)). A
+    single point or cut is kept, and so are all of a complete enumeration.
     """
     generator, at = np.random.default_rng(seed), np.array(places)
     counts = [
@@ -493,7 +494,7 @@ def bootstrap(
 def word_shares(
     words: Sequence[Sequence[str]], places: Sequence[tuple[int, int]], exhausted: tuple[bool, bool]
 ) -> dict[str, Estimate]:
-    """Return the share of slices that each word fits, of those that are not flat; that of flat ones is of all."""
+    """Return the share of slices for each word, among those that are not flat; that of flat is of all slices."""
     return {word: share_of_any(words, [word], places, exhausted) for word in WORDS}
 
 
@@ -503,7 +504,7 @@ def share_of_any(
     places: Sequence[tuple[int, int]],
     exhausted: tuple[bool, bool],
 ) -> Estimate:
-    """Return the share of slices that any of some words fits, with its interval; see `word_shares`.
+    """Return the share of slices with any of some words, with its interval; see `word_shares`.
 
     Slices of one base point are a cluster, and so are those of one cut where there are others.
     """
@@ -514,7 +515,7 @@ def share_of_any(
 
 
 def spread(values: Array, drawn: NDArray[np.int64]) -> Spread:
-    """Return how the values of a measure are distributed, NaN left out."""
+    """Return the distribution of the values of a measure, without NaN."""
     known = np.isfinite(values)
     if not known.any():
         return Spread((np.nan,) * len(QUANTILES), UNKNOWN)
@@ -523,7 +524,7 @@ def spread(values: Array, drawn: NDArray[np.int64]) -> Spread:
 
 
 def _medians(values: Array, drawn: NDArray[np.int64]) -> Array:
-    """Return the median of each resample in which there are values: the mean of the one or two in its middle."""
+    """Return the median of each resample with values: the mean of the one or two in its middle."""
     order = np.argsort(values, kind="stable")
     upto = np.cumsum(drawn[:, order], axis=1)  # how many of a resample there are up to each value
     upto = upto[upto[:, -1] > 0]
@@ -535,13 +536,13 @@ def _medians(values: Array, drawn: NDArray[np.int64]) -> Array:
 def divide(
     values: Array, halved: Array, others: Mapping[int, float], places: Sequence[tuple[int, int]]
 ) -> VarianceComponents:
-    """Divide the variance of a measure over slices, shape (slice,), by what they differ in.
+    """Divide the variance of a measure over slices, shape (slice,), among its causes.
 
-    Two-way random effects: half the mean square of the difference of two slices is what point, cut and both add where
-    they share neither, and lacks what they share (Searle, Casella & McCulloch 1992, section 4.3: in a whole table these
-    are the mean squares). Shares below zero are cut off. `places` are base point and cut of the slices. `halved` is the
-    measure at half the resolution, `others` that of some slices, by their numbers, at another fidelity: half the mean
-    square of a difference is the variance that either adds.
+    Two-way random effects: half the mean square of the difference of two slices is the sum of the effects of point, cut
+    and both where they share neither, and lacks the shared ones (Searle, Casella & McCulloch 1992, section 4.3: in a
+    complete table these are the mean squares). Shares below zero are set to zero. `places` are base point and cut of
+    the slices. `halved` is the measure at half the resolution, `others` that of some slices, by their numbers, at
+    another fidelity. Half the mean square of a difference is the variance that either adds.
     """
     total = float(np.nanvar(values, ddof=1)) if np.isfinite(values).sum() > 1 else 0.0
     if not total > (ROUNDING * np.nanmax(np.abs(values), initial=0.0)) ** 2:
@@ -560,7 +561,7 @@ def _added(values: Array, others: Array) -> float:
 
 
 def _components(values: Array, places: NDArray[np.int64]) -> tuple[float, float, float]:
-    """Return what base points, cuts and the rest add to the variance; NaN where no two slices share either."""
+    """Return the variances due to base points, cuts and the rest; NaN where no two slices share either."""
     first, second = np.triu_indices(len(values), 1)
     squares = np.square(values[first] - values[second]) / 2
     shared = places[first] == places[second]

@@ -1,4 +1,4 @@
-"""What a landscape is like, by some tens of evaluations over all its parameters: enough to choose how to search it."""
+"""The character of a landscape from a few dozen evaluations over all its parameters: enough to choose a search."""
 
 from __future__ import annotations
 
@@ -36,15 +36,15 @@ EXPLORED = {  # features of `Exploratory`, as a character calls them
 
 @dataclass(frozen=True)
 class Character:
-    """Measures over all parameters, in sides of the box; NaN where the evaluations do not tell.
+    """Measures over all parameters, in sides of the box; NaN where the evaluations do not determine them.
 
-    `failed` is the share of points without a loss, `flat` that of gradients that are zero or missing. `falls` says at
-    which share of points a step of `STEPS` down the gradient lowers the loss, and `agreement` by how much of what the
-    gradient promises (median, between -1 and 1). `across` is the correlation of differences of losses between any two
-    points with those that their gradients promise, which is 1 of a parabola, and `convex` the share of pairs between
-    which the gradient grows. `coherence` is the length of the mean of the gradients' directions, `steepest` how many
-    powers of ten the longest gradient is above the median. `noise` is what repeated losses differ by, as a share of
-    their spread. The others are features of `Exploratory`.
+    `failed` is the share of points without a loss, `flat` that of gradients that are zero or missing. `falls` is the
+    share of points where a step of `STEPS` down the gradient lowers the loss. `agreement` is the actual decrease
+    relative to the one that the gradient predicts (median, between -1 and 1). `across` is the correlation of loss
+    differences between any two points with the prediction of their gradients, which is 1 for a parabola. `convex` is
+    the share of pairs between which the gradient grows. `coherence` is the length of the mean of the gradients'
+    directions, `steepest` the longest gradient over the median, in powers of ten. `noise` is the difference of repeated
+    losses, as a share of their spread. The others are features of `Exploratory`.
     """
 
     parameters: int
@@ -72,13 +72,17 @@ class Character:
             FeatureRow("Points without a loss", _percent(self.failed), ""),
             FeatureRow("Gradients that are zero or missing", _percent(self.flat), "of those at points with a loss"),
             FeatureRow("Steps down a gradient that lower the loss", _several(_percent, self.falls), f"by {steps}"),
-            FeatureRow("Of what the gradient promises", _several(_percent, self.agreement), "these steps lower it by"),
-            FeatureRow("Differences between points explained", _number(self.across), "correlation; 1: a parabola"),
-            FeatureRow("Pairs of points between which it curves upwards", _percent(self.convex), "100 %: convex"),
+            FeatureRow(
+                "Decrease, of the gradient's prediction", _several(_percent, self.agreement), "by the same steps"
+            ),
+            FeatureRow("Loss differences explained by gradients", _number(self.across), "correlation; 1: a parabola"),
+            FeatureRow("Pairs of points with upward curvature", _percent(self.convex), "100 %: convex"),
             FeatureRow("Gradients point one way", _number(self.coherence), "length of their mean direction"),
-            FeatureRow("Steepest by median gradient", _number(self.steepest), "powers of ten"),
-            FeatureRow("Noise", _percent(self.noise), "losses repeated, of their spread"),
-            FeatureRow("A linear, a quadratic model explain", _several(_percent, (self.linear, self.quadratic)), "R2"),
+            FeatureRow("Steepest over median gradient", _number(self.steepest), "powers of ten"),
+            FeatureRow("Noise", _percent(self.noise), "of repeated losses, relative to their spread"),
+            FeatureRow(
+                "Explained by a linear, a quadratic model", _several(_percent, (self.linear, self.quadratic)), "R2"
+            ),
             FeatureRow("Dispersion of the best quarter", _number(self.dispersion), "1 scattered, 0 together"),
             FeatureRow("Information content", _number(self.information), "0 level, 1 rugged"),
             FeatureRow("Fitness-distance correlation", _number(self.distance), "1: a cone"),
@@ -88,9 +92,9 @@ class Character:
 
 @dataclass(frozen=True)
 class CharacterSample:
-    """The points of the unit cube that a character is measured at: some with gradients, then others by these.
+    """The points of the unit cube for measuring a character: some with gradients, then others that depend on these.
 
-    The `first` are with gradients. The `others`, with losses, are steps down some of the gradients, two points again,
+    The `first` have gradients. The `others`, with losses, are steps down some of the gradients, two repeated points,
     and points that continue the Sobol' sequence of the first ones.
     """
 
@@ -105,7 +109,7 @@ class CharacterSample:
 
     @property
     def stepped(self) -> int:
-        """The number of points that are stepped from: half of the losses are at the ends of steps."""
+        """The number of points from which steps start: half of the losses are at the ends of steps."""
         return (self.evaluations - self.gradients - REPEATED) // (2 * len(STEPS))
 
     @cached_property
@@ -121,7 +125,7 @@ class CharacterSample:
         return self.spread[: self.gradients]
 
     def ends(self, slopes: Array) -> Array:
-        """Return where steps end, shape (step, point, dim): down gradients, or anywhere where there is none."""
+        """Return the ends of steps, shape (step, point, dim): down gradients, or in any direction without one."""
         drawn = np.random.default_rng(self.seed).standard_normal((self.stepped, self.dim))
         ways = slopes[: self.stepped]
         largest = np.abs(ways).max(axis=1, keepdims=True)
@@ -133,14 +137,14 @@ class CharacterSample:
         return found
 
     def others(self, slopes: Array) -> Array:
-        """Return the points whose losses are needed, given gradients at the first ones by sides of the box."""
+        """Return the points whose losses are needed, from gradients at the first ones by sides of the box."""
         ends = self.ends(slopes).reshape(-1, self.dim)
         return np.concatenate([ends, self.first[:REPEATED], self.spread[self.gradients :]])
 
     def measure(self, loss: Array, slopes: Array, others: Array) -> Character:
-        """Measure the character by losses and slopes at the first points, and losses at the others.
+        """Measure the character from losses and gradients at the first points, and losses at the others.
 
-        What is not finite is missing. Slopes are by sides of the box.
+        Values that are not finite are missing. Gradients are by sides of the box.
         """
         largest = np.abs(np.concatenate([loss, others])).max(
             initial=0.0, where=np.isfinite(np.concatenate([loss, others]))
@@ -174,7 +178,7 @@ class CharacterSample:
         )
 
     def _steps(self, loss: Array, slopes: Array, ends: Array) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        """Return by step the share of losses that fall, and the median of how much of the promise is kept."""
+        """Return by step the share of losses that fall, and the median of the decrease over its prediction."""
         start = self.first[: self.stepped]
         promised = ((self.ends(slopes) - start) * slopes[: self.stepped]).sum(axis=2)
         change = ends - loss[: self.stepped]
@@ -188,7 +192,7 @@ class CharacterSample:
 
 
 def _pairs(x: Array, loss: Array, slopes: Array) -> tuple[float, float]:
-    """Return how differences of losses agree with those of gradients, and the share of pairs whose gradients grow."""
+    """Return the agreement of loss differences with those of gradients, and the share of pairs whose gradients grow."""
     i, j = np.triu_indices(len(x), 1)
     if len(i) < MIN_LOSSES:
         return math.nan, math.nan
@@ -209,9 +213,9 @@ def _explore(x: Array, y: Array) -> dict[str, float]:
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """Hold a character, the points that it was measured at, and their losses, NaN where there is none.
+    """A character, its points, and their losses, NaN where there is none.
 
-    `gradient_cost` is about what a point with gradient took, in points without: NaN where programs were compiled.
+    `gradient_cost` is about the cost of a point with gradient, in points without: NaN where programs were compiled.
     """
 
     character: Character
@@ -221,7 +225,7 @@ class Measured:
 
 
 def measure_character(objective: Objective, *, evaluations: int, seed: int = 0) -> Measured:
-    """Evaluate an objective at exactly so many points, a quarter of them with gradients, and measure its character.
+    """Evaluate an objective at exactly this many points, a quarter of them with gradients, and measure its character.
 
     The first point is evaluated alone: it raises ValueError where the objective has no gradients.
     """

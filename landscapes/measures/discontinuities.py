@@ -1,17 +1,17 @@
-"""Discontinuities of a loss: jumps between neighbouring samples that do not vanish on a finer look.
+"""Discontinuities of a loss: jumps between neighbouring samples that remain at a finer resolution.
 
-A jump counts from a fixed part of the range on, whatever the samples are. Its trace is a difference between two
-neighbours that neither their gradients nor the differences around it explain. Every line of a slice, row or column, is
-in one of three states before anything is evaluated or drawn:
+A jump counts from a fixed part of the range, whatever the resolution. Its trace is a difference between two neighbours
+that neither their gradients nor the differences around it explain. Every line of a slice, row or column, is in one of
+three states before anything is evaluated or drawn:
 
-- it has no trace of half a jump: the samples clear it;
-- its strongest trace is among the strongest of the slice, which are looked into, and is a jump;
-- neither: some of these lines are drawn at random. That gives the interval of the share of lines that cross a jump and,
-  where none is found in all traces of the lines that are drawn, the power of the search.
+- It has no trace of half a jump: the samples clear it.
+- Its strongest trace is among the strongest of the slice, which are examined, and is a jump.
+- Neither. Some of these lines are drawn at random. That gives the interval of the share of lines that cross a jump.
+  If no trace of the drawn lines is a jump, it gives the power of the search.
 
-A trace is bisected towards the larger unexplained difference: a jump keeps its height, a slope loses half of it every
-time. What is left must be apart by more than the losses on either side of it vary among themselves, so that neither
-noise nor a fractal surface jumps.
+A trace is bisected towards the larger unexplained difference: a jump keeps its height, a slope loses half of it each
+time. The remaining difference must exceed the variation of the losses on either side, so that neither noise nor a
+fractal surface jumps.
 """
 
 from __future__ import annotations
@@ -48,9 +48,9 @@ Count = Callable[[Tensor], Mapping[str, Tensor]]
 
 @dataclass(frozen=True)
 class Jump:
-    """Hold where a jump is [plane units] and its height [loss unit].
+    """The position of a jump [plane units] and its height [loss unit].
 
-    `event` says whether some event happens more or less often on its other side, None where the objective counts none.
+    `event`: whether some event happens more or less often on its other side, None where the objective counts none.
     """
 
     place: tuple[float, ...]
@@ -60,12 +60,13 @@ class Jump:
 
 @dataclass(frozen=True)
 class Jumps:
-    """Hold the jumps of a slice that were `found`, the highest first, and how many of its lines cross one.
+    """The jumps `found` in a slice, the highest first, and how many of its lines cross one.
 
     A jump is at least `least` high [loss unit], and the losses have a `range`. Of the slice's `lines`, its rows and
-    columns, `crossed` cross a found jump. So many are `settled` without chance, by the samples or by their strongest
-    traces. Of the others `drawn` were drawn at random: `hit` of these cross a jump, and `clear` have none. In all
-    `checked` pairs of neighbours were looked into, of which `undecided` could not be, as an evaluation there failed.
+    columns, `crossed` cross a found jump. `settled` lines are decided without chance, by the samples or by their
+    strongest traces. Of the others, `drawn` were drawn at random: `hit` of these cross a jump, and `clear` have none.
+    In total `checked` pairs of neighbours were examined; `undecided` of them could not be, because an evaluation failed
+    there.
     """
 
     derived: ClassVar = ("share", "unseen", "largest", "explained_by_events", "sentence")
@@ -85,7 +86,7 @@ class Jumps:
 
     @property
     def share(self) -> Estimate:
-        """Share of the lines that cross a jump; drawn lines that are neither hit nor clear may or may not."""
+        """Share of the lines that cross a jump; drawn lines that are neither hit nor clear are undecided."""
         if not self.lines:
             return UNKNOWN
         others, most = self.lines - self.settled, self.drawn - self.clear
@@ -101,7 +102,7 @@ class Jumps:
 
     @property
     def unseen(self) -> float:
-        """Share of the lines that could have a jump though none was found: a one-sided 95 % bound."""
+        """Share of the lines that could have a jump although none was found: a one-sided 95 % bound."""
         if not self.lines or self.crossed:
             return math.nan
         others, unknown = self.lines - self.settled, self.drawn - self.clear
@@ -116,13 +117,13 @@ class Jumps:
 
     @property
     def explained_by_events(self) -> Estimate | None:
-        """Share of the jumps across which an event is counted differently, None where there is no jump or no event."""
+        """Share of the jumps across which an event count changes, None where there is no jump or no event."""
         explained = [jump.event for jump in self.found]
         return share(sum(map(bool, explained)), len(explained)) if explained and None not in explained else None
 
     @property
     def sentence(self) -> str:
-        """Say how high jumps are and how many lines cross one, or how many could have one that was not found."""
+        """Give the height of jumps and the share of lines that cross one, or that could have an undetected one."""
         if not self.found:
             part = self.least / self.range if self.range > 0 else math.inf
             said = f"none of {_percent(part)} of the range or more" if part < 1 else "none above the noise"
@@ -147,11 +148,11 @@ def find_jumps(
     seed: int = 0,
     events: Count | None = None,
 ) -> list[Jumps]:
-    """Look for jumps between neighbouring samples of slices, by new evaluations; those of all slices are in one batch.
+    """Search for jumps between neighbouring samples of slices, by new evaluations of all slices in one batch.
 
-    A jump is `LEAST` of its slice's range or more, and no less than the slice's floor in `least` [loss unit], by
-    default 0. At most `most` pairs of a slice are looked into: first those with the strongest traces, then those of
-    lines that are drawn at random.
+    A jump is at least `LEAST` of its slice's range, and at least the slice's floor in `least` [loss unit], by default
+    0. At most `most` pairs of a slice are examined: first those with the strongest traces, then those of lines drawn at
+    random.
     """
     floors = [0.0] * len(datasets) if least is None else least
     slices = [_Search(*one, most, seed) for one in zip(datasets, floors, strict=True)]
@@ -164,10 +165,10 @@ UNSEEN, FAILED, NO_JUMP, JUMP = range(4)  # what is known of a trace
 
 
 class _Search:
-    """Keep what is known of the traces of jumps in a slice: pairs of neighbours whose difference is not explained.
+    """The traces of jumps in a slice: pairs of neighbours with an unexplained difference.
 
-    `ends` are their places [plane units], shape (trace, end, rank), `trend` is what explains a part of their difference
-    [loss unit], `line` the number of the row or column that they are on. The strongest come first.
+    `ends` are their positions [plane units], shape (trace, end, rank), `trend` is the explained part of their
+    difference [loss unit], `line` the number of their row or column. The strongest come first.
     """
 
     def __init__(self, dataset: xr.Dataset, floor: float, most: int, seed: int) -> None:
@@ -207,10 +208,10 @@ class _Search:
         return self._first(np.arange(len(self.line)), self.most if whole else round(GUIDED * self.most))
 
     def draw(self) -> NDArray[np.intp]:
-        """Draw lines that are not settled, and return the pairs to look into there.
+        """Draw undecided lines, and return the pairs to examine there.
 
-        Where jumps were found, that is the strongest trace of as many lines as possible, since it will be another one;
-        else it is all traces of fewer lines.
+        If jumps were found, that is the strongest trace of as many lines as possible, because it will be another jump.
+        Otherwise it is all traces of fewer lines.
         """
         unseen = self.state == UNSEEN
         pending = np.unique(self.line[unseen | (self.state == FAILED)])
@@ -224,7 +225,7 @@ class _Search:
         return np.sort(self.generator.permutation(np.flatnonzero(unseen))[:left])  # no line fits: traces at random
 
     def _first(self, pairs: NDArray[np.intp], most: int) -> NDArray[np.intp]:
-        """Return so many pairs: the strongest of each line, then the second of each, and so on."""
+        """Return this many pairs: the strongest of each line, then the second of each, and so on."""
         place = np.zeros(len(pairs), int)
         by_line = np.argsort(self.line[pairs], kind="stable")
         starts = np.flatnonzero(np.diff(self.line[pairs][by_line], prepend=-1))
@@ -232,7 +233,7 @@ class _Search:
         return pairs[np.sort(np.argsort(place, kind="stable")[:most])]
 
     def conclude(self, events: Count | None) -> Jumps:
-        """Return the jumps that were found, and what is known of the lines."""
+        """Return the found jumps, and the states of the lines."""
         found = np.flatnonzero(self.state == JUMP)
         found = found[np.argsort(-self.height[found], kind="stable")]
         low, high = (torch.from_numpy(one[found]) for one in (self.low, self.high))
@@ -258,10 +259,10 @@ class _Search:
 
 
 def _trend(difference: Float[Values, "line step"], slope: Float[Values, "line sample"] | None) -> Values:
-    """Return what explains differences along lines: the gradients around, or else the median difference around.
+    """Return the explained differences along lines: by the gradients around, or else by the median difference around.
 
-    `slope` is the derivative by a step. It explains by the trapezoid of both ends or by the cubic through four samples,
-    whichever is nearer, unless it says more than twice what the losses do here and around.
+    `slope` is the derivative by a step. The prediction is the trapezoid of both ends or the cubic through four samples,
+    whichever is nearer, unless it exceeds twice the change of the losses here and around.
     """
     padded, count = np.pad(difference, ((0, 0), (2, 2)), constant_values=np.nan), difference.shape[1]
     around = np.sort(np.stack([padded[:, 2 + off : 2 + off + count] for off in AROUND]), axis=0)  # NaN comes last
@@ -289,9 +290,9 @@ def _integrals(slope: Float[Values, "line sample"]) -> tuple[Values, Values]:
 
 
 def _look(objective: Objective, slices: Sequence[_Search], chosen: Sequence[NDArray[np.intp]]) -> None:
-    """Look into pairs of all slices, given by their numbers: bisect them, and compare both sides of what is left.
+    """Examine pairs of all slices, given by their numbers: bisect them, and compare both sides of the remaining step.
 
-    What became of a pair is kept by its slice: its last ends, its state and its height.
+    The results of a pair are stored in its slice: its last ends, its state and its height.
     """
     several = list(zip(slices, chosen, strict=True))
     owner = np.repeat(np.arange(len(slices)), [len(pairs) for pairs in chosen])
@@ -318,7 +319,7 @@ def _bisect(
 ) -> tuple[Values, Values, NDArray[np.bool_], NDArray[np.bool_]]:
     """Halve pairs towards the larger unexplained difference; return their last ends, which persist, which failed.
 
-    A pair is left where less than half a jump is in either half, or both change alike for the third time running: a
+    A pair is dropped if neither half has half a jump, or if both halves change alike for the third time in a row. A
     jump is in one of them, and only steps in a regular row are alike so often.
     """
     low, high = ends[:, 0], ends[:, 1]
@@ -339,7 +340,7 @@ def _bisect(
 
 
 class _Batch:
-    """Evaluate places of pairs on several planes in one batch, and count them by plane.
+    """Evaluate positions of pairs on several planes in one batch, and count them by plane.
 
     `owner` is the number of each pair's plane, ascending.
     """

@@ -1,7 +1,7 @@
-"""Exploratory landscape features of a sample over all parameters, as pflacco (Prager & Trautmann 2024) defines them.
+"""Exploratory landscape features of a sample over all parameters, as defined by pflacco (Prager & Trautmann 2024).
 
 A feature takes points `x`, shape (point, dim), and losses `y`, shape (point,), both finite. It is NaN where the sample
-does not determine it. Fields are called as pflacco calls features, with underscores for dots.
+does not determine it. Fields have pflacco's names of features, with underscores for dots.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ GROUPS = 10  # that are left out in turn, for intervals
 
 @dataclass(frozen=True)
 class MetaModels:
-    """Adjusted R2 of least squares models, and their coefficients without sign (Mersmann et al. 2011).
+    """Adjusted R2 of least squares models, and the magnitudes of their coefficients (Mersmann et al. 2011).
 
     `lin_w_interact` has products of two parameters. `quad_simple` has squares. `quad_w_interact` has the products of
     any two of the parameters and of their squares, so also cubic terms. `quad_simple_cond` is the largest coefficient
@@ -65,7 +65,7 @@ class MetaModels:
 
     @staticmethod
     def coefficients(dim: int) -> tuple[int, int, int, int]:
-        """Return how many coefficients each model has without its intercept, the simplest first."""
+        """Return the number of coefficients of each model without its intercept, the simplest first."""
         return dim, dim + dim * (dim - 1) // 2, 2 * dim, 2 * dim + dim * (2 * dim - 1)
 
 
@@ -104,11 +104,11 @@ class Dispersion:
 
 @dataclass(frozen=True)
 class InformationContent:
-    """Entropy of ups and downs along a tour from each point to the nearest one left (Munoz et al. 2015).
+    """Entropy of ups and downs along a tour from each point to the nearest remaining one (Munoz et al. 2015).
 
-    `h_max` is the largest entropy over the sizes from which on a slope counts, and `eps_max` that size. From `eps_s` on
-    (log10) the entropy is below 0.05. `m0` is the share of steps that turn back, and `eps_ratio` (log10) the largest
-    size with more than half of that.
+    `h_max` is the largest entropy over the thresholds above which a slope counts, and `eps_max` that threshold. From
+    `eps_s` on (log10) the entropy is below 0.05. `m0` is the share of steps that turn back, and `eps_ratio` (log10) the
+    largest threshold with more than half of that.
     """
 
     h_max: float
@@ -164,10 +164,10 @@ class NearestBetter:
 
 @dataclass(frozen=True)
 class LossDistribution:
-    """Skewness and excess kurtosis of the losses, and how many peaks of their density hold 1 % or more of them.
+    """Skewness and excess kurtosis of the losses, and the number of peaks of their density with 1 % or more of them.
 
-    pflacco adds the width of a peak to the mean density in it, where the product is the share of the losses. So
-    `number_of_peaks` is another number there.
+    pflacco adds the width of a peak to its mean density, where their product is the share of the losses. So
+    `number_of_peaks` differs from pflacco's.
     """
 
     skewness: float
@@ -187,7 +187,7 @@ class LossDistribution:
 class LevelSets:
     """Share of points that linear and quadratic discriminants put on the wrong side of a quantile of the losses.
 
-    Held out by tenths (Mersmann et al. 2011), below 10, 25 and 50 %.
+    Cross-validated in ten parts (Mersmann et al. 2011), below 10, 25 and 50 %.
     """
 
     mmce_lda_10: float
@@ -214,8 +214,8 @@ class LevelSets:
 class FitnessDistance:
     """Losses against distances from the best point (Jones & Forrest 1995): 1 for a cone.
 
-    pflacco divides the covariance by n and the deviations by n - 1, so its correlations are short by (n - 1)/n, and
-    its covariances as well.
+    pflacco divides the covariance by n and the deviations by n - 1, so its correlations and covariances are smaller by
+    (n - 1)/n.
     """
 
     fd_correlation: float
@@ -242,7 +242,7 @@ class FitnessDistance:
 
 @dataclass(frozen=True)
 class PrincipalComponents:
-    """Share of the components that explain 90 % of the variance, and of the variance that the first one explains.
+    """Share of the components that explain 90 % of the variance, and the variance explained by the first one.
 
     Of the points (`x`), and of points with their losses (`init`), by covariances and by correlations.
     """
@@ -304,7 +304,7 @@ class Exploratory:
 
     @classmethod
     def reach(cls, x: Array, y: Array) -> Exploratory:
-        """Return how far the 95 % interval of each feature reaches on either side.
+        """Return the half-width of the 95 % interval of each feature.
 
         Delete-a-group jackknife over ten groups of points, with Student's distribution. NaN where fewer points do not
         determine a feature.
@@ -380,9 +380,9 @@ def _middle(distances: Array, middle: Callable[[Array], Any]) -> float:
 
 
 def walk_information(distances: Array, y: Array, unit: float = 1.0) -> tuple[Array, Array]:
-    """Return entropy and share of turns of a walk by the sizes from which on a slope counts, shapes (size,) of `SIZES`.
+    """Return entropy and share of turns of a walk by the threshold for slopes, shapes (size,) of `SIZES`.
 
-    Losses count in a `unit`. The walk goes from the first point on to the nearest of those left each time (Munoz et al.
+    Losses count in a `unit`. From the first point, the walk always goes to the nearest remaining one (Munoz et al.
     2015, eqs. 6 to 10).
     """
     left, order = np.ones(len(y), bool), [0]
@@ -410,7 +410,7 @@ def _information(signs: NDArray[np.int8]) -> tuple[float, float]:
 
 
 def _peaks(y: Array) -> int:
-    """Count the peaks of the density of losses that hold 1 % or more of them."""
+    """Count the peaks of the density of losses that contain 1 % or more of them."""
     from scipy.stats import gaussian_kde
 
     kernel = gaussian_kde(y)
@@ -423,7 +423,7 @@ def _peaks(y: Array) -> int:
 
 
 def _misclassified(x: Array, low: NDArray[np.bool_]) -> tuple[float, float]:
-    """Return the share of points in the wrong class by linear and by quadratic discriminants, held out by tenths."""
+    """Return the share of points in the wrong class by linear and quadratic discriminants, in ten held-out parts."""
     if min(low.sum(), (~low).sum()) < FOLDS:
         return math.nan, math.nan
     x, fold, wrong = x - x.mean(axis=0), _stratify(low), list[tuple[float, float]]()
@@ -444,9 +444,9 @@ def _misclassified(x: Array, low: NDArray[np.bool_]) -> tuple[float, float]:
 
 
 def _stratify(low: NDArray[np.bool_]) -> NDArray[np.int_]:
-    """Return the fold of each point, of equal shares of both classes, each in its order.
+    """Return the fold of each point, with equal shares of both classes, each in its order.
 
-    The class of the first point is dealt out first, as scikit-learn does.
+    The class of the first point is dealt out first, as in scikit-learn.
     """
     first = low == low[0]
     order = np.sort(~first)

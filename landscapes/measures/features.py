@@ -1,4 +1,4 @@
-"""Landscape features over all parameters of an objective: the exploratory ones, and those that gradients give."""
+"""Landscape features over all parameters of an objective: exploratory ones, and those from gradients."""
 
 from __future__ import annotations
 
@@ -32,8 +32,9 @@ UNDETERMINED, UNRESOLVED, WORTHLESS = "not determined", "not resolved", -100.0  
 class ActiveSubspace:
     """Eigenvalues of the mean of grad grad^T in sides of the box (Constantine, Dow & Wang 2014).
 
-    `shares` are the largest ones, of their sum. `participation` is (sum)^2 / sum of squares: how many directions count.
-    `directions` are as many as hold 95 % of the sum. `leading` has the largest components of the first eigenvector.
+    `shares` are the largest ones, relative to their sum. `participation` is (sum)^2 / sum of squares: how many
+    directions matter. `directions` is the number that has 95 % of the sum. `leading` has the largest components of the
+    first eigenvector.
     """
 
     gradients: int
@@ -48,8 +49,8 @@ class SobolIndices:
     """Shares of the variance by each parameter alone (`first`) and with all its interactions (`total`).
 
     Estimators of Saltelli et al. 2010 and of Jansen 1999 at `points` base points, each with every parameter varied.
-    `bound` is what gradients allow the total at most (Sobol' & Kucherenko 2009). `interaction` is 1 less the sum of
-    `first`. `failed` counts the points without a loss.
+    `bound` is the upper bound of the total from gradients (Sobol' & Kucherenko 2009). `interaction` is 1 minus the sum
+    of `first`. `failed` counts the points without a loss.
     """
 
     points: int
@@ -61,12 +62,12 @@ class SobolIndices:
 
     @property
     def unexplained(self) -> list[str]:
-        """The parameters whose total index is above what gradients allow, both intervals considered."""
+        """The parameters whose total index exceeds the bound from gradients, both intervals considered."""
         return [name for name, total in self.total.items() if name in self.bound and total.low > self.bound[name].high]
 
 
 class FeatureRow(NamedTuple):
-    """A feature as a table has it: what it is called, its value, and what that means."""
+    """A feature in a table: its name, its value, and its meaning."""
 
     name: str
     value: str
@@ -75,10 +76,10 @@ class FeatureRow(NamedTuple):
 
 @dataclass(frozen=True)
 class Features:
-    """Features over all parameters, of `points` in the box, in sides of the box and in ranges of the sampled losses.
+    """Features over all parameters, from `points` in the box, in sides of the box and ranges of the sampled losses.
 
-    `why` says why nothing can be told, and is empty where something can. `reach` is half the width of the 95 % interval
-    of each exploratory feature. These and polynomials are of the first `measured` points alone.
+    `why` explains why there is no result, and is empty where there is one. `reach` is half the width of the 95 %
+    interval of each exploratory feature. These and polynomials use only the first `measured` points.
     """
 
     parameters: int
@@ -96,7 +97,7 @@ class Features:
     sobol: SobolIndices | None = None
 
     def rows(self) -> list[FeatureRow]:
-        """Return the chief features in words, with 95 % intervals."""
+        """Return the main features in words, with 95 % intervals."""
         said = f"{self.points} points, {self.failed} failed"
         rows = [FeatureRow("Sample", said, "scrambled Sobol' sequence over all parameters")]
         if self.why or self.exploratory is None or self.reach is None:
@@ -110,12 +111,12 @@ class Features:
 
 
 def effort(dim: int) -> tuple[int, int]:
-    """Return how many losses and how many gradients `measure_features` evaluates."""
+    """Return the numbers of losses and of gradients that `measure_features` evaluates."""
     return BASE * (dim + 2), POINTS * dim
 
 
 def need_of(dim: int) -> Need:
-    """Return what the points, their gradients and their distances take."""
+    """Return the memory of the points, their gradients and their distances."""
     points = POINTS * dim
     measured, blocks = min(points, MAX_POINTS), min(points, BLOCKS)
     terms = max(count for _, count in degrees_of(dim))
@@ -124,7 +125,7 @@ def need_of(dim: int) -> Need:
 
 
 def own_seconds(dim: int) -> float:
-    """Return about how many seconds `measure_features` takes itself (one core)."""
+    """Return the approximate time of `measure_features` itself in seconds (one core)."""
     n, times = min(POINTS * dim, MAX_POINTS), 1 + GROUPS
     polynomials = sum(50 * count**3 / 3 + 4 * n * count**2 for _, count in degrees_of(dim))
     models = sum(4 * n * count**2 for count in MetaModels.coefficients(dim) if count <= min(n - 2, MAX_COEFFICIENTS))
@@ -137,8 +138,8 @@ def measure_features(
 ) -> Features:
     """Sample an objective over its box, and measure its features.
 
-    `rounding` is the engine's relative precision. `follow` hears how many points are evaluated. Gradients that are
-    missing are left out, and features of gradients where fewer than 10 for each parameter are there.
+    `rounding` is the engine's relative precision. `follow` receives the number of evaluated points. Missing gradients
+    are left out, and so are features of gradients where there are fewer than 10 for each parameter.
     """
     space, dim = objective.space, objective.space.dim
     unit = sobol(POINTS * dim, dim, seed=seed)
@@ -170,11 +171,11 @@ def measure_features(
 
 
 def _refuse(y: Array, dim: int, rounding: float) -> str:
-    """Say why nothing can be told of losses; nothing where something can."""
+    """Explain why losses give no result; empty where they do."""
     if len(y) < LEAST * dim:
-        return f"{len(y)} points have a loss; {LEAST * dim} are needed, {LEAST} for each parameter"
+        return f"{len(y)} points have a loss; at least {LEAST * dim} are needed, {LEAST} for each parameter"
     if np.ptp(y) <= ROUNDINGS * rounding * np.abs(y).max():
-        return f"all losses are the same to rounding: {y.min():.6g} to {y.max():.6g}"
+        return f"all losses are equal up to rounding: {y.min():.6g} to {y.max():.6g}"
     return ""
 
 
@@ -185,7 +186,7 @@ def evaluate_parts(
     grad: bool,
     follow: Callable[[int], None] = lambda done: None,
 ) -> Evaluation:
-    """Evaluate an objective as many points at a time as it prefers; `follow` hears how many are done."""
+    """Evaluate an objective in its preferred batches; `follow` receives the number of finished points."""
     parts, done = list[Evaluation](), 0
     for rows in torch.split(x, objective.preferred_batch):
         parts.append(evaluate(objective, rows, grad=grad))
@@ -197,7 +198,7 @@ def evaluate_parts(
 
 
 def active_subspace(slopes: Array, names: Sequence[str], rng: np.random.Generator) -> ActiveSubspace:
-    """Decompose the mean of grad grad^T, of slopes of shape (point, dim), with bootstrap intervals over points."""
+    """Decompose the mean of grad grad^T, from gradients of shape (point, dim), with bootstrap intervals over points."""
     blocks = np.arange(len(slopes)) % min(len(slopes), BLOCKS)
     tables = np.stack([slopes[blocks == one].T @ slopes[blocks == one] for one in range(blocks.max() + 1)])
     sizes, vectors = np.linalg.eigh(tables.sum(axis=0))
@@ -218,7 +219,7 @@ def active_subspace(slopes: Array, names: Sequence[str], rng: np.random.Generato
 
 
 def _spectrum(sizes: Array) -> tuple[Array, float, float]:
-    """Return eigenvalues as shares, the largest first, their participation ratio, and how many make 95 %."""
+    """Return eigenvalues as shares, the largest first, their participation ratio, and the number that makes 95 %."""
     share = np.clip(sizes[::-1], 0, None) / np.clip(sizes, 0, None).sum()
     return share, float(1 / np.square(share).sum()), float((np.cumsum(share) < ENOUGH).sum() + 1)
 
@@ -247,7 +248,7 @@ def sobol_indices(
 ) -> SobolIndices:
     """Estimate Sobol' indices of losses, shapes (base,), (base,) and (base, dim), and bounds by `slopes`.
 
-    Intervals are a bootstrap over base points, of which those without all losses are left out.
+    Intervals are a bootstrap over base points with all losses.
     """
     failed = sum(int((~np.isfinite(one)).sum()) for one in (base, far, varied))
     there = np.isfinite(base) & np.isfinite(far) & np.isfinite(varied).all(axis=1)
@@ -276,7 +277,7 @@ def _indices(base: Array, far: Array, varied: Array) -> tuple[Array, Array]:
 
 
 def _bounds(slopes: Array, variance: float, names: Sequence[str], rng: np.random.Generator) -> dict[str, Estimate]:
-    """Return upper bounds of total indices: mean squares of slopes by pi^2 times the variance."""
+    """Return upper bounds of total indices: mean squares of gradients by pi^2 times the variance."""
     squares = np.square(slopes) / (math.pi**2 * variance)
     times = rng.multinomial(len(squares), np.full(len(squares), 1 / len(squares)), size=RESAMPLES)
     drawn = times @ squares / len(squares)
@@ -288,7 +289,7 @@ def _bounds(slopes: Array, variance: float, names: Sequence[str], rng: np.random
 
 @dataclass(frozen=True)
 class _Words:
-    """Write exploratory features with their intervals, each called like "ic.h_max"."""
+    """Write exploratory features with their intervals, each with a name like "ic.h_max"."""
 
     found: Exploratory
     reach: Exploratory
@@ -302,7 +303,7 @@ class _Words:
         return ", ".join(_percent(get(self.found), get(self.reach)) for get in map(attrgetter, names))
 
     def resolved(self, name: str) -> str:
-        """Write a ratio as a number, unless its interval reaches down to zero."""
+        """Write a ratio as a number, unless its interval includes zero."""
         value, reach = attrgetter(name)(self.found), attrgetter(name)(self.reach)
         return UNRESOLVED if reach >= value else self.number(name)
 
@@ -310,10 +311,10 @@ class _Words:
 def _model_rows(words: _Words, dim: int, points: int) -> list[FeatureRow]:
     counts = MetaModels.coefficients(dim)
     said = (
-        ("A linear model explains", "lin_simple", "losses lie on a plane"),
-        ("One with products of parameters explains", "lin_w_interact", "parameters interact in pairs"),
-        ("A quadratic model explains", "quad_simple", "a parabola for each parameter"),
-        ("One with all its products explains", "quad_w_interact", "squares interact, too"),
+        ("Explained by a linear model", "lin_simple", "losses lie on a plane"),
+        ("Explained with products of parameters", "lin_w_interact", "parameters interact in pairs"),
+        ("Explained by a quadratic model", "quad_simple", "a parabola for each parameter"),
+        ("Explained with all its products", "quad_w_interact", "squares interact, too"),
     )
     rows = []
     for (name, kind, meaning), count in zip(said, counts, strict=True):
@@ -323,15 +324,15 @@ def _model_rows(words: _Words, dim: int, points: int) -> list[FeatureRow]:
     steep, curved = words.resolved("ela_meta.lin_simple_coef_max_by_min"), words.resolved("ela_meta.quad_simple_cond")
     return [
         *rows,
-        FeatureRow("Steepest parameter by the least steep", steep, "in the linear model"),
-        FeatureRow("Most curved parameter by the least", curved, "in the quadratic model"),
+        FeatureRow("Steepest over least steep parameter", steep, "in the linear model"),
+        FeatureRow("Most over least curved parameter", curved, "in the quadratic model"),
     ]
 
 
 def _fitted_row(model: GradientModel) -> FeatureRow:
     kind = f"polynomial of degree {model.degree}{' without products' if model.separable else ''}"
     alone = f"held-out R2; from losses alone {_share(model.losses_alone)}; {model.coefficients} coefficients"
-    return FeatureRow(f"With gradients a {kind} explains", _share(model.with_gradients), alone)
+    return FeatureRow(f"Explained with gradients by a {kind}", _share(model.with_gradients), alone)
 
 
 def _subspace_rows(found: ActiveSubspace, dim: int) -> list[FeatureRow]:
@@ -367,23 +368,23 @@ def _distance_rows(words: _Words, points: int) -> list[FeatureRow]:
     entropy, turns = words.number("ic.h_max"), words.percent("ic.m0")
     return [
         FeatureRow("Dispersion of the best 2, 5, 10, 25 %", dispersion, f"1 scattered, 0 together; of {points} points"),
-        FeatureRow("Information content", entropy, "of steps to the nearest point left: 0 level, 1 rugged"),
+        FeatureRow("Information content", entropy, "of steps to the nearest remaining point: 0 level, 1 rugged"),
         FeatureRow("Steps that turn back", turns, "of the same steps"),
-        FeatureRow("Nearest point by nearest better", better, "mean distances; small: better points are far away"),
-        FeatureRow("Loss and how many it attracts", attracted, "correlation; near -1: one funnel"),
+        FeatureRow("Nearest over nearest better point", better, "mean distances; small: better points are far away"),
+        FeatureRow("Loss and number of points it attracts", attracted, "correlation; near -1: one funnel"),
     ]
 
 
 def _loss_rows(words: _Words) -> list[FeatureRow]:
     plane, quadric = (words.percent(*(f"ela_level.mmce_{kind}_{q}" for q in (10, 25, 50))) for kind in ("lda", "qda"))
     best = f"1: a cone; of the best 10 %: {words.number('fitness_distance.fd_correlation')}"
-    alone = f"of the variance, by correlations; of points alone {words.percent('pca.expl_var_pc1_cor_x')}"
+    alone = f"of the variance, by correlations; of the points alone {words.percent('pca.expl_var_pc1_cor_x')}"
     peaks = f"{words.found.ela_distr.number_of_peaks:.0f}"
     return [
         FeatureRow("Skewness of the losses", words.number("ela_distr.skewness"), "above 0: few high losses"),
         FeatureRow("Excess kurtosis", words.number("ela_distr.kurtosis"), "0: normal; above: far outliers"),
         FeatureRow("Peaks of their density", peaks, "above 1: plateaus or levels"),
-        FeatureRow("Wrong side of a plane", plane, "points below the 10, 25, 50 % quantile; a guess: 10, 25, 50 %"),
+        FeatureRow("Wrong side of a plane", plane, "points below the 10, 25, 50 % quantile; by chance: 10, 25, 50 %"),
         FeatureRow("Wrong side of a quadric", quadric, "the same, by quadratic discriminants"),
         FeatureRow("Fitness-distance correlation", words.number("fitness_distance_all.fd_correlation"), best),
         FeatureRow("First component of points and losses", words.percent("pca.expl_var_pc1_cor_init"), alone),
@@ -412,6 +413,6 @@ def _estimate(estimate: Estimate, form: str = "{:.1f}") -> str:
     if not math.isfinite(estimate.value):
         return UNDETERMINED
     if form.endswith("%") and estimate.high < WORTHLESS:
-        return "nothing: the mean is closer"
+        return "nothing: the mean predicts better"
     value, low, high = (form.format(one).replace("-", "\N{MINUS SIGN}") for one in vars(estimate).values())
     return f"{value} ({low.removesuffix(' %')} to {high})"

@@ -1,7 +1,7 @@
-"""The numerical floor: how far losses and gradients move where only the numerics change, and the physics does not.
+"""The numerical floor: the change of losses and gradients when only the numerics change, not the physics.
 
-An objective names its replicas, `Objective.replicas`: the grid shifted by a part of a cell, other particles, the
-mirrored scene. What differs between them is no feature of the landscape, so no measure counts anything below it.
+An objective has replicas, `Objective.replicas`: the grid shifted by a part of a cell, other particles, the mirrored
+scene. Differences between them are no features of the landscape, so no measure counts anything below them.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ RESAMPLES = 999  # of the bootstrap
 
 @dataclass(frozen=True)
 class Floor:
-    """Hold how far replicas of an objective are apart at some points.
+    """The differences between replicas of an objective at some points.
 
-    `names` are the replicas; `points` is how many points all of them have a loss at, `failed` how many were left out.
-    `deviation` [loss unit] is the root mean square, over points, of the standard deviation between the original and
-    its replicas; `range` [loss unit] is what it is held against, and `share` = deviation / range. `cosine` is the
-    median cosine of the replicas' gradients with the original's, per width of the box; None without gradients.
-    Intervals are NaN below four points.
+    `names` are the replicas; `points` is the number of points where all of them have a loss, `failed` the number left
+    out. `deviation` [loss unit] is the root mean square, over points, of the standard deviation between the original
+    and its replicas. `range` [loss unit] is its reference, and `share` = deviation / range. `cosine` is the median
+    cosine of the replicas' gradients with the original's, per width of the box; None without gradients. Intervals are
+    NaN below four points.
     """
 
     names: tuple[str, ...]
@@ -52,16 +52,16 @@ class Floor:
 
 
 def format_cosine(cosine: float) -> str:
-    """Return a cosine with two decimals, and with three where two would make it 1."""
+    """Return a cosine with two decimals, or three where two would round it to 1."""
     return f"{cosine:z.2f}" if abs(cosine) < 0.995 else f"{cosine:z.3f}"
 
 
 def evaluate_replicas(
     objective: Objective, x: Float[Tensor, "points dim"], replicas: Mapping[str, Objective], *, grad: bool
 ) -> dict[str, Evaluation]:
-    """Evaluate each replica of an objective at points, one at a time in memory.
+    """Evaluate each replica of an objective at points, with one replica in memory at a time.
 
-    Raises ValueError where a replica has another space, and what `evaluate` does.
+    Raises ValueError where a replica has another space, and any error of `evaluate`.
     """
     found = {}
     objective.release()
@@ -73,7 +73,7 @@ def evaluate_replicas(
 
 
 def refuse_other_space(objective: Objective, name: str, replica: Objective) -> None:
-    """Raise ValueError where a replica does not take the points of the objective."""
+    """Raise ValueError where a replica has other parameters than the objective."""
     if replica.space.names != objective.space.names:
         raise ValueError(
             f"{objective.name}'s replica {name!r} must take the same parameters, {', '.join(objective.space.names)}; "
@@ -89,14 +89,16 @@ def floor_between(
     range: float | None = None,
     seed: int = 0,
 ) -> Floor:
-    """Measure how far apart evaluations of an objective and its replicas at the same points are.
+    """Measure the differences between evaluations of an objective and its replicas at the same points.
 
-    `sides` are the widths of the box, by which gradients are scaled before their cosine is taken. `range` [loss unit]
-    is by default that of the losses. Raises ValueError where a replica was evaluated at another number of points.
+    `sides` are the widths of the box, which scale gradients before their cosine is taken. `range` [loss unit] is by
+    default that of the losses. Raises ValueError where a replica was evaluated at another number of points.
     """
     for name, found in replicas.items():
         if len(found.loss) != len(own.loss):
-            raise ValueError(f"the replica {name!r} has {len(found.loss)} points, and the objective {len(own.loss)}")
+            raise ValueError(
+                f"the replica {name!r} has {len(found.loss)} points, but the objective has {len(own.loss)}"
+            )
     apart = point_deviations(own, replicas).numpy()
     apart = apart[np.isfinite(apart)]
     if range is None:
@@ -110,7 +112,7 @@ def floor_between(
 
 
 def point_deviations(own: Evaluation, replicas: Mapping[str, Evaluation]) -> Float[Tensor, " points"]:
-    """Return the standard deviation between an objective and its replicas at each point, NaN where one has no loss."""
+    """Return the standard deviation between an objective and its replicas at each point, NaN without all losses."""
     losses = torch.stack([own.loss, *(found.loss for found in replicas.values())]).double()
     return (losses - losses[0]).std(dim=0)  # of differences, so that those of losses that agree are exactly 0
 
@@ -126,10 +128,10 @@ def replica_cosines(own: Evaluation, replica: Evaluation, sides: Float[Tensor, "
 
 
 def _pooled_deviation(apart: Values, freedom: int) -> Estimate:
-    """Return the root mean square of standard deviations, each with so many degrees of freedom.
+    """Return the root mean square of standard deviations, each with this many degrees of freedom.
 
-    Its interval is that of a scaled chi-square whose freedom fits the variances' own spread (Satterthwaite 1946), which
-    holds more often than a bootstrap where points are few and unequal.
+    Its interval is that of a scaled chi-square whose degrees of freedom fit the spread of the variances (Satterthwaite
+    1946). It covers the true value more often than a bootstrap where points are few and unequal.
     """
     if not len(apart):
         return UNKNOWN

@@ -1,8 +1,8 @@
-"""How gradients follow a landscape at fixed scales: parts of the box, whatever the samples of a slice are.
+"""How gradients follow a landscape at fixed scales: parts of the box, independent of a slice's samples.
 
-At random points of the plane the gradient is held against central differences over each scale. A scale at which the
-loss has no slope above the noise at a point does not count there. Gradients of zero have no direction and are counted
-apart, as are those that are missing, exploding, or biased.
+At random points of the plane, the gradient is compared with central differences over each scale. A point does not count
+at a scale where the loss has no slope above the noise. Zero gradients have no direction and are counted separately, as
+are missing, exploding and biased ones.
 """
 
 from __future__ import annotations
@@ -46,11 +46,11 @@ NEAR = 2  # times a scale, or its part, that differences of samples may be over 
 
 @dataclass(frozen=True)
 class ScaleCosine:
-    """Hold how gradients follow differences over one `scale`, a part of the box.
+    """How gradients follow differences over one `scale`, a part of the box.
 
-    `width` is the part that the differences are really over, which the samples of a stored slice decide. Of `of` points
-    that have a gradient and show a slope above the noise, `points` have one that is not zero. Of these are the mean
-    `cosine` of the two, its three `quartiles`, and the share that is `uphill` (below zero).
+    `width` is the actual part of the differences, which depends on the samples of a stored slice. `of` points have a
+    gradient and a slope above the noise; at `points` of these the gradient is not zero. Over these are the mean
+    `cosine` of the two, its three `quartiles`, and the share that is `uphill` (cosine below zero).
     """
 
     derived: ClassVar = ("grade",)
@@ -76,7 +76,7 @@ class ScaleCosine:
         return NOT if high < FOLLOWS_LOOSELY else None
 
     def describe(self) -> str:
-        """Say what the mean cosine is, and its grade."""
+        """Describe the mean cosine and its grade."""
         if not self.points:
             return "all gradients zero" if self.of else "no slope above the noise"
         value, low, high = (f"{one:z.2f}" for one in (self.cosine.value, self.cosine.low, self.cosine.high))
@@ -86,10 +86,10 @@ class ScaleCosine:
 
 @dataclass(frozen=True)
 class Following:
-    """Hold how gradients follow the landscape at several `scales`, and where they are of no use.
+    """How gradients follow the landscape at several `scales`, and where they are useless.
 
-    Shares are of `points`, NaN where they are not known: of those with a loss, the gradient is `missing`; of those with
-    a gradient, it is `zero`, or `exploding`; of some more closely looked at, its mean over a Gaussian is `biased`.
+    Shares are of `points`, NaN where unknown. Of those with a loss, the gradient is `missing`; of those with a
+    gradient, it is `zero`, or `exploding`; of some that are examined further, its mean over a Gaussian is `biased`.
     """
 
     derived: ClassVar = ("stuck", "words", "reasons", "sentence")
@@ -102,12 +102,12 @@ class Following:
     biased: Estimate
 
     def at(self, scale: float) -> ScaleCosine | None:
-        """Return how gradients follow over one of `SCALES`, None where the samples do not allow it."""
+        """Return the result at one of `SCALES`, None where the samples do not allow it."""
         return next((one for one in self.scales if one.scale == scale), None)
 
     @property
     def stuck(self) -> Estimate:
-        """Share of gradients that are zero nevertheless among the points that show a slope over 1 % of the box."""
+        """Share of gradients that are zero among the points that have a slope over 1 % of the box."""
         chief = self.at(CHIEF)
         return UNKNOWN if chief is None else share(chief.of - chief.points, chief.of)
 
@@ -119,14 +119,14 @@ class Following:
 
     @property
     def reasons(self) -> dict[str, str]:
-        """Each word with the measure that it comes from.
+        """Each word with its measure.
 
-        Shares are worth a word where their whole interval says so. What is missing or stuck at zero does not follow.
-        Whether means are biased is no news of gradients that are zero, opposite or exploding.
+        A share gives a word only if its whole interval supports it. Gradients that are missing or zero do not follow.
+        Bias is not mentioned for gradients that are zero, opposite or exploding.
         """
         reasons, chief = dict[str, str](), self.at(CHIEF)
         if self.missing.low > NOTABLE:
-            reasons[MISSING] = f"no gradient at {_share(self.missing)} of the points that have a loss"
+            reasons[MISSING] = f"no gradient at {_share(self.missing)} of the points with a loss"
         if self.zero.low > NOTABLE:
             beside = f", and at {_share(self.stuck)} of those with a slope over 1 %" if self.stuck.value > 0 else ""
             reasons[ZERO] = f"zero at {_share(self.zero)} of the points{beside}"
@@ -145,7 +145,7 @@ class Following:
 
     @property
     def undecided(self) -> frozenset[str]:
-        """The words of which nobody can say whether they fit: what they are from is not known, or not resolved."""
+        """The words that can neither be confirmed nor excluded: their measure is unknown or not resolved."""
         shares = {MISSING: self.missing, ZERO: self.zero, EXPLODING: self.exploding, BIASED: self.biased}
         unknown = {word for word, one in shares.items() if math.isnan(one.value)}
         chief = self.at(CHIEF)
@@ -157,7 +157,7 @@ class Following:
 
     @property
     def sentence(self) -> str:
-        """Say in a line how gradients follow at each scale."""
+        """Describe in a line how gradients follow at each scale."""
         said = [f"{100 * one.width:.2g} %: {one.describe()}" for one in self.scales]
         return "mean cosine of gradient and slope, by parts of the box: " + ("; ".join(said) or "not known")
 
@@ -173,11 +173,11 @@ def measure_following(
     pairs: int = 12,
     seed: int = 0,
 ) -> list[Following]:
-    """Hold gradients against slopes at random points of planes of one rank; those of all planes are in one batch.
+    """Compare gradients with slopes at random points of planes of one rank, all planes in one batch.
 
     `ranges` are those of the losses on each plane, `deviation` is that of the losses' noise [loss unit]. At `smoothed`
-    of the points means of gradients are held against the slope of the mean loss, with `pairs` of samples each; with 0
-    that is not known. Points keep so far from the border that no difference leaves the box.
+    of the points, means of gradients are compared with the slope of the mean loss, with `pairs` of samples each; 0
+    leaves that out. Points keep a distance from the border, so that no difference leaves the box.
     """
     generator = torch.Generator().manual_seed(seed)
     inner = 1 - max(SCALES)
@@ -200,9 +200,9 @@ def measure_following(
 def follow_samples(
     dataset: xr.Dataset, *, deviation: float = 0.0, points: int = 100, seed: int = 0
 ) -> Following | None:
-    """Hold gradients of a stored slice against differences of its own losses, at some samples: no evaluation.
+    """Compare gradients of a stored slice with differences of its own losses, at some samples, without evaluations.
 
-    Only scales are there that the samples allow within a factor of two. None of a slice without gradients.
+    It returns only scales that the samples allow within a factor of two, and none for a slice without gradients.
     """
     if "grad" not in dataset:
         return None
@@ -228,7 +228,7 @@ def _conclude(
     deviation: float,
     biased: Estimate,
 ) -> Following:
-    """Sum up slopes by gradients [loss unit per side] and differences `over` scales, each with its width."""
+    """Summarise slopes by gradients [loss unit per side] and differences `over` scales, each with its width."""
     size = np.linalg.norm(slope, axis=-1)
     having, zero = np.isfinite(size), size <= VANISHING * whole
     scales, exploding = list[ScaleCosine](), UNKNOWN

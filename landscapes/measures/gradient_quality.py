@@ -1,6 +1,6 @@
 """Gradient quality by scale: against finite differences, and first order against zeroth order.
 
-Slopes are taken along the plane's axes, per side of its box, as a picture shows them; scales and widths are fractions
+Slopes are taken along the plane's axes, per side of its box, as a picture shows them. Scales and widths are fractions
 of the box.
 """
 
@@ -31,9 +31,9 @@ NOTABLE_BIAS = 0.1  # and worth a word where first and zeroth order disagree by 
 
 @dataclass(frozen=True, eq=False)
 class GradientQuality:
-    """Hold what is drawn of a slice's gradients.
+    """The data for drawing the gradients of a slice.
 
-    `steps` is what `compare_differences` returns, `samples` what `compare_samples` does, `smooth` `smoothed_slopes`.
+    `steps` is a result of `compare_differences`, `samples` of `compare_samples`, `smooth` of `smoothed_slopes`.
     """
 
     steps: xr.Dataset
@@ -43,9 +43,9 @@ class GradientQuality:
 
 @dataclass(frozen=True)
 class ScaleRow:
-    """How gradients compare with differences over one `scale`, a fraction of the box.
+    """The comparison of gradients with differences over one `scale`, a fraction of the box.
 
-    Of `of` points `points` show a slope; `error` is their median.
+    `points` of the `of` points have a slope; `error` is their median.
     """
 
     scale: float
@@ -59,7 +59,7 @@ class ScaleRow:
 
 @dataclass(frozen=True)
 class WidthRow:
-    """How first- and zeroth-order slopes compare under a Gaussian of one `width`, a fraction of the box."""
+    """The comparison of first- and zeroth-order slopes under a Gaussian of one `width`, a fraction of the box."""
 
     width: float
     points: int
@@ -70,7 +70,7 @@ class WidthRow:
 
 
 def subgrid(plane: Plane, points: int) -> Float[Tensor, "count rank"]:
-    """Return plane coordinates of so many points per axis, half a step away from the borders, u fastest."""
+    """Return plane coordinates of this many points per axis, half a step away from the borders, u fastest."""
     places = (torch.arange(points, dtype=torch.float64) + 0.5) / points
     grid = torch.cartesian_prod(*[places] * plane.rank).reshape(-1, plane.rank).flip(-1)
     return plane.lower + grid * (plane.upper - plane.lower)
@@ -79,7 +79,7 @@ def subgrid(plane: Plane, points: int) -> Float[Tensor, "count rank"]:
 def compare_differences(
     objective: Objective, plane: Plane, u: Float[Tensor, "count rank"], *, deviation: float = 0.0
 ) -> xr.Dataset:
-    """Hold slopes by AD against central differences over steps of several scales, at points of a plane.
+    """Compare slopes by AD with central differences over steps of several scales, at points of a plane.
 
     Returns `cosine`, `sign` and `error`, dims (scale, point), as in `agreement`, and `place`, dims (point, axis).
     """
@@ -107,10 +107,10 @@ def central_differences(
 
 
 def compare_samples(dataset: xr.Dataset, *, deviation: float = 0.0) -> xr.Dataset:
-    """Hold a slice's gradients against differences of its own losses, over 2, 4 and 8 of its steps: no evaluation.
+    """Compare a slice's gradients with differences of its own losses, over 2, 4 and 8 of its steps.
 
-    Returns what `compare_differences` does, dims (scale, v, u); scales are by the longer axis's samples. Samples too
-    close to the border for a central difference have none.
+    It evaluates nothing. The result is that of `compare_differences`, dims (scale, v, u); scales are by the longer
+    axis's samples. Samples too close to the border for a central difference have none.
     """
     plane = plane_of(dataset)
     loss = losses_of(dataset)
@@ -126,7 +126,7 @@ def compare_samples(dataset: xr.Dataset, *, deviation: float = 0.0) -> xr.Datase
 
 
 def _stack(parts: Sequence[Mapping[str, Values]], *dims: str) -> dict[str, tuple[tuple[str, ...], Values]]:
-    """Return what each part holds in one array by name, the parts along the first dimension; nothing of none."""
+    """Return the values of all parts in one array by name, the parts along the first dimension; or nothing."""
     arrays = {name: np.stack([part[name] for part in parts]) for name in (parts[0] if parts else ())}
     return {name: (dims[: values.ndim], values) for name, values in arrays.items()}
 
@@ -134,8 +134,8 @@ def _stack(parts: Sequence[Mapping[str, Values]], *dims: str) -> dict[str, tuple
 def agreement(slope: Values, difference: Values, noise: float) -> dict[str, Values]:
     """Compare slopes by AD with differences, both of shape (..., axis): NaN where neither is above the noise.
 
-    `cosine` of the angle between them, 0 where only one is zero; `sign`, the share of axes with the same sign among
-    those where one is above the noise; `error`, the length of what is between them over that of the difference.
+    `cosine` of the angle between them, 0 where only one is zero. `sign`, the share of axes with the same sign among
+    those where one is above the noise. `error`, the length of their difference relative to the finite difference.
     """
     sizes = np.linalg.norm(slope, axis=-1), np.linalg.norm(difference, axis=-1)
     known = np.isfinite(sizes[0]) & np.isfinite(sizes[1])
@@ -150,7 +150,7 @@ def agreement(slope: Values, difference: Values, noise: float) -> dict[str, Valu
 
 
 def scale_table(found: xr.Dataset) -> tuple[ScaleRow, ...]:
-    """Return a row for each scale: points that show a slope, their mean cosine and sign agreement, median error."""
+    """Return a row for each scale: points with a slope, their mean cosine and sign agreement, median error."""
     rows = list[ScaleRow]()
     for scale in found["scale"].to_numpy():
         values = [found[name].sel(scale=scale).to_numpy() for name in ("cosine", "sign", "error")]
@@ -183,13 +183,13 @@ def smoothed_slopes(
 
     Suh et al. 2022, "Do differentiable simulators give better policy gradients?": first order averages gradients,
     zeroth order (f(x + w) - f(x - w)) w / (2 sigma^2), over `pairs` of w and -w (antithetic: the same mean, less
-    variance). Where the loss jumps, first order is biased. To see that, zeroth order has as a control variate the line
-    g fitted to the losses of the other pairs: g - (g w) w / sigma^2 has mean zero whatever g is.
+    variance). Where the loss jumps, first order is biased. To detect that, zeroth order has as a control variate the
+    line g fitted to the losses of the other pairs: g - (g w) w / sigma^2 has mean zero for every g.
 
     Returns, dims (width, point, axis), `first` and `zeroth`, their standard errors `first_error` and `zeroth_error`,
     their plain variances of one pair `first_variance` and `zeroth_variance`, the `bias` of first order, which is the
-    difference of means, and its standard error `bias_error`; `count`, the pairs that succeeded, dims (width, point);
-    and `place`, dims (point, axis). Widths are standard deviations, as fractions of the box.
+    difference of means, and its standard error `bias_error`; `count`, the successful pairs, dims (width, point); and
+    `place`, dims (point, axis). Widths are standard deviations, as fractions of the box.
     """
     generator = torch.Generator().manual_seed(seed)
     sides = plane.upper - plane.lower
@@ -207,7 +207,7 @@ def smoothed_slopes(
 
 
 def find_bias(found: xr.Dataset) -> xr.DataArray:
-    """Say at which points first order is biased along an axis, by more than a little and than chance would have it."""
+    """Return at which points first order is biased along an axis, by more than a little and more than chance."""
     level = 1 - CHANCE / 2 / found.sizes["axis"]
     sure = xr.apply_ufunc(lambda count: student(np.maximum(count - 1, 1), level), found["count"])
     flags: xr.DataArray = (abs(found["bias"]) > sure * found["bias_error"]).any("axis") & (
@@ -217,7 +217,7 @@ def find_bias(found: xr.Dataset) -> xr.DataArray:
 
 
 def disagreement(found: xr.Dataset) -> xr.DataArray:
-    """Return |first - zeroth| / (|first| + |zeroth|), dims (width, point): 0 the same, 1 opposite or one is zero."""
+    """Return |first - zeroth| / (|first| + |zeroth|), dims (width, point): 0 equal, 1 opposite or one is zero."""
     first, zeroth, bias = ((found[name] ** 2).sum("axis", skipna=False) ** 0.5 for name in ("first", "zeroth", "bias"))
     total = first + zeroth
     apart: xr.DataArray = bias / total.where(total > 0, 1.0)
@@ -259,7 +259,7 @@ def differences_of_samples(loss: Values, axis: int, stride: int) -> Values:
 def _compare_orders(
     first: Float[Tensor, "point pair axis"], half: Float[Tensor, "point pair"], w: Float[Tensor, "point pair axis"]
 ) -> dict[str, Values]:
-    """Return means, errors and variances over the pairs that succeed; NaN with too few to fit a line without one."""
+    """Return means, errors and variances over the successful pairs; NaN with too few to fit a line without one."""
     known = first.isfinite().all(dim=-1) & half.isfinite()
     count = known.sum(dim=1, keepdim=True).double()
     enough, seen = count > w.shape[-1] + 1, known[..., None]

@@ -1,4 +1,4 @@
-"""The Hessian of an objective at a point: the record of its spectrum, each number with its error, and what it says."""
+"""The Hessian of an objective at a point: the record of its spectrum, each number with its error, and its meaning."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ NAMED = 3  # eigenvalues that a warning names
 
 @dataclass(frozen=True)
 class Eigenpair:
-    """Hold an eigenvalue [loss unit, in box units], which is at most `error` off, and its place, 1 the largest.
+    """An eigenvalue [loss unit, in box units] with its largest `error`, and its place, 1 the largest.
 
-    The error is made of `residual`, the norm of Hv - value v; of `difference`, by how much Hv changes from the step to
-    a quarter of it; and of what losses say otherwise. `by_losses` is the curvature of the losses along the direction,
-    NaN where it was not measured. `along` names the largest components of the unit vector.
+    The error combines `residual`, the norm of Hv - value v; `difference`, the change of Hv from the step to a quarter
+    of it; and contradictions by losses. `by_losses` is the curvature of the losses along the direction, NaN where not
+    measured. `along` names the largest components of the unit vector.
     """
 
     place: int
@@ -49,7 +49,7 @@ class Eigenpair:
 
     @property
     def sign(self) -> Sign:
-        """Whether it is positive or negative: it cannot be told where the error is larger than the value."""
+        """Whether it is positive or negative, undecided where the error is larger than the value."""
         if not abs(self.value) > self.error:
             return UNTOLD
         return "positive" if self.value > 0 else "negative"
@@ -61,19 +61,18 @@ class Eigenpair:
 
 @dataclass(frozen=True, eq=False)
 class Hessian:
-    """Hold the Hessian of an environment at a point, in box units: every parameter runs from 0 to 1 in its bounds.
+    """The Hessian of an environment at a point, in box units: every parameter runs from 0 to 1 in its bounds.
 
-    `pairs` are its largest and smallest eigenvalues, descending, each with its error [`loss_unit`]; `whole` says
-    whether all `dim` were computed. `point` are the parameters' own values; it was `moved` [box] off a bound.
-    Differences are of `source`, gradients or losses (and `why` these), over `step` [box], chosen among `steps`.
-
-    `trace`, `condition` (the largest eigenvalue by the smallest, by magnitude) and `negative` (share of eigenvalues
-    that are surely negative) have 95 % intervals or bounds; NaN is not known, and `undecided` the share whose sign
-    cannot be told. `asymmetry` is the Frobenius norm of the antisymmetric part by that of the symmetric one, of which
-    differences explain `asymmetry_explained`.
+    `pairs` are its largest and smallest eigenvalues, descending, each with its error [`loss_unit`]; `whole`: all `dim`
+    were computed. `point` are the parameters' own values; it was `moved` [box] off a bound. Differences are of
+    `source`, gradients or losses (and `why` these), over `step` [box], chosen among `steps`. `trace`, `condition` (the
+    largest eigenvalue by the smallest, by magnitude) and `negative` (share of eigenvalues that are certainly negative)
+    have 95 % intervals or bounds; NaN means unknown. `undecided` is the share with an undecided sign. `asymmetry` is
+    the Frobenius norm of the antisymmetric part relative to that of the symmetric one; differences explain
+    `asymmetry_explained` of it.
 
     Arrays, which hessian.npz has: `values` and `errors` of all known eigenvalues, shape (known,), `vectors`, shape
-    (known, dim), and of a spectrum that was sampled `nodes` and `weights`, shape (probe, step), else empty.
+    (known, dim), and of a sampled spectrum `nodes` and `weights`, shape (probe, step), else empty.
     """
 
     identity: dict[str, Any]
@@ -112,12 +111,12 @@ class Hessian:
 
     @property
     def units(self) -> str:
-        """What lengths are measured in."""
+        """The unit of lengths."""
         return BOX_UNITS
 
     @property
     def kind(self) -> Kind:
-        """What the landscape is like at the point, by the signs of all eigenvalues."""
+        """The type of the landscape at the point, by the signs of all eigenvalues."""
         signs = {pair.sign for pair in self.pairs}
         if {"positive", "negative"} <= signs:
             return "saddle"
@@ -127,32 +126,32 @@ class Hessian:
 
     @property
     def symmetric(self) -> bool:
-        """Whether the matrix is symmetric, as every Hessian is, but for what differences explain."""
+        """Whether the matrix is symmetric, as every Hessian is, within the error of differences."""
         return not self.asymmetry > SYMMETRIC * self.asymmetry_explained + ROUNDED
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What makes these numbers doubtful, a sentence each."""
+        """Reasons to doubt these numbers, a sentence each."""
         said = [f"differences are of losses, not of gradients: {self.why}"] if self.why else []
         if not self.symmetric:
             said.append(
                 f"the matrix is not symmetric: its antisymmetric part is {self.asymmetry:.2g} of the symmetric one, "
-                f"and differences explain {self.asymmetry_explained:.1g}; so these gradients are of no loss, or they "
-                f"jump: `landscape check {self.env}` says where"
+                f"of which differences explain {self.asymmetry_explained:.1g}; so these gradients belong to no loss, "
+                f"or they jump: `landscape check {self.env}` shows where"
             )
         if wrong := [pair for pair in self.pairs if pair.disputed]:
             first = "; ".join(f"{one.value:.3g}, and {one.by_losses:.3g} by losses" for one in wrong[:NAMED])
             said.append(
-                f"losses curve otherwise than gradients say along {len(wrong)} of {len(self.pairs)} directions "
-                f"({first}): gradients are wrong, or losses jump; `landscape check {self.env}` says which"
+                f"losses and gradients give different curvatures along {len(wrong)} of {len(self.pairs)} directions "
+                f"({first}): gradients are wrong, or losses jump; `landscape check {self.env}` shows which"
             )
         if untold := sum(pair.sign == UNTOLD for pair in self.pairs):
             said.append(
-                f"{untold} of {len(self.pairs)} eigenvalues cannot be told from 0: their errors are as large as they "
-                "are, as where gradients are noisy, jump within the step, or do not change"
+                f"{untold} of {len(self.pairs)} eigenvalues are not distinguishable from 0: their errors are as large "
+                "as their values, for example because gradients are noisy, jump within the step, or do not change"
             )
         if self.moved:
-            said.append(f"the point was moved off the bounds, by {self.moved:.2g} of the box at most")
+            said.append(f"the point was moved off the bounds, by at most {self.moved:.2g} of the box")
         if self.failures:
             said.append(f"{len(self.failures)} points failed, the first {self.failures[0]}")
         return tuple(said)
@@ -189,7 +188,7 @@ def conclude(
     provenance: dict[str, Any],
     command: str,
 ) -> Hessian:
-    """Return the record of a spectrum, with so many `pairs` at either end; the other keywords are fields of it."""
+    """Return the record of a spectrum, with this many `pairs` at either end; the other keywords are fields of it."""
     whole, dim = curvature.whole, curvature.dim
     negative, undecided = _signs(found)
     return Hessian(
@@ -243,7 +242,7 @@ def _pair(found: Spectrum, at: int, dim: int, names: Sequence[str]) -> Eigenpair
 
 
 def _condition(found: Spectrum, whole: bool) -> Estimate:
-    """Return the largest magnitude of an eigenvalue by the smallest; NaN, but for a bound, where the latter may be 0.
+    """Return the largest magnitude of an eigenvalue over the smallest; only a bound where the latter can be 0.
 
     Where only the ends of a spectrum are known, the smallest magnitude is at an end if all have one sign.
     """
@@ -258,7 +257,7 @@ def _condition(found: Spectrum, whole: bool) -> Estimate:
 
 
 def _signs(found: Spectrum) -> tuple[Estimate, float]:
-    """Return the share of eigenvalues that are surely negative, with its bounds, and of those that may be either."""
+    """Return the share of eigenvalues that are certainly negative, with its bounds, and of undecided ones."""
     if not found.nodes.size:
         below, either = float((found.values < -found.error).mean()), float((np.abs(found.values) <= found.error).mean())
         return Estimate(below, below, below + either), either

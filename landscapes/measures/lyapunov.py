@@ -1,9 +1,9 @@
-"""Growth of gradients with the length of an episode: exponential, by a power of time, bounded, or not to be told.
+"""Growth of gradients with the length of an episode: exponential, by a power of time, bounded, or undecided.
 
-How far a motion's end moves for a change of a parameter, |dx(t)/dp|, grows by the largest Lyapunov exponent: like
-exp(rate x t) where neighbours part for good. What only flies on grows like a power of time, and what swings stays
-bounded: neither is divergence. Points of a slice swing together, so that many points do not tell these apart, and only
-the lengths of episodes do: shapes are judged by the medians over points, one for each length.
+The change of a motion's end with a parameter, |dx(t)/dp|, grows with the largest Lyapunov exponent: like exp(rate x t)
+where neighbouring motions diverge. In free flight it grows like a power of time, and in oscillations it stays bounded:
+neither is divergence. Points of a slice oscillate together, so many points do not separate these cases; only several
+lengths of episodes do. The shape is judged from the medians over points, one for each length.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ EXACT = 1e-20  # squared errors of a logarithm that are rounding
 
 
 class Shape(StrEnum):
-    """Say how gradients grow with the length of episodes."""
+    """How gradients grow with the length of episodes."""
 
     EXPONENTIAL = "exponential"
     POWER = "power"
@@ -34,11 +34,11 @@ class Shape(StrEnum):
 
 @dataclass(frozen=True)
 class GradientGrowth:
-    """Hold how gradients grow with the length of episodes.
+    """The growth of gradients with the length of episodes.
 
     `rate` [1/s] is the mean over points of the slope of log |gradient| against time, `power` that against log time,
-    each NaN where it cannot be told; `misfit` are the standard deviations of what either leaves, in that order. `time`
-    [s] are the lengths, `norm` [loss unit per box] the medians over points, of `known` of `points`.
+    each NaN where unknown. `misfit` are the residual standard deviations of both, in that order. `time` [s] are the
+    lengths, `norm` [loss unit per box] the medians over points, for `known` of `points`.
     """
 
     rate: Estimate
@@ -51,11 +51,11 @@ class GradientGrowth:
 
     @property
     def shape(self) -> Shape:
-        """How the medians grow.
+        """The growth of the medians.
 
-        Where a straight line rises beyond chance (Student's 95 % interval of its slope), the shape is the one of
-        exponential, power and saturation that has the least AICc, by `EVIDENCE` or more. Where none rises, it is
-        bounded if the interval leaves out a growth in proportion to time.
+        If a straight line rises beyond chance (Student's 95 % interval of its slope), the shape is the one of
+        exponential, power and saturation with the lowest AICc, by `EVIDENCE` or more. If none rises, it is bounded if
+        the interval excludes growth in proportion to time.
         """
         if not math.isfinite(self.rate.value):
             return Shape.UNDECIDED
@@ -73,9 +73,12 @@ class GradientGrowth:
         return best if told > EVIDENCE else Shape.UNDECIDED
 
     def describe(self) -> str:
-        """Say in a line how gradients grow."""
+        """Describe in a line how gradients grow."""
         if not math.isfinite(self.rate.value):
-            return f"how gradients grow is not known: at {self.known} of {self.points} points they are at every horizon"
+            return (
+                f"the growth of gradients is unknown: they exist at every horizon at {self.known} of {self.points} "
+                "points"
+            )
         rate, power = (f"{one.value:z.2g} ({one.low:z.2g} to {one.high:z.2g})" for one in (self.rate, self.power))
         if self.shape is Shape.EXPONENTIAL:
             low, high = self.rate.low, self.rate.high
@@ -83,19 +86,21 @@ class GradientGrowth:
         if self.shape is Shape.POWER:
             return f"gradients grow like t^{power}, not exponentially"
         if self.shape is Shape.BOUNDED:
-            return f"gradients stay bounded; as a power of time their exponent is {power}"
-        return f"cannot tell how gradients grow: as an exponential by {rate}/s, as a power of time by {power}"
+            return f"gradients stay bounded; a power of time would have exponent {power}"
+        return (
+            f"the growth of gradients is undecided: an exponential has {rate}/s, a power of time has exponent {power}"
+        )
 
 
 def measure_growth(time: Values, norm: Values) -> GradientGrowth:
-    """Fit how |gradients|, shape (horizon, point), grow with the ascending lengths of episodes `time` [s].
+    """Fit the growth of |gradients|, shape (horizon, point), with the ascending lengths of episodes `time` [s].
 
-    Each point is fitted by itself, an exponential and a power of time; points whose gradient is zero or failed at some
-    horizon are left out. Intervals are those of the mean over points and of the fit to the medians, added in squares.
-    Raises ValueError where lengths do not ascend from above zero.
+    An exponential and a power of time are fitted to each point; points with a zero or failed gradient at some horizon
+    are left out. Intervals combine those of the mean over points and of the fit to the medians, added in squares.
+    Raises ValueError where lengths are not positive and ascending.
     """
     if not (time > 0).all() or not (np.diff(time) > 0).all():
-        raise ValueError(f"lengths of episodes ascend from above 0; got {time.tolist()}")
+        raise ValueError(f"lengths of episodes must be positive and ascending; got {time.tolist()}")
     there = np.isfinite(norm).all(axis=0) & (norm > 0).all(axis=0)
     known, points = int(there.sum()), norm.shape[1]
     medians = np.median(norm[:, there], axis=1) if known else np.full(len(time), math.nan)
@@ -113,22 +118,22 @@ def measure_growth(time: Values, norm: Values) -> GradientGrowth:
 
 
 def _fit(axis: Values, values: Values) -> tuple[float, float]:
-    """Return the slope of a line through values, and the standard deviation of what it leaves."""
+    """Return the slope of a line through values, and the residual standard deviation."""
     found = fit_line(axis, values)
     return found.slope, float(np.std(values - found.intercept - found.slope * axis))
 
 
 def _widened(found: Estimate, line: Line, count: int) -> Estimate:
-    """Return the interval of a mean over points that depend on each other, by the line through `count` medians."""
+    """Return the interval of a mean over dependent points, by the line through `count` medians."""
     reach = math.hypot(found.high - found.value, _reach(line, count))
     return Estimate(found.value, found.value - reach, found.value + reach)
 
 
 def _reach(line: Line, count: int) -> float:
-    """Return half the width of the 95 % interval of the slope of a line through so many points."""
+    """Return the half-width of the 95 % interval of the slope of a line through this many points."""
     return float(line.standard_error * student(count - 2))
 
 
 def _squares(left: Values) -> float:
-    """Return the sum of squares about the mean, as large as rounding at least."""
+    """Return the sum of squares about the mean, at least as large as rounding."""
     return float(((left - left.mean()) ** 2).sum()) + EXACT

@@ -1,4 +1,4 @@
-"""The noise of a loss, below which a difference is no feature of the landscape."""
+"""The noise of a loss: smaller differences are no features of the landscape."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from ..objective import Objective, evaluate
 
 @dataclass(frozen=True)
 class Noise:
-    """Hold standard deviations of the same loss [loss unit]: evaluated again, in another batch, and rounded otherwise.
+    """Standard deviations of the same loss [loss unit]: evaluated again, in another batch, and rounded differently.
 
-    `again` repeats the same batch; `batch` splits and shuffles it; `rounding` moves the parameters by less than the
-    last digit that the engine keeps of them. The first two are 0 where an engine is deterministic.
+    `again` repeats the same batch; `batch` splits and shuffles it; `rounding` moves the parameters by less than their
+    last digit in the engine. The first two are 0 where an engine is deterministic.
     """
 
     again: float
@@ -32,9 +32,9 @@ class Noise:
 
 
 def noise_floor(deviation: float, samples: int) -> float:
-    """Return how far apart noise of a standard deviation should put the extremes of so many samples.
+    """Return the expected range of this many samples of noise with a standard deviation.
 
-    Twice the expected maximum of so many normal draws, sqrt(2 ln n) deviations.
+    Twice the expected maximum of this many normal draws, sqrt(2 ln n) deviations.
     """
     return 2 * deviation * math.sqrt(2 * math.log(max(samples, 2)))
 
@@ -42,9 +42,9 @@ def noise_floor(deviation: float, samples: int) -> float:
 def noise(
     objective: Objective, x: Float[Tensor, "points dim"], *, rounding: float, repeats: int = 4, seed: int = 0
 ) -> Noise:
-    """Measure noise at some points; `rounding` is the engine's relative precision, such as 1.2e-7 of float32.
+    """Measure noise at some points; `rounding` is the engine's relative precision, such as 1.2e-7 for float32.
 
-    Root mean squares over points that succeed. `rounding` draws are uniform, as fractions of the parameters' ranges.
+    Root mean squares over successful points. `rounding` draws are uniform, as fractions of the parameters' ranges.
     """
     generator = torch.Generator().manual_seed(seed)
     first = evaluate(objective, x, grad=False).loss

@@ -1,4 +1,4 @@
-"""Polynomials fitted to losses and to their gradients, and how much they explain of points held out."""
+"""Polynomials fitted to losses and gradients, and the share of held-out points that they explain."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ MAX_DEGREE, MAX_WEIGHT = 4, 1e6
 
 @dataclass(frozen=True)
 class GradientModel:
-    """Held-out R2 of a polynomial of so many `coefficients`, fitted to losses alone and with their gradients.
+    """Held-out R2 of a polynomial with `coefficients`, fitted to losses alone and with their gradients.
 
-    A `separable` one has no products of parameters. `of_gradients` is the R2 of the model's slopes. An equation of a
-    gradient has `weight` times that of a loss: the ratio of the variances that the model leaves (feasible generalised
-    least squares).
+    A `separable` one has no products of parameters. `of_gradients` is the R2 of the model's gradients. An equation of a
+    gradient has `weight` times that of a loss: the ratio of the residual variances (feasible generalised least
+    squares).
     """
 
     degree: int
@@ -36,9 +36,9 @@ class GradientModel:
 
 
 def degrees_of(dim: int) -> list[tuple[int, int]]:
-    """Return the degrees of the polynomials that are fitted, and how many coefficients each has.
+    """Return the degrees of the fitted polynomials, and the number of coefficients of each.
 
-    Where squares and products of all parameters are too many, that of degree 2 has squares alone.
+    Where squares and products of all parameters are too many, that of degree 2 has only squares.
     """
     counts = [(degree, math.comb(dim + degree, degree)) for degree in range(1, MAX_DEGREE + 1)]
     counts[1] = counts[1] if counts[1][1] <= MAX_COEFFICIENTS else (2, 1 + 2 * dim)
@@ -46,9 +46,9 @@ def degrees_of(dim: int) -> list[tuple[int, int]]:
 
 
 def fit_with_gradients(x: Array, y: Array, slopes: Array, rng: np.random.Generator) -> tuple[GradientModel, ...]:
-    """Fit polynomials to losses, shape (point,), and to slopes, shape (point, dim), and test them on other points.
+    """Fit polynomials to losses, shape (point,), and gradients, shape (point, dim), and test them on other points.
 
-    One of each degree up to 4 that has no more coefficients than are fitted.
+    One for each degree up to 4, with no more coefficients than data.
     """
     x, y, slopes = 2 * x[:MAX_POINTS] - 1, y[:MAX_POINTS], slopes[:MAX_POINTS] / 2  # parameters from -1 to 1
     found, dim = list[GradientModel](), x.shape[1]
@@ -164,7 +164,7 @@ class _Equations:
         return self._solve(weight, self.right + weight * self.slopes_right)
 
     def used_by_losses(self, weight: float) -> float:
-        """Return how many coefficients the losses determine, rather than the slopes: a trace by random vectors."""
+        """Return how many coefficients the losses determine, rather than the gradients: a trace by random vectors."""
         probes = np.random.default_rng(0).choice([-1.0, 1.0], size=(len(self.right), PROBES))
         return float((probes * self._solve(weight, self.losses @ probes)).sum() / PROBES)
 

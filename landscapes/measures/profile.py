@@ -1,4 +1,4 @@
-"""The profile of a slice: all that is measured of it, and what that comes to in words."""
+"""The profile of a slice: all its measures, and the words that follow from them."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ PAIRS_PER_POINT = 8  # pairs of samples that are looked into, for each point of 
 
 @dataclass(frozen=True)
 class OutsideBounds:
-    """Count the evaluations that were `asked` for, and those `cut` as they lay outside the bounds."""
+    """Count the requested evaluations (`asked`), and those `cut` because they were outside the bounds."""
 
     asked: int
     cut: int
@@ -42,16 +42,15 @@ class OutsideBounds:
 
 @dataclass(frozen=True)
 class Profile:
-    """Hold the measures of a slice: of its losses, of its noise, of its jumps and of its gradients at several scales.
+    """The measures of a slice: of its losses, its noise, its jumps and its gradients at several scales.
 
-    The `verdict` has the words, and what they are from: the surface, jumps, how gradients follow, and the numerical
-    floor. No measure of losses counts what is below `losses.floor`, which is that of noise or that of numerics,
-    whichever is larger. `noise` is None where it is not known.
-
-    `differences`, `differences_of_samples` and `smoothing` sum up `quality`, which is drawn; records of samples alone
-    have but those in the middle. `beyond_the_box` counts the probes that the objective does not allow. `undersampled`
-    says what the samples hide, None where that is not known; `errors` says how many of them raised and what the first
-    of them said. `growth` is that of gradients with the length of episodes, None where it was not measured.
+    The `verdict` has the words and their sources: the surface, jumps, how gradients follow, and the numerical floor. No
+    measure of losses counts anything below `losses.floor`, the larger one of the noise floor and the numerical floor.
+    `noise` is None where it is unknown. `differences`, `differences_of_samples` and `smoothing` summarise `quality`,
+    which is drawn; records from samples alone have only the second. `beyond_the_box` counts the probes that the
+    objective does not allow. `undersampled` describes what the samples miss, None where that is unknown. `errors` has
+    the number of them that raised and the first message. `growth` is that of gradients with the length of episodes,
+    None where not measured.
     """
 
     losses: Ruggedness
@@ -73,17 +72,17 @@ class Profile:
 
     @property
     def jumps(self) -> Jumps | None:
-        """The jumps that were found, None where they were not searched."""
+        """The found jumps, None where they were not searched."""
         return self.verdict.jumps
 
     @property
     def floor(self) -> Floor | None:
-        """What replicas of the objective differ by, None where it has none."""
+        """The differences between replicas of the objective, None where it has none."""
         return self.verdict.floor
 
     @property
     def measures(self) -> dict[str, str]:
-        """The chief numbers by short names, with 95 % intervals, as a page shows them."""
+        """The main numbers by short names, with 95 % intervals, as a page shows them."""
         named = self._measures_of_losses() | self._measures_of_gradients()
         return {name: text for name, text in named.items() if text}
 
@@ -97,13 +96,13 @@ class Profile:
             "Local minima deeper than 1 % of the range": _count(surface.minima),
             "Turns along a side": _along_axes(surface.turns),
             "Exponent over short distances": _number(surface.holder),
-            "Places between samples that these do not tell": _shares(surface.off),
+            "Points between samples that the samples do not predict": _shares(surface.off),
             "Basin of the lowest sample": _percent(losses.lowest_basin),
             "Noise floor": f"{losses.floor:.2g}{self._describe_source()}",
             "Numerical floor, of the range": _shares(self.floor.share) if self.floor else "",
             "Cosine of gradients of replicas": _number(self.floor.cosine) if self.floor and self.floor.cosine else "",
             "Gradient effectively zero": _shares(losses.flat),
-            "Level, of the box": _shares(surface.level),
+            "Level regions, of the box": _shares(surface.level),
             "Jumps": jumps.sentence if jumps else "not searched",
             "Jumps explained by an event": _shares(jumps.explained_by_events) if jumps else "",
             "Correlation length, of the box": ", ".join(map(_shares, losses.correlation_length)),
@@ -118,28 +117,28 @@ class Profile:
     def _measures_of_gradients(self) -> dict[str, str]:
         lacking, following, named = self.losses.missing, self.verdict.following, dict[str, str]()
         if lacking and lacking.value:
-            named["Gradients missing beside a loss"] = _shares(lacking)
+            named["Gradients missing at points with a loss"] = _shares(lacking)
         for one in following.scales if following else ():
             said = f"{one.width:.1%} of the box"
             named[f"Cosine of gradient and slope over {said}"] = _number(one.cosine)
             named[f"Gradients uphill over {said}"] = _shares(one.uphill)
         if cut := self.beyond_the_box.cut:
-            named["Probes beyond the bounds, left out"] = f"{cut} of {self.beyond_the_box.asked}"
+            named["Probes outside the bounds, left out"] = f"{cut} of {self.beyond_the_box.asked}"
         if self.growth:
-            named["Growth with the length of episodes"] = self.growth.describe()
+            named["Growth of gradients with the length of episodes"] = self.growth.describe()
         for row in self.smoothing:
             named[f"First order biased, smoothed over {row.width:.0%} of the box"] = _shares(row.biased)
         return named
 
     def _describe_source(self) -> str:
-        """Say that the floor is not that of repeats."""
-        return ", that of numerics" if self.floor and self.losses.floor == counted_from(self.floor) else ""
+        """Say whether the floor is the numerical one."""
+        return ", the numerical floor" if self.floor and self.losses.floor == counted_from(self.floor) else ""
 
 
 def effort(rank: int, points: int, shape: Sequence[int] = (), replicas: int = 0) -> tuple[int, int]:
-    """Return how many losses, at most, and how many gradients `measure_profile` evaluates.
+    """Return the largest number of losses, and the number of gradients, that `measure_profile` evaluates.
 
-    Without the `shape` of the slice those are left out that look between its samples, and at its `replicas`.
+    Without the `shape` of the slice, those between its samples and at its `replicas` are not counted.
     """
     places = points**2
     losses = NOISE_POINTS * (2 + 2 * REPEATS) + PAIRS_PER_POINT * points * EVALUATIONS_PER_PAIR + RANGE_POINTS
@@ -153,12 +152,12 @@ def effort(rank: int, points: int, shape: Sequence[int] = (), replicas: int = 0)
 
 
 def need_of(rank: int, dim: int, points: int) -> Need:
-    """Return what the points and gradients of `measure_profile` take, some copies of them included."""
+    """Return the memory of the points and gradients of `measure_profile`, including some copies."""
     return Need(8.0 * (4 * rank + 6 * dim) * 2 * PAIRS * float(points) ** 2)
 
 
 def own_cost(samples: int) -> tuple[float, int]:
-    """Return about how many seconds and bytes `measure_profile` takes itself for a slice of so many samples."""
+    """Return the approximate seconds and bytes that `measure_profile` itself takes for a slice of this many samples."""
     return SECONDS[0] + SECONDS[1] * samples, BYTES[0] + BYTES[1] * samples
 
 
@@ -171,11 +170,11 @@ def measure_profile(
     seed: int = 0,
     events: Count | None = None,
 ) -> Profile:
-    """Measure a slice, with new evaluations of its objective at points x points places of it and at random ones.
+    """Measure a slice, with new evaluations on a grid of points x points and at random points.
 
-    `rounding` is the engine's relative precision: `LAST_PLACE` has that of float32 and of float64. `events` counts what
-    happens in episodes, which explains jumps. The numerical floor is the slice's own, or else measured now. Where
-    neighbours or their gradients are compared it does not count, but noise alone: their numerics are the same.
+    `rounding` is the engine's relative precision: `LAST_PLACE` has that of float32 and of float64. `events` counts the
+    events of episodes, which explain jumps. The numerical floor is the slice's own, or else measured now. Where
+    neighbours or their gradients are compared, only noise counts, because their numerics are the same.
     """
     plane, objective = plane_of(dataset), CountedObjective(objective)
     generator = torch.Generator().manual_seed(seed)
@@ -210,7 +209,7 @@ def measure_profile(
 
 
 def _with_bias(verdict: Verdict, widths: Sequence[gradients.WidthRow]) -> Verdict:
-    """Return a verdict that knows where the mean of gradients is biased, of those widths the one of its words."""
+    """Return the verdict completed by where the mean of gradients is biased, at the width of its words."""
     biased = next((row.biased for row in widths if row.width == WIDTH), None)
     if verdict.following is None or biased is None:
         return verdict
@@ -222,7 +221,7 @@ def _shares(estimate: Estimate | None) -> str:
 
 
 def _along_axes(values: Sequence[Estimate]) -> str:
-    """Write a number for each axis, a dash where one is not known, nothing where none is."""
+    """Write a number for each axis, a dash where it is unknown, nothing where all are."""
     said = list(map(_number, values))
     return ", ".join(one or "\N{EN DASH}" for one in said) if any(said) else ""
 
@@ -240,7 +239,7 @@ def _with_interval(estimate: Estimate | None, write: Callable[[float], str]) -> 
 
 
 def _count(estimate: Estimate) -> str:
-    """Write a count, and those by deeper and by less deep ones."""
+    """Write a count, and those for a larger and a smaller depth."""
     if not math.isfinite(estimate.value):
         return ""
     ends = f" ({estimate.low:.0f} to {estimate.high:.0f})" if estimate.low != estimate.high else ""

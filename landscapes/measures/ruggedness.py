@@ -1,7 +1,7 @@
 """Ruggedness of the losses of a slice: minima and basins, flatness, correlation, variation, information.
 
-Every measure takes losses, shape (u,) or (v, u), at evenly spaced samples of a box whose sides count as 1, NaN where an
-evaluation failed; what is missing is left out, never filled in.
+Every measure takes losses, shape (u,) or (v, u), at evenly spaced samples of a box whose sides count as 1. Failed
+evaluations are NaN; they are left out, never filled in.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ PAIRED = 4096  # most samples whose pairs are gone through one by one, 8 million
 
 @dataclass(frozen=True)
 class Minima:
-    """Hold the local minima of a slice, deepest first: their depths [loss unit] and the samples they are at.
+    """The local minima of a slice, deepest first: their depths [loss unit] and their samples.
 
-    Depth is persistence: how far one must climb to get to a lower minimum. The lowest one's is the range of the losses.
+    Depth is persistence: the climb needed to reach a lower minimum. That of the lowest one is the range of the losses.
     """
 
     depth: Values
@@ -84,26 +84,26 @@ def basins(loss: Values, sample: NDArray[np.intp]) -> Values:
 
 
 def minima_of_halves(loss: Values, depth: float) -> tuple[int, int]:
-    """Return the fewest and the most minima deeper than `depth` that every second sample would have shown."""
+    """Return the fewest and the most minima deeper than `depth` that every second sample would show."""
     starts = np.ndindex((2,) * loss.ndim)
     counts = [minima(loss[tuple(slice(at, None, 2) for at in start)]).count(depth) for start in starts]
     return min(counts), max(counts)
 
 
 def span(loss: Values) -> float:
-    """Return the range of the losses. Raises ValueError where they are too large to have differences."""
+    """Return the range of the losses. Raises ValueError where their differences would overflow."""
     refuse_large(loss)
     known = loss[np.isfinite(loss)]
     return float(known.max() - known.min()) if known.size else math.nan
 
 
 def half_step(whole: float, shape: Sequence[int]) -> float:
-    """Return half the step, from sample to sample of the longer axis, of a ramp through a range; 0 where it is NaN."""
+    """Return half a step, between samples of the longer axis, of a ramp through a range; 0 where it is NaN."""
     return float(np.nan_to_num(whole)) / (max(shape) - 1) / 2
 
 
 def level_samples(loss: Values, depth: float) -> Values:
-    """Return 1 for each sample that no neighbour along an axis differs from by more than `depth`, 0 for others."""
+    """Return 1 for each sample that differs from its neighbours by at most `depth`, 0 for others."""
     most = np.zeros_like(loss)
     for axis in range(loss.ndim):
         apart = np.nan_to_num(np.abs(np.diff(loss, axis=axis)))
@@ -114,9 +114,9 @@ def level_samples(loss: Values, depth: float) -> Values:
 
 
 def correlation_length(loss: Values, axis: int) -> float:
-    """Return the distance at which the autocorrelation along lines of an axis falls to 1/e, in fractions of the box.
+    """Return the distance at which the autocorrelation along an axis falls to 1/e, in fractions of the box.
 
-    Each line varies about its own mean; lines count by their variance.
+    Each line varies about its own mean; lines are weighted by their variance.
     """
     lines = lines_along(loss, axis)
     lines = lines[np.isfinite(lines).any(axis=1)]
@@ -134,13 +134,13 @@ def correlation_length(loss: Values, axis: int) -> float:
 
 
 def holder_exponent(loss: Values, axis: int, floor: float) -> float:
-    """Return the exponent by which losses along an axis differ with distance: |f(x + h) - f(x)| ~ h^exponent.
+    """Return the exponent of the growth of differences along an axis with distance: |f(x + h) - f(x)| ~ h^exponent.
 
     The slope of the logarithm of the root mean square of differences over 1, 2, 3, 4, 6, 8, ... steps, up to a quarter
     of the side, against that of the distance: Wang et al. 2023, *Fractal landscapes in policy optimization* (NeurIPS),
-    section 5, with differences of samples instead of a Gaussian's. Beyond the correlation length differences grow no
-    more, whatever the landscape is like within it, so longer distances are left out. So are differences no larger than
-    `floor`. NaN where fewer than three distances are left: such a landscape varies within the samples' distance.
+    section 5, with differences of samples instead of a Gaussian's. Beyond the correlation length differences stop
+    growing in any landscape, so longer distances are left out. So are differences no larger than `floor`. NaN where
+    fewer than three distances remain: such a landscape varies within the distance of the samples.
     """
     lines, known = lines_along(loss, axis), list[tuple[float, float]]()
     sides = lines.shape[1] - 1
@@ -153,7 +153,7 @@ def holder_exponent(loss: Values, axis: int, floor: float) -> float:
 
 
 def total_variation(loss: Values, axis: int) -> float:
-    """Return how many times lines along an axis go through their own range: 1 if monotone, 2 across a bowl."""
+    """Return how many times lines along an axis pass through their own range: 1 if monotone, 2 across a bowl."""
     lines = lines_along(loss, axis)
     ranges = sum(span(line) for line in lines[np.isfinite(lines).any(axis=1)])
     return float(np.nansum(np.abs(np.diff(lines, axis=1)))) / ranges if ranges > 0 else math.nan
@@ -163,9 +163,9 @@ def information_content(loss: Values) -> tuple[float, float]:
     """Return the information content h_max and log10 of the settling sensitivity eps_s, of a walk over a slice.
 
     Munoz, Kirley & Halgamuge 2015, IEEE Trans. Evol. Comput. 19(1), eqs. 6 to 9: the walk goes from each point of a
-    sample of the box to the nearest that is left. The sample is up to `WALKED` points of the slice, drawn at random, so
-    that what comes out hardly depends on how fine the slice is. Slopes are in ranges of the losses per side of the box,
-    so that slices compare.
+    sample of the box to the nearest remaining one. The sample is up to `WALKED` points of the slice, drawn at random,
+    so the result hardly depends on the resolution. Slopes are in ranges of the losses per side of the box, which makes
+    slices comparable.
     """
     places, whole = np.argwhere(np.isfinite(loss)), span(loss)
     if len(places) < 3 or not whole > 0:
@@ -177,11 +177,11 @@ def information_content(loss: Values) -> tuple[float, float]:
 
 
 def turns(loss: Values, floor: float = 0.0) -> float:
-    """Return the share of steps between samples that turn back, small steps passed over.
+    """Return the share of steps between samples that turn back, ignoring small steps.
 
-    Small is less than half the step of a ramp through the range of the losses. The partial information content M of
-    Munoz et al. 2015, eq. 10, but that a walk which never turns has none, and that one which goes back by no more than
-    `floor` [loss unit] has not turned.
+    Small is less than half the step of a ramp through the range of the losses. This is the partial information content
+    M of Munoz et al. 2015, eq. 10, with two changes. A walk that never turns has 0, and going back by no more than
+    `floor` [loss unit] is no turn.
     """
     turned = 0
     for axis in range(loss.ndim):
@@ -199,7 +199,7 @@ def steps(loss: Values) -> int:
 
 
 def count_turns(lines: Values, depth: float) -> int:
-    """Count how often lines, shape (line, sample), turn back by `depth` or more; samples that are NaN are passed."""
+    """Count how often lines, shape (line, sample), turn back by `depth` or more; NaN samples are skipped."""
     high, low = np.full(len(lines), -np.inf), np.full(len(lines), np.inf)
     way, turned = np.zeros(len(lines), int), 0  # 0 while a line has gone nowhere
     for at in lines.T:
@@ -213,7 +213,7 @@ def count_turns(lines: Values, depth: float) -> int:
 
 
 def dispersion(loss: Values) -> float:
-    """Return how far apart the best 5 % of the samples are, against all: 1 scattered, 0 together.
+    """Return the distance among the best 5 % of the samples, relative to all: 1 scattered, 0 together.
 
     Lunacek & Whitley 2006, GECCO, as a ratio of mean distances.
     """
@@ -227,8 +227,8 @@ def dispersion(loss: Values) -> float:
 def mean_distance(places: NDArray[np.intp], shape: tuple[int, ...]) -> float:
     """Return the mean distance of all pairs of samples of a slice of this shape, shape (count, rank).
 
-    Of many there are more pairs than memory holds, but few steps that samples can be apart: how many pairs are each is
-    the autocorrelation of where the samples are, by the Fourier transform, rounded to the whole numbers it is made of.
+    There can be more pairs than fit in memory, but there are few different steps between samples. The number of pairs
+    for each step is the autocorrelation of the positions, by the Fourier transform, rounded to integers.
     """
     from scipy import fft
     from scipy.spatial.distance import pdist
@@ -254,12 +254,12 @@ def fitness_distance(loss: Values) -> float:
 
 @dataclass(frozen=True)
 class Ruggedness:
-    """Hold the measures of a slice's losses; `floor` [loss unit] is the range that noise or numerics alone would give.
+    """The measures of a slice's losses; `floor` [loss unit] is the range that noise or numerics alone would give.
 
-    `minima` counts those deeper than the floor, `minima_halved` what every second sample shows of them; `curve` counts
-    by depths in fractions of the range. `zero` and `flat` are shares of samples whose gradient along the plane is
-    exactly and effectively zero, `missing` of those that have a loss and, though it was asked for, no gradient; `level`
-    of those whose neighbours' losses differ by no more than the floor of noise.
+    `minima` counts those deeper than the floor, `minima_halved` those in every second sample; `curve` counts by depths
+    in fractions of the range. `zero` and `flat` are shares of samples whose gradient along the plane is exactly and
+    effectively zero. `missing` is the share of samples with a loss but without the requested gradient. `level` is the
+    share of samples that differ from their neighbours by no more than the noise floor.
     """
 
     samples: int
@@ -293,10 +293,10 @@ def ruggedness(
     noise: float | None = None,
     estimate: Callable[..., Estimate] = jackknife,
 ) -> Ruggedness:
-    """Measure the ruggedness of a slice; `estimate` takes a statistic and samples, and gives its interval, too.
+    """Measure the ruggedness of a slice; `estimate` returns a statistic of samples with its interval.
 
-    `noise` [loss unit] is the floor of repeats, by default `floor`. Neighbours are level by that one: their numerics
-    are the same, so that their difference is a slope, however fine the samples are.
+    `noise` [loss unit] is the floor of repeats, by default `floor`. It decides which neighbours are level: their
+    numerics are the same, so their difference is a slope, at any resolution.
     """
     loss = losses_of(dataset)
     whole, found = span(loss), minima(loss)
@@ -341,7 +341,7 @@ def ruggedness(
 
 
 def missing_gradients(dataset: xr.Dataset) -> Estimate | None:
-    """Return the share of samples without a gradient among those with a loss that were asked for one, None of none."""
+    """Return the share of samples without a gradient among those with a loss that requested one, None for none."""
     if "grad" not in dataset or "status" not in dataset:
         return None
     lacking = int((dataset["status"] == Status.NO_GRADIENT).sum())
@@ -374,19 +374,19 @@ def losses_of(dataset: xr.Dataset) -> Values:
 
 
 def lines_along(values: Values, axis: int, rank: int | None = None) -> Values:
-    """Return values of samples as lines along an axis of so many, by default all: shape (line, sample, ...)."""
+    """Return values of samples as lines along an axis, by default all: shape (line, sample, ...)."""
     last = (rank or values.ndim) - 1
     moved = np.moveaxis(values, axis, last)
     return moved.reshape(-1, *moved.shape[last:])
 
 
 def known_mean(values: Values) -> float:
-    """Return the mean of values, NaN left out."""
+    """Return the mean of values, without NaN."""
     with warnings.catch_warnings():  # of nothing at all it is NaN
         warnings.simplefilter("ignore", RuntimeWarning)
         return float(np.nanmean(values))
 
 
 def _sides(shape: tuple[int, ...]) -> NDArray[np.intp]:
-    """Return how many steps between samples make each side of the box."""
+    """Return the number of steps between samples along each side of the box."""
     return np.array([max(points - 1, 1) for points in shape])

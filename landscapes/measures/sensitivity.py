@@ -1,4 +1,4 @@
-"""Which pairs of parameters to look at: sensitivity, interaction, ruggedness and gradients, from shared samples."""
+"""Pairs of parameters worth slicing: sensitivity, interaction, ruggedness and gradients, from shared samples."""
 
 from __future__ import annotations
 
@@ -42,19 +42,19 @@ class Design:
 
     @classmethod
     def sobol(cls, space: ParameterSpace, samples: int, *, seed: int) -> Design:
-        """Return the design of so many base points."""
+        """Return the design with this many base points."""
         both = sobol(samples, 2 * space.dim, seed=seed).numpy()
         return cls(space, both[:, : space.dim], both[:, space.dim :])
 
     @property
     def episodes(self) -> int:
-        """How many episodes the whole takes: samples x (1 + 5 dim + crossed pairs); one in each has a gradient."""
+        """Count the episodes: samples x (1 + 5 dim + crossed pairs); one of each sample has a gradient."""
         crossed = min(self.space.dim, CROSSED)
         return len(self.base) * (1 + LINE * self.space.dim + crossed * (crossed - 1) // 2)
 
     @property
     def offsets(self) -> Array:
-        """Where the other points of each short line are from the base point, shape (sample, dim, 4).
+        """Offsets of the other points of each short line from the base point, shape (sample, dim, 4).
 
         Two on either side; near the border of the box the line is shifted inwards by whole steps.
         """
@@ -123,7 +123,7 @@ class Responses:
     def interaction(self) -> Array:
         """Return superset importances of `pairs` as shares of the variance (Liu & Owen 2006, eq. 10), shape (pair,).
 
-        What all effects contribute in which both take part; zero if the loss is a sum of functions of either.
+        The contribution of all effects that involve both parameters; zero if the loss is a sum of functions of either.
         """
         first, second = (self.far[:, [pair[k] for pair in self.pairs]] for k in (0, 1))
         return _mean(np.square(self.loss[:, None] - first - second + self.cross), axis=0) / (4 * self.spread**2)
@@ -143,7 +143,7 @@ class Responses:
         """Return sums of |gradient - slope of the line| and of |gradient| + |slope|, by parameter, shapes (dim,).
 
         The slope is the central difference over a twentieth of the box [loss unit / width of the box]; base points too
-        near the border for one are left out.
+        near the border are left out.
         """
         inner = np.abs(self.offsets.mean(axis=2)) < STEP / 8
         slope = np.where(inner, (self.line[:, :, 2] - self.line[:, :, 1]) / (2 * STEP), np.nan)
@@ -151,16 +151,17 @@ class Responses:
 
 
 def default_samples(dim: int) -> int:
-    """Return how many base points are taken in so many dimensions unless said otherwise: 16, fewer in more than 20."""
+    """Return the default number of base points in this dimension: 16, fewer for more than 20 parameters."""
     return max(MIN_SAMPLES, min(MAX_SAMPLES, MAX_EPISODES // (1 + LINE * dim + CROSSED * (CROSSED - 1) // 2)))
 
 
 def explore(
     objective: Objective, design: Design, checkpoint: Checkpoint, *, follow: Callable[[int], None] = lambda done: None
 ) -> Responses:
-    """Evaluate a design, pieces of it at a time; what `checkpoint` holds already is not evaluated again.
+    """Evaluate a design in parts; results already in `checkpoint` are not evaluated again.
 
-    `follow` hears how many episodes are done. Pairs are crossed of the parameters whose total indices are largest.
+    `follow` receives the number of finished episodes. Only pairs of the parameters with the largest total indices are
+    crossed.
     """
     groups = list(_groups(objective, design))
     done = 0
@@ -183,13 +184,13 @@ def explore(
 
 @dataclass(frozen=True)
 class Pair:
-    """Hold what makes a pair of parameters, by their numbers `dims`, worth a look; None where it was not measured.
+    """The reasons to slice a pair of parameters, given by their numbers `dims`; None where not measured.
 
-    `sensitivity`: total index of the pair, the sum of both less their `interaction` where that was measured: the share
-    of the variance that a slice shows on average; `ruggedness`: sum of both; `disagreement`: |gradient - slope| by
-    |gradient| + |slope|, summed over both, 0 where gradients tell the slope that is seen, 1 where they are zero or
-    opposite. `score`: sensitivity x (1 + all others), where an interaction that was not measured counts as 0. Fields
-    are called as files have them.
+    `sensitivity`: total index of the pair, the sum of both minus their `interaction` where that was measured. It is the
+    share of the variance that a slice shows on average. `ruggedness`: sum of both. `disagreement`: |gradient - slope|
+    by |gradient| + |slope|, summed over both, 0 where gradients equal the slope, 1 where they are zero or opposite.
+    `score`: sensitivity x (1 + all others), where an interaction that was not measured counts as 0. Fields have the
+    same names in files.
     """
 
     dims: tuple[int, int]
@@ -242,7 +243,7 @@ def _evaluate_pairs(
 
 
 def _mean(values: Array, axis: int) -> Array:
-    """Return the mean of what is known, NaN where nothing is."""
+    """Return the mean of known values, NaN for none."""
     known = np.isfinite(values)
     with np.errstate(invalid="ignore"):
         found: Array = np.where(known, values, 0.0).sum(axis) / known.sum(axis)

@@ -1,4 +1,4 @@
-"""Two slices of one plane held against each other: losses, their order, gradients, and where they part."""
+"""Compare two slices of one plane: losses, their order, gradients, and their largest differences."""
 
 from __future__ import annotations
 
@@ -38,15 +38,15 @@ if TYPE_CHECKING:
 PLACING = ("plane", "cut", "boxed", "parameters")  # in a slice's identity: where it lies, not what it is of
 PARTS = {"basis": "directions", "lower": "lower ends", "upper": "upper ends", "origin": "points they go through"}
 ROUNDING = 1e-9  # planes that are no farther apart, relatively, are the same
-ANYTHING = "give the name of an environment as B, which is then sampled on A's plane"
+ANYTHING = "give the name of an environment as B to sample it on A's plane"
 POINTS, RANGE = "of the points", "of A's range"  # what shares are of
 
 
 @dataclass(frozen=True)
 class LossDifference:
-    """Hold how far losses are apart [loss unit]: `median`, 95th percentile, `largest`; and the `range` of A's losses.
+    """The differences of losses [loss unit]: `median`, 95th percentile, `largest`; and the `range` of A's losses.
 
-    Nothing is estimated by the largest, which has no interval.
+    The largest estimates nothing and has no interval.
     """
 
     derived: ClassVar = ("shares",)
@@ -58,14 +58,14 @@ class LossDifference:
 
     @property
     def shares(self) -> dict[str, Estimate]:
-        """Return the three as shares of the range, NaN where A's losses are all the same."""
+        """Return the three as shares of the range, NaN where all of A's losses are equal."""
         whole = self.range or math.nan
         return {name: _share(getattr(self, name), whole) for name in ("median", "p95", "largest")}
 
 
 @dataclass(frozen=True)
 class SlopeDifference:
-    """Hold how gradients differ along the plane, whose sides count as 1: two that are exactly zero agree.
+    """The differences of gradients along the plane, whose sides count as 1: two that are exactly zero agree.
 
     Medians of `cosine` and of `ratio`, B's length to A's; `opposing` is the share of points with a cosine below 0.
     """
@@ -77,7 +77,7 @@ class SlopeDifference:
 
 @dataclass(frozen=True)
 class Parting:
-    """Say where losses are farthest apart: coordinates by the labels of the plane's axes, and both losses there."""
+    """The point with the largest difference: coordinates by the labels of the plane's axes, and both losses."""
 
     place: dict[str, float]
     a: float
@@ -86,7 +86,7 @@ class Parting:
 
 @dataclass(frozen=True)
 class StatusPair:
-    """Count the points that ended in one way in A and in another in B."""
+    """The number of points with one status in A and another in B."""
 
     a: str
     b: str
@@ -95,13 +95,13 @@ class StatusPair:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class SliceComparison:
-    """Hold B against A, two slices of one plane; `a` and `b` name what they are of.
+    """The comparison of B with A, two slices of one plane; `a` and `b` are their names.
 
-    Of `points`, `compared` have a loss in both; `statuses` counts those that ended differently. `slopes` and `cosine`
+    Of `points`, `compared` have a loss in both; `statuses` counts those with different statuses. `slopes` and `cosine`
     are None where either has no gradients, `parting` where no point is compared. `differing` has both values of every
-    setting that is not the same, by its name. `data` are the samples: of refined slices the finest lattice that both
-    sampled. Over them, NaN where either has none: `difference`, B's losses less A's [loss unit], and `cosine`, that of
-    the angle between gradients along the plane.
+    differing setting, by its name. `data` are the samples: of refined slices the finest common lattice. It contains,
+    NaN where either has none: `difference`, B's losses minus A's [loss unit], and `cosine`, that of the angle between
+    gradients along the plane.
     """
 
     a: str
@@ -122,11 +122,11 @@ class SliceComparison:
 
     @property
     def shared(self) -> dict[str, tuple[str, str]]:
-        """Those of the settings that differ which both slices have."""
+        """The differing settings that both slices have."""
         return {name: values for name, values in self.differing.items() if ABSENT not in values}
 
     def settings(self) -> list[str]:
-        """Return a line for each setting that differs, and one for those that only one of the two has."""
+        """Return a line for each differing setting, and one for those that only one of the two has."""
         said = [f"{name}: {a} in A, {b} in B" for name, (a, b) in self.shared.items()]
         for side, letter in enumerate("AB"):
             if alone := [name for name, values in self.differing.items() if values[1 - side] == ABSENT]:
@@ -136,7 +136,7 @@ class SliceComparison:
     def table(self) -> pd.DataFrame:
         """Return a row for each number, indexed by `measure`: its `value`, its interval `low` to `high`, its `unit`.
 
-        The unit of a share is what it is a share of.
+        The unit of a share names its whole.
         """
         import pandas as pd
 
@@ -162,14 +162,14 @@ class SliceComparison:
     def plot(self, width: float | None = None) -> Picture:
         """Draw both losses on one scale, their difference, and the cosine of gradients.
 
-        The picture is matplotlib's figure; `width` is that of a page [mm], and none that of a screen.
+        It returns a matplotlib figure; `width` is that of a page [mm], None that of a screen.
         """
         from ..draw.figure import figure_of
 
         return figure_of(self, width)
 
     def __repr__(self) -> str:
-        """Return in a line what is compared and what came out."""
+        """Return the compared slices and the result in a line."""
         return f"<SliceComparison of {self.a} and {self.b}: rank correlation {self.spearman.value:.3g}>"
 
     def _repr_html_(self) -> str:
@@ -178,12 +178,11 @@ class SliceComparison:
 
 
 def compare_slices(a: xr.Dataset, b: xr.Dataset, *, command: str = "") -> SliceComparison:
-    """Hold the slice B against the slice A of the same plane.
+    """Compare the slice B with the slice A of the same plane.
 
-    Intervals leave out blocks of the plane in turn (`statistics.jackknife`), as neighbours depend on each other: they
-    say what another part of the plane might have given. The 95th percentile is the next larger difference.
-
-    Raises ValueError where the two are not on one plane, of other parameters, in other units, or not finished.
+    Intervals leave out blocks of the plane in turn (`statistics.jackknife`), because neighbours depend on each other:
+    they cover what another part of the plane could have given. The 95th percentile is the next larger difference.
+    Raises ValueError where the two differ in plane, parameters or units, or are not complete.
     """
     check_landscapes(parameters(a), parameters(b), loss_unit(a), loss_unit(b))
     check_planes(plane_of(a), plane_of(b))
@@ -224,33 +223,33 @@ def check_landscapes(ours: Sequence[str], theirs: Sequence[str], unit: str, othe
         pairs = zip(ours, theirs, strict=False)
         first = next(((x, y) for x, y in pairs if x != y), (f"{len(ours)} of them", f"{len(theirs)}"))
         raise ValueError(
-            f"slices to compare have the same parameters; A has {first[0]} where B has {first[1]}, so compare "
+            f"slices to compare need the same parameters; A has {first[0]} where B has {first[1]}, so compare "
             "landscapes of one space"
         )
     if unit != other:
         raise ValueError(
-            f"losses to compare have one unit; A's is {unit or 'none'} and B's {other or 'none'}, so compare "
-            "landscapes that count the same"
+            f"losses to compare need the same unit; A's is {unit or 'none'} and B's {other or 'none'}, so compare "
+            "landscapes with the same loss"
         )
 
 
 def check_planes(ours: Plane, theirs: Plane) -> None:
-    """Raise ValueError where two planes, or their samples, are not the same, and say what of them is not."""
+    """Raise ValueError where two planes, or their samples, differ, and name the difference."""
     if ours.resolution != theirs.resolution:
         sizes = (" x ".join(map(str, one.resolution)) for one in (ours, theirs))
-        raise ValueError("slices to compare have the same points; A has {} and B {}; ".format(*sizes) + ANYTHING)
+        raise ValueError("slices to compare need the same points; A has {} and B {}; ".format(*sizes) + ANYTHING)
     for name, said in PARTS.items():
         one, other = getattr(ours, name), getattr(theirs, name)
         if not torch.allclose(one, other, rtol=ROUNDING, atol=ROUNDING * float(one.abs().max())):
             values = _name_axes(ours, theirs) if name == "basis" else _where_apart(one, other)
-            raise ValueError(f"slices to compare lie on one plane; the {said} differ: {values}; {ANYTHING}")
+            raise ValueError(f"slices to compare need the same plane; the {said} differ: {values}; {ANYTHING}")
 
 
 def check_finished(*slices: xr.Dataset) -> None:
     """Raise ValueError where samples are missing."""
     for name, dataset in zip("AB", slices, strict=False):
         if missing := int((dataset["status"] == Status.MISSING).sum()):
-            raise ValueError(f"{missing} samples of {name} are missing; let what samples it continue first")
+            raise ValueError(f"{missing} samples of {name} are missing; finish sampling it first")
 
 
 def _name_axes(ours: Plane, theirs: Plane) -> str:
@@ -263,7 +262,7 @@ def _where_apart(one: torch.Tensor, other: torch.Tensor) -> str:
 
 
 def parameters(dataset: xr.Dataset) -> list[str]:
-    """Return the names of a slice's parameters, with the scales that they are on."""
+    """Return the names of a slice's parameters, with their scales."""
     return list(scaled_labels([str(name) for name in dataset["dim"].to_numpy()], stored_scales(dataset)))
 
 
@@ -273,7 +272,7 @@ def loss_unit(dataset: xr.Dataset) -> str:
 
 
 def _on_one_lattice(a: xr.Dataset, b: xr.Dataset) -> tuple[xr.Dataset, xr.Dataset]:
-    """Return two slices as `sampled_lattice` does, the same lattice of both, v before u."""
+    """Return two slices as `sampled_lattice` does, on the same lattice, v before u."""
     a, b = (one.transpose("v", "u", ..., missing_dims="ignore") for one in (a, b))
     lacking = [one["status"].to_numpy() == Status.INTERPOLATED for one in (a, b)]
     either = lacking[0] | lacking[1]
@@ -286,14 +285,14 @@ def _on_one_lattice(a: xr.Dataset, b: xr.Dataset) -> tuple[xr.Dataset, xr.Datase
 
 
 def _settings(dataset: xr.Dataset) -> dict[str, Any]:
-    """Return what a slice is of, by its identity, and the versions of packages that made it."""
+    """Return the settings of a slice, from its identity, and the versions of packages that made it."""
     identity = {name: value for name, value in stored_identity(dataset).items() if name not in PLACING}
     settings = {name: value for name, value in identity.get("settings", {}).items() if name != "name"}  # the fidelity's
     return {**identity, "settings": settings, "versions": stored_provenance(dataset).get("versions", {})}
 
 
 def _names(a: xr.Dataset, b: xr.Dataset, differing: dict[str, tuple[str, str]]) -> list[str]:
-    """Name objective and fidelity of both, and of the same ones the first setting that differs."""
+    """Name objective and fidelity of both; if these are equal, the first differing setting."""
     known = [stored_identity(one) for one in (a, b)]
     names = [" · ".join(simulator_parts(one)) for one in known]
     if names[0] == names[1] and differing:
@@ -304,7 +303,7 @@ def _names(a: xr.Dataset, b: xr.Dataset, differing: dict[str, tuple[str, str]]) 
 
 
 def _statuses(a: xr.Dataset, b: xr.Dataset) -> tuple[StatusPair, ...]:
-    """Count the pairs of ways in which points ended differently, the most frequent first."""
+    """Count the pairs of different statuses, the most frequent first."""
     pairs = Counter(zip(*(one["status"].to_numpy().ravel().tolist() for one in (a, b)), strict=True))
     return tuple(
         StatusPair(Status(one).name.lower(), Status(other).name.lower(), count)
@@ -336,7 +335,7 @@ def _cosine(a: xr.Dataset, b: xr.Dataset) -> xr.DataArray | None:
 
 
 def _ratio(ours: Values, theirs: Values) -> Values:
-    """Return how long slopes are, theirs to ours: 1 of two that are zero, NaN where either is not known."""
+    """Return the length of slopes, theirs to ours: 1 of two that are zero, NaN where either is unknown."""
     lengths = [np.linalg.norm(one, axis=-1) for one in (ours, theirs)]
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where((lengths[0] == 0) & (lengths[1] == 0), 1.0, lengths[1] / lengths[0])
@@ -353,7 +352,7 @@ def _part(dataset: xr.Dataset, losses: Sequence[Values], apart: Values) -> Parti
 def _over_blocks(
     statistic: Callable[..., Values], *fields: Values, least: float = -math.inf, most: float = math.inf
 ) -> Estimate:
-    """Estimate a statistic of fields over the plane whose entries belong together, where none of them is NaN."""
+    """Estimate a statistic of matching fields over the plane, where none of them is NaN."""
     known = ~np.any([np.isnan(one) for one in fields], axis=0)
     numbers = np.where(known, np.arange(known.size).reshape(known.shape), np.nan)
 

@@ -1,4 +1,4 @@
-"""The numerical floor of a slice: measured at a few of its samples and kept with it, or at all of them, as a map."""
+"""The numerical floor of a slice: measured at a few of its samples and stored with it, or everywhere, as a map."""
 
 from __future__ import annotations
 
@@ -27,36 +27,36 @@ SAMPLES_EACH, MOST_POINTS = 10, 16  # samples of a slice for each evaluation of 
 
 
 def floor_of(dataset: xr.Dataset) -> Floor | None:
-    """Read the numerical floor from a slice, None where it was not measured or what is there is none."""
+    """Read the numerical floor from a slice, None where it has none."""
     return from_attribute(Floor, dataset.attrs, ATTRIBUTE)
 
 
 def floor_attribute(floor: Floor) -> dict[str, str]:
-    """Return the attribute that a slice holds its numerical floor in, as text."""
+    """Return the text of the attribute in which a slice stores its numerical floor."""
     return to_attribute(ATTRIBUTE, floor)
 
 
 def counted_from(floor: Floor | None) -> float:
-    """Return how far numerics alone should put losses apart [loss unit]; 0 where unknown."""
+    """Return the difference of losses that numerics alone can make [loss unit]; 0 where unknown."""
     return 0.0 if floor is None else float(np.nan_to_num(APART * floor.deviation))
 
 
 def refuse_without_replicas(objective: Objective, *, refined: bool) -> None:
-    """Raise ValueError where there is no numerical floor to map: without replicas, and of a refined slice."""
+    """Raise ValueError where no numerical floor can be mapped: without replicas, and for a refined slice."""
     if refined:
         raise ValueError("--floor evaluates replicas at every sample; got --refine or --budget: leave out one")
     if not objective.replicas():
         raise ValueError(
-            f"{objective.name} has no replicas, so its numerical floor is not known; leave out --floor, or offer the "
-            "same physics computed otherwise: replicas={'shifted grid': fn} of gs.from_torch and its like, or the "
-            "method replicas()"
+            f"{objective.name} has no replicas, so its numerical floor is unknown; leave out --floor, or give it "
+            "replicas that compute the same physics differently: replicas={'shifted grid': fn} in gs.from_torch "
+            "and similar, or the method replicas()"
         )
 
 
 def split_effort(samples: int, replicas: int) -> tuple[int, int]:
-    """Return at how many points of a slice how many of its replicas are evaluated: in all about a tenth of its samples.
+    """Return the numbers of points and of replicas to evaluate: in total about a tenth of a slice's samples.
 
-    Of a small slice these are four points and its first replicas.
+    For a small slice these are four points and its first replicas.
     """
     budget = samples // SAMPLES_EACH
     used = min(replicas, max(1, budget // MIN_POINTS))
@@ -72,8 +72,8 @@ def find_floor(
 ) -> Floor | None:
     """Measure the numerical floor of a slice at a few of its samples; None where its objective has no replicas.
 
-    The samples are those nearest to Sobol points; their own losses are the slice's. A replica is evaluated as what
-    `through` returns of it. Raises what `evaluate_replicas` does.
+    The samples are those nearest to Sobol points; their own losses are the slice's. `through` wraps each replica before
+    it is evaluated. Raises any error of `evaluate_replicas`.
     """
     replicas = objective.replicas()
     if not replicas:
@@ -91,7 +91,7 @@ def find_floor(
 
 
 def spread_samples(dataset: xr.Dataset, points: int, *, seed: int = 0) -> NDArray[np.intp]:
-    """Return the numbers of at most so many samples with a loss, of those that were asked for a gradient.
+    """Return the numbers of at most this many samples with a loss, among those that requested a gradient.
 
     They are spread evenly: the nearest to Sobol points, in fractions of the plane.
     """
@@ -117,7 +117,7 @@ def sample_points(dataset: xr.Dataset) -> Float[Tensor, "sample dim"]:
 
 
 def evaluation_of(dataset: xr.Dataset) -> Evaluation:
-    """Return what was found at all samples of a slice, in the order of its array."""
+    """Return the results at all samples of a slice, in the order of its array."""
     loss, status = dataset["loss"].to_numpy().ravel(), dataset["status"].to_numpy().ravel()
     if "grad" not in dataset:
         return Evaluation(torch.from_numpy(loss), None, torch.from_numpy(status))
@@ -128,11 +128,11 @@ def evaluation_of(dataset: xr.Dataset) -> Evaluation:
 
 
 def map_floor(objective: Objective, dataset: xr.Dataset, replicas: Mapping[str, xr.Dataset]) -> xr.Dataset:
-    """Return how far apart a slice and its replicas are at every sample.
+    """Return the differences between a slice and its replicas at every sample.
 
-    It has `deviation` (v, u), the standard deviation between the losses [loss unit], `cosine` (v, u), the median of the
-    replicas' gradients with the slice's, where there are gradients, and the losses of each `replica`. Its attributes
-    say of which slice it is, and hold the floor over all samples.
+    It has `deviation` (v, u), the standard deviation between the losses [loss unit], and `cosine` (v, u), the median
+    cosine of the replicas' gradients with the slice's, where there are gradients. It also has the losses of each
+    `replica`. Its attributes identify the slice, and contain the floor over all samples.
     """
     own, found = evaluation_of(dataset), {name: evaluation_of(one) for name, one in replicas.items()}
     sides = objective.space.upper - objective.space.lower
@@ -154,7 +154,7 @@ def map_floor(objective: Objective, dataset: xr.Dataset, replicas: Mapping[str, 
 
 
 def median_known(values: Values) -> Values:
-    """Return the median of each column, NaN left out, and NaN where there is nothing else."""
+    """Return the median of each column without NaN; NaN for columns with nothing else."""
     found = np.full(values.shape[1], np.nan)
     known = np.isfinite(values).any(axis=0)
     found[known] = np.nanmedian(values[:, known], axis=0)

@@ -1,13 +1,14 @@
-"""The surface of a landscape in a word, judged at fixed scales: shares of the range and of the box, no sample's width.
+"""The surface of a landscape in a word, judged at fixed scales: shares of the range and of the box.
 
-A minimum counts from a prominence of 1 % of the range on, and so does a turn along a line; noise and numerics count
-where they are larger. Such a count is true of the landscape where the samples tell what lies between them. That is
-tested: losses at random places are held against what the samples around them, with their gradients, predict. Without
-an objective every other sample is held against those left. Where more than 5 % of the places are off by 1 % of the
-range or more, the slice is undersampled. Only the turns stay true then, as a lower bound: finer samples can only add.
+A minimum counts from a prominence of 1 % of the range, and so does a turn along a line; a larger noise or numerical
+floor raises that. Such a count is true of the landscape if the samples determine the losses between them. That is
+tested: losses at random points are compared with a prediction from the samples around them and their gradients. Without
+an objective, every other sample is compared with a prediction from the rest. If more than 5 % of the points are off by
+1 % of the range or more, the slice is undersampled. Only the turns remain valid then, as a lower bound: finer samples
+can only add some.
 
-A landscape that turns often is extremely rugged where losses differ over a distance h by h to a power below 0.7, from
-1/2048 to 1/256 of the box. That takes new evaluations; without them it stays open.
+A landscape that turns often is extremely rugged if differences of losses grow with a power of the distance below 0.7,
+from 1/2048 to 1/256 of the box. That needs new evaluations; without them it stays open.
 """
 
 from __future__ import annotations
@@ -47,11 +48,11 @@ GROUPS = 8  # of starts, one of which is left out at a time
 
 @dataclass(frozen=True, eq=False)
 class Between:
-    """Hold losses of a slice's plane at random places: `place` in steps along each axis of the array, and `loss`.
+    """Losses of a slice's plane at random points: `place` in steps along each axis of the array, and `loss`.
 
-    `rise` is how far the loss differs from the first of them on over each of `DISTANCES`, shape (start, distance).
-    `prominence` [loss unit] is that of the slice's minima, the deepest first: of those looked into no more than what
-    lies on the straight way to a lower one.
+    `rise` is the difference of losses over each of `DISTANCES` from the first ones, shape (start, distance).
+    `prominence` [loss unit] is that of the slice's minima, the deepest first; for examined ones it is at most the
+    barrier on the straight way to a lower one.
     """
 
     place: Values
@@ -70,9 +71,8 @@ def look_between(
 ) -> list[Between]:
     """Evaluate losses between the samples of slices, those of all slices in one batch.
 
-    These are five for each of so many `places` of a slice, and some for each of the minima that its samples show but
-    for the lowest. Along a narrow valley samples have minima that are not there: the straight way to the next has no
-    pass.
+    These are five for each of a slice's `places`, and some for each minimum in its samples except the lowest. Along a
+    narrow valley, samples show false minima: the straight way to the next one has no barrier.
     """
     planes, losses = [plane_of(one) for one in datasets], [losses_of(one) for one in datasets]
     drawn = [_draw(plane.rank, places, seed) for plane in planes]
@@ -93,7 +93,7 @@ def _between(plane: Plane, drawn: Values, ways: _Ways, found: torch.Tensor) -> B
 
 
 def _draw(rank: int, places: int, seed: int) -> Values:
-    """Return random places in shares of the box, and those at `DISTANCES` from each, along a random axis."""
+    """Return random points in shares of the box, and those at `DISTANCES` from each, along a random axis."""
     generator = np.random.default_rng(seed)
     start = generator.random((places, rank))
     axis = np.eye(rank)[generator.integers(rank, size=places)]
@@ -103,7 +103,7 @@ def _draw(rank: int, places: int, seed: int) -> Values:
 
 @dataclass(frozen=True, eq=False)
 class _Ways:
-    """Hold the straight ways from minima of a slice to the nearest lower ones; `prominence` is by the samples."""
+    """The straight ways from minima of a slice to the nearest lower ones; `prominence` is from the samples."""
 
     prominence: Values
     lowest: Values
@@ -140,13 +140,13 @@ def _ways(loss: Values, floor: float) -> _Ways:
 
 @dataclass(frozen=True)
 class Surface:
-    """Hold what a slice's surface is like, and its `word`, None where it is flat or not resolved.
+    """The surface of a slice, and its `word`, None where it is flat or not resolved.
 
-    `minima` and `turns` (mean over lines, for each axis, u first) count from `depth` on [loss unit]; their intervals
-    are counts from a larger and from a smaller one on, see `BAND`. `level` is the share of the box in level regions,
-    `holder` the exponent over short distances, NaN where not known. `off` is the share of places between samples whose
-    loss these do not tell; `probed` whether that was seen by new evaluations. A rugged surface of which it is open
-    whether it is extremely so is rugged `at_least`. `unresolved` says why there is no word.
+    `minima` and `turns` (mean over lines, for each axis, u first) count from `depth` [loss unit]; their intervals are
+    counts for a larger and a smaller depth, see `BAND`. `level` is the share of the box in level regions, `holder` the
+    exponent over short distances, NaN where unknown. `off` is the share of points between samples whose loss the
+    samples do not predict; `probed`: new evaluations tested that. A rugged surface that could be extremely rugged is
+    rugged `at_least`. `unresolved` explains why there is no word.
     """
 
     derived: ClassVar = ("large_flat",)
@@ -176,7 +176,7 @@ class Surface:
         return False if high < LARGE and not self.off.value > UNDERSAMPLED else None
 
     def describe(self) -> str:
-        """Return the numbers that the word is from: "4 minima, and at most 2.9 turns along a side"."""
+        """Return the numbers behind the word: "4 minima, and at most 2.9 turns along a side"."""
         count, most = self.minima.value, max(self.turns, key=lambda one: one.value).value
         said = f"{count:.0f} {'minimum' if count == 1 else 'minima'} and {most:.1f} turns along a side"
         said += f", deeper than {100 * self.depth / self.range:.2g} % of the range"
@@ -188,9 +188,10 @@ class Surface:
 def measure_surface(
     dataset: xr.Dataset, *, floor: float = 0.0, own_range: float | None = None, between: Between | None = None
 ) -> Surface:
-    """Judge the surface of a slice, from its samples and, if it is known, from what lies `between` them.
+    """Judge the surface of a slice, from its samples and, if known, from the losses `between` them.
 
-    `floor` [loss unit] is what noise or numerics alone put losses apart by, `own_range` that of the whole environment.
+    `floor` [loss unit] is the difference that noise or numerics alone can make, `own_range` the range of the whole
+    environment.
     """
     loss = losses_of(dataset)
     whole, floor = span(loss), max(floor, rounding(loss))
@@ -213,7 +214,7 @@ def measure_surface(
 
 
 class _Probed:
-    """Say of the samples of a slice whether they tell what lies between them, by new evaluations."""
+    """Test by new evaluations whether the samples of a slice determine the losses between them."""
 
     def __init__(self, loss: Values, slope: Values | None, depth: float, between: Between, floor: float) -> None:
         error = _nearest([np.abs(one - between.loss) for one in _predictions(loss, slope, between.place)], depth)
@@ -222,12 +223,12 @@ class _Probed:
         self.smooth = self.holder.low >= ROUGH
 
     def doubt(self, word: str) -> str:
-        """Say why a word may not hold, nothing where it does."""
+        """Explain why a word could be wrong; empty where there is no doubt."""
         return ""
 
 
 class _Samples:
-    """Say of the samples of a slice whether they tell what lies between them, by every second of them alone."""
+    """Test by every second sample whether the samples of a slice determine the losses between them."""
 
     def __init__(self, loss: Values, slope: Values | None, depth: float) -> None:
         self.loss, self.slope, self.depth = loss, slope, depth
@@ -239,17 +240,17 @@ class _Samples:
         self.smooth = bool(len(known)) and float(np.mean(known**2)) < EXPLAINED * float(np.mean(rise**2))
 
     def doubt(self, word: str) -> str:
-        """Say why a word may not hold, nothing where it does."""
+        """Explain why a word could be wrong; empty where there is no doubt."""
         every, told = self._halved(), self._told()
         if every != word:
             return f"{word}, but {every} by every second sample"
         if told != (self.prominence > self.depth).sum() and word != RUGGED:
-            return "some minima are no deeper than what samples do not tell"
+            return "some minima are no deeper than the prediction error of the samples"
         largest, off = self._contradiction()
         if off > UNDERSAMPLED:
             return f"gradients contradict the losses at {100 * off:.0f} % of the steps between samples"
         if largest > self.depth and word == VERY_SMOOTH:
-            return f"a step between samples that may be a jump, of {100 * largest / span(self.loss):.2g} % of the range"
+            return f"a step between samples could be a jump, of {100 * largest / span(self.loss):.2g} % of the range"
         return ""
 
     def _halved(self) -> str:
@@ -258,7 +259,7 @@ class _Samples:
         return _word(turns, minima(part).count(self.depth))
 
     def _told(self) -> int:
-        """Count the minima that are twice as deep as samples around them are off."""
+        """Count the minima that are twice as deep as the prediction error of the samples around them."""
         from scipy.ndimage import maximum_filter
 
         around = maximum_filter(np.nan_to_num(self.error), size=3, mode="nearest").ravel()[self.minima.sample]
@@ -266,7 +267,7 @@ class _Samples:
         return int(((deep > self.depth) & ((deep > 2 * around) | (np.arange(len(deep)) == 0))).sum())
 
     def _contradiction(self) -> tuple[float, float]:
-        """Return the largest difference of neighbours that is not explained, and the share that gradients do not."""
+        """Return the largest unexplained difference of neighbours, and the share that contradicts gradients."""
         steps, told = list[Values](), list[Values]()
         for axis in range(self.loss.ndim):
             difference = np.diff(self.loss, axis=axis)
@@ -282,15 +283,15 @@ class _Samples:
 
 
 def _judge(words: Sequence[str], known: _Probed | _Samples, hidden: float) -> tuple[str | None, bool, str]:
-    """Return the word, whether it is one at least, and why there is none; `words` are those of the band of depths."""
+    """Return the word, whether it is a lower bound, and why there is none; `words` are those of the band of depths."""
     if words[0] == RUGGED:  # also where samples are too few: finer ones only add to the turns
         return (EXTREME, False, "") if known.holder.high < ROUGH else (RUGGED, not known.smooth, "")
     if not known.off.value <= UNDERSAMPLED:
-        return None, False, f"the samples do not tell {100 * known.off.value:.0f} % of what lies between them"
+        return None, False, f"the samples do not predict {100 * known.off.value:.0f} % of the points between them"
     if hidden > MOST_FLOOR:
-        return None, False, f"noise or numerics hide what is below {100 * hidden:.0f} % of the range"
+        return None, False, f"noise or numerics hide differences below {100 * hidden:.0f} % of the range"
     if len(set(words)) > 1:
-        return None, False, f"{' or '.join(dict.fromkeys(words))}, by the depth from which minima count"
+        return None, False, f"{' or '.join(dict.fromkeys(words))}, depending on the depth from which minima count"
     doubt = known.doubt(words[1])
     return (None, False, doubt) if doubt else (words[1], False, "")
 
@@ -302,9 +303,9 @@ def _word(turns: float, count: float) -> str:
 
 
 def turning_points(loss: Values, axis: int, depth: float) -> float:
-    """Return how often a line along an axis turns back by at least `depth`, the mean over lines; NaN left out.
+    """Return how often a line along an axis turns back by at least `depth`, the mean over lines, without NaN.
 
-    A line counts where at least half of its samples have a loss.
+    A line counts if at least half of its samples have a loss.
     """
     lines = lines_along(loss, axis)
     lines = lines[np.isfinite(lines).mean(axis=1) >= 0.5]
@@ -314,7 +315,7 @@ def turning_points(loss: Values, axis: int, depth: float) -> float:
 def level_share(loss: Values, floor: float) -> Estimate:
     """Return the share of the box in regions that are level over 2 % of it, or over a sample's width if that is more.
 
-    Where noise hides that only an upper bound is known.
+    Where noise hides that, only an upper bound is known.
     """
     widths = [max(1, round(SIDE * (points - 1))) for points in loss.shape]
     widest = max(width / (points - 1) / SIDE for width, points in zip(widths, loss.shape, strict=True))
@@ -328,10 +329,10 @@ def level_share(loss: Values, floor: float) -> Estimate:
 
 
 def short_exponent(between: Between, floor: float) -> Estimate:
-    """Return the power of the distance by which losses differ over short distances, by their mean absolute difference.
+    """Return the power of the distance with which losses differ over short distances.
 
-    A jump here and there does not lower it: mean absolute differences over a jump grow like the distance. Distances
-    whose differences are within `floor` [loss unit] are left out; NaN where fewer than three are left.
+    It uses mean absolute differences, which a few jumps do not lower: over a jump they grow like the distance.
+    Distances whose differences are within `floor` [loss unit] are left out; NaN where fewer than three remain.
     """
     rises = between.rise[np.isfinite(between.rise).all(axis=1)]
     seen = rises.mean(axis=0) > max(floor, 0.0) if len(rises) >= 2 * GROUPS else np.zeros(0)
@@ -349,7 +350,7 @@ def short_exponent(between: Between, floor: float) -> Estimate:
 
 
 def rounding(loss: Values) -> float:
-    """Return the difference of losses that their own rounding makes, by the type that they were computed in."""
+    """Return the difference of losses that rounding can make, by the type in which they were computed."""
     known = loss[np.isfinite(loss)]
     if not known.size:
         return 0.0
@@ -358,7 +359,10 @@ def rounding(loss: Values) -> float:
 
 
 def _held_out(loss: Values, slope: Values | None, depth: float) -> tuple[Values, Values]:
-    """Return how far every other sample is off what those left predict, NaN at these, and off the nearest of them."""
+    """Return the error of predicting every other sample from the rest, and from the nearest of them.
+
+    It is NaN at the rest.
+    """
     even = (slice(None, None, 2),) * loss.ndim
     coarse, error = loss[even], np.full(loss.shape, np.nan)
     at = np.argwhere(np.ones(loss.shape, bool))
@@ -370,7 +374,7 @@ def _held_out(loss: Values, slope: Values | None, depth: float) -> tuple[Values,
 
 
 def _nearest(errors: Sequence[Values], depth: float) -> Values:
-    """Return the errors of the prediction that is the most often right, and of those alike the nearest."""
+    """Return the errors of the prediction that is most often right, or of the nearest if several are equal."""
 
     def size(error: Values) -> tuple[float, float]:
         known = _finite(error)
@@ -380,9 +384,9 @@ def _nearest(errors: Sequence[Values], depth: float) -> Values:
 
 
 def _predictions(loss: Values, slope: Values | None, places: Values) -> list[Values]:
-    """Return losses at places between samples: by straight lines, and by cubics (Hermite).
+    """Return losses at positions between samples: by straight lines, and by cubics (Hermite).
 
-    Their slopes are those of the samples around and, where there are gradients, these.
+    Their slopes come from the samples around and, if there are any, from gradients.
     """
     linear = _interpolate(loss, None, places)
     order: Literal[1, 2] = 2 if min(loss.shape) > 2 else 1  # of the differences at the border
@@ -392,7 +396,7 @@ def _predictions(loss: Values, slope: Values | None, places: Values) -> list[Val
 
 
 def _interpolate(loss: Values, slope: Values | None, places: Values) -> Values:
-    """Interpolate between the samples around each place, with slopes by a step along each axis, or without.
+    """Interpolate between the samples around each position, with slopes by a step along each axis, or without.
 
     With them each cell is bicubic, its mixed derivative by differences of the gradients: exact for a quadratic.
     """

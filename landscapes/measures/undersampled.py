@@ -1,20 +1,20 @@
-"""What the samples of a slice do not show: jumps, ridges and ripples finer than they are, as a share of its cells.
+"""Features that the samples of a slice miss: jumps, ridges and ripples finer than they are, as a share of its cells.
 
-A cell lies between neighbouring samples: two along a line, four of a plane. It is undersampled if the loss between them
-is not what they tell, in one of two ways. At a point halfway it differs from both the mean of the samples around it and
-what their gradients say (exact for a quadratic) by more than half a step of a ramp through the range of the losses. Or
-a difference of as much keeps more than a quarter of itself while the interval it lies in is halved three times, as a
-jump does; of a slope, steep as it may be, an eighth is left.
+A cell lies between neighbouring samples: two along a line, four in a plane. It is undersampled if the loss between them
+differs from the prediction of the samples, in one of two ways. First, at a point halfway, it differs from both the mean
+of the samples around it and the prediction of their gradients (exact for a quadratic). The difference exceeds half a
+step of a ramp through the range of the losses. Second, a difference of that size keeps more than a quarter of itself
+when its interval is halved three times, as a jump does; a slope, however steep, keeps an eighth.
 
-Cells are drawn at random from three strata, with new evaluations of their losses alone:
+Cells are drawn at random from three strata, with new evaluations of their losses only:
 
 - contradicted: along an edge, the gradients at both ends do not explain the difference between them, or send the cubic
-  through both (Hermite) beyond the ends. That is the trace of what lies between. The edge is bisected.
-- steep: along an edge the loss changes by more than half a step, as its gradients say. The edge is bisected, too.
-- quiet: all others. The loss is asked for in the middle, since what left no trace can only be met.
+  through both (Hermite) beyond the ends. That is the trace of a hidden feature. The edge is bisected.
+- steep: along an edge the loss changes by more than half a step, as its gradients predict. The edge is bisected, too.
+- quiet: all others. The loss is evaluated in the middle, because a feature without a trace can only be found by chance.
 
-Of a slice that has no gradients, or not at every sample, their place is taken by differences of neighbouring losses. Of
-a refined slice the cells that it interpolates count as resolved; how exact they are is said separately.
+In a slice without gradients, or with gradients at only some samples, differences of neighbouring losses replace them.
+Interpolated cells of a refined slice count as resolved; their accuracy is reported separately.
 """
 
 from __future__ import annotations
@@ -50,10 +50,10 @@ Cells = NDArray[np.intp]  # lower corners of cells, shape (count, rank), in arra
 
 @dataclass(frozen=True)
 class Undersampled:
-    """Hold the `share` of a slice's cells whose loss its samples do not show.
+    """The `share` of a slice's cells whose loss its samples miss.
 
-    Of `cells` between samples that did not fail `probed` were looked into, `found` undersampled, and `undecided` as an
-    evaluation failed there, with so many `episodes`. A difference counts from `least` on [loss unit].
+    Of `cells` between samples that did not fail, `probed` were examined, `found` were undersampled, and `undecided`
+    ones had a failed evaluation, in `episodes` evaluations. A difference counts from `least` [loss unit].
     """
 
     share: Estimate
@@ -65,7 +65,7 @@ class Undersampled:
     episodes: int
 
     def format_share(self) -> str:
-        """Return the share with its interval, nothing where it is not known."""
+        """Return the share with its interval, empty where it is unknown."""
         if not math.isfinite(self.share.value):
             return ""
         value, low, high = (100 * part for part in (self.share.value, self.share.low, self.share.high))
@@ -73,27 +73,27 @@ class Undersampled:
         return f"{_round(value)} %{interval if high > low else ''}"
 
     def describe(self) -> str:
-        """Say in a line which share of the cells is undersampled; nothing where that is not known."""
+        """Give the share of undersampled cells in a line; empty where it is unknown."""
         said = self.format_share()
         return f"undersampled cells: {said}" if said else ""
 
     def attribute(self) -> dict[str, str]:
-        """Return the attribute that a slice holds it in, as text."""
+        """Return the text of the attribute in which a slice stores it."""
         return to_attribute(ATTRIBUTE, self)
 
     @classmethod
     def of(cls, dataset: xr.Dataset) -> Undersampled | None:
-        """Read it from a slice, None where the slice has none or what it has is none."""
+        """Read it from a slice, None where the slice has none."""
         return from_attribute(cls, dataset.attrs, ATTRIBUTE)
 
 
 def find_undersampled(
     objective: Objective, dataset: xr.Dataset, *, floor: float = 0.0, seed: int = 0
 ) -> Undersampled | None:
-    """Look between the samples of a slice, at no more than a tenth of its own cost; None where that is too little.
+    """Look between the samples of a slice, at most at a tenth of its own cost; None where that is too little.
 
-    `floor` [loss unit] is the least difference that is more than noise. A slice whose range is zero has steps of zero,
-    so that any difference beyond rounding counts.
+    `floor` [loss unit] is the least difference above the noise. A slice with zero range has steps of zero, so any
+    difference above rounding counts.
     """
     unit, dataset = unit_of(dataset["loss"].to_numpy()), in_unit(dataset)
     loss = losses_of(dataset)
@@ -128,17 +128,17 @@ def find_undersampled(
 
 
 def probes(samples: int, *, grad: bool) -> int:
-    """Return how many losses, at most, are evaluated between so many samples.
+    """Return the largest number of losses to evaluate between this many samples.
 
-    That is a tenth of what the samples cost, if a gradient costs as much as the loss itself; it costs more.
+    That is a tenth of the cost of the samples, if a gradient costs as much as the loss itself; it costs more.
     """
     return samples // COST[grad]
 
 
 def _most(name: str, strata: dict[str, Cells], budget: int, left: int) -> int:
-    """Return how many cells of a stratum may be looked into, so that no more evaluations than are left are used.
+    """Return how many cells of a stratum can be examined with the remaining evaluations.
 
-    Those that are suspected get half of the budget, or what they need of it; the others get the rest by their numbers.
+    Suspected cells get half of the budget, or what they need of it; the others share the rest by their numbers.
     """
     if name == QUIET:
         return left
@@ -154,8 +154,8 @@ def _round(percent: float) -> str:
 def contradicted_cells(dataset: xr.Dataset) -> NDArray[np.bool_]:
     """Return which cells between the samples of a slice are contradicted, with a corner less along each axis.
 
-    A cell with a corner that failed or was not sampled is none. A difference counts from what the slice's own record
-    says on, and without a record from half a step of a ramp through the range.
+    A cell with a failed or unsampled corner does not count. A difference counts from the value in the slice's own
+    record, or from half a step of a ramp through the range.
     """
     known, unit, dataset = Undersampled.of(dataset), unit_of(dataset["loss"].to_numpy()), in_unit(dataset)
     loss = losses_of(dataset)
@@ -166,7 +166,7 @@ def contradicted_cells(dataset: xr.Dataset) -> NDArray[np.bool_]:
 
 
 def _least(loss: Values, floor: float) -> float:
-    """Return the difference that counts from on: half a step of a ramp, and no less than the noise and rounding."""
+    """Return the smallest difference that counts: half a step of a ramp, and no less than noise and rounding."""
     known = np.isfinite(loss)
     least = max(floor, half_step(span(loss), loss.shape))
     return float(max(least, ROUNDING * np.abs(loss[known]).max())) if known.any() else float(least)
@@ -190,7 +190,7 @@ def _strata(loss: Values, slope: Values, least: float) -> dict[str, Cells]:
 
 
 def _edges(loss: Values, slope: Values) -> tuple[list[Values], list[Values]]:
-    """Return for the edges along each axis how far their ends differ, and how far that is not what gradients say."""
+    """Return the differences along the edges of each axis, and the parts that gradients do not explain."""
     gaps, surprises = list[Values](), list[Values]()
     for axis in range(loss.ndim):
         low, high = _pairs(loss, axis)
@@ -202,7 +202,7 @@ def _edges(loss: Values, slope: Values) -> tuple[list[Values], list[Values]]:
 def _surprise(low: Values, high: Values, start: Values, end: Values) -> Values:
     """Return how far the gradients at the ends of edges contradict their losses.
 
-    That is by the rule of the trapezoid, or as far as the cubic through both goes beyond the ends.
+    The measure is the trapezoidal rule, or how far the cubic through both goes beyond the ends.
     """
     found: Values = np.abs(high - low - (start + end) / 2)
     top, bottom = np.maximum(low, high), np.minimum(low, high)
@@ -229,9 +229,9 @@ def _of_cells(edges: Sequence[Values]) -> Values:
 
 @dataclass
 class _Look:
-    """Look into cells of a slice by new evaluations, and count them.
+    """Examine cells of a slice by new evaluations, and count them.
 
-    An answer is 1 for a cell that is undersampled, 0 for one that is not, NaN where an evaluation failed.
+    The result is 1 for an undersampled cell, 0 for another one, NaN where an evaluation failed.
     """
 
     objective: Objective
@@ -243,7 +243,7 @@ class _Look:
     episodes: int = 0
 
     def ask(self, at: Values) -> Values:
-        """Return the losses at places between samples, shape (count, rank), in steps along each axis of the array."""
+        """Return losses at positions between samples, shape (count, rank), in steps along each axis of the array."""
         if not len(at):
             return np.zeros(0)
         self.episodes += len(at)
@@ -251,13 +251,13 @@ class _Look:
         return losses
 
     def middles(self, cells: Cells) -> Values:
-        """Look at the middles of cells, against all their corners."""
+        """Compare the middles of cells with all their corners."""
         corners = [np.array(corner) for corner in np.ndindex((2,) * self.loss.ndim)]
         middle = cells.astype(np.float64) + 0.5
         return self._off(self.ask(middle), [cells + corner for corner in corners], middle)
 
     def edges(self, cells: Cells, kind: str) -> Values:
-        """Bisect of each cell the edge that is the steepest, or contradicted most, towards the larger difference."""
+        """Bisect the steepest or most contradicted edge of each cell, towards the larger difference."""
         low, high = self._worst(cells, kind)
         below, above = self.loss[tuple(low.T)], self.loss[tuple(high.T)]
         low, high, first = low.astype(float), high.astype(float), np.abs(above - below)
@@ -277,7 +277,7 @@ class _Look:
         return np.where(open_ & (np.abs(above - below) > KEPT * first), 1.0, found)
 
     def _worst(self, cells: Cells, kind: str) -> tuple[Cells, Cells]:
-        """Return the ends of the edge of each cell that is to be bisected."""
+        """Return the ends of the edge of each cell to bisect."""
         measure = _edges(self.loss, self.slope)[kind == CONTRADICTED]
         rank = self.loss.ndim
         edges = [
@@ -289,7 +289,7 @@ class _Look:
         return low, low + np.eye(rank, dtype=int)[np.array([axis for axis, _ in edges])[chosen]]
 
     def _off(self, found: Values, around: Sequence[Cells], at: Values) -> Values:
-        """Say where losses are neither the mean of the samples `around` nor what their gradients say, NaN if failed.
+        """Return where losses differ from both the mean of the samples `around` and their gradients, NaN if failed.
 
         The mean of f + g d / 2 over samples on opposite sides is the loss between them where it is quadratic.
         """
@@ -301,17 +301,15 @@ class _Look:
 
 
 def _evaluated(dataset: xr.Dataset) -> int:
-    """Return how many samples of a slice were evaluated: a refined one interpolates others."""
+    """Return the number of evaluated samples of a slice; a refined one interpolates others."""
     return int((dataset["status"] != Status.INTERPOLATED).sum())
 
 
 def _combine(strata: Sequence[tuple[int, int, int]], *, of: int) -> Estimate:
     """Return the share over strata, each a count of cells, of hits and of tries, and its interval.
 
-    It is a share `of` so many cells.
-
-    Each stratum has its exact binomial interval, none where all of it was tried; they are combined by the variances
-    that they stand for (Zou & Donner 2008, Stat. Med. 27, eqs. 3 and 4).
+    It is a share `of` all cells. Each stratum has its exact binomial interval, none where all of it was examined; they
+    are combined by their variances (Zou & Donner 2008, Stat. Med. 27, eqs. 3 and 4).
     """
     value, below, above = 0.0, 0.0, 0.0
     for count, hits, tries in strata:

@@ -1,7 +1,7 @@
-"""A landscape in words, at fixed scales: what its surface is like, whether it jumps, and whether its gradients help.
+"""A landscape in words, at fixed scales: its surface, its jumps, and whether its gradients help.
 
-Each word comes from one measure, is the same however many samples a slice has, and is left out where that measure does
-not resolve it. The rules were set on half of the functions of `benchmarks/words.py`, and on nothing else.
+Each word comes from one measure, does not depend on the number of samples, and is left out where that measure does not
+resolve it. The rules were fixed on half of the functions of `benchmarks/words.py`, and on nothing else.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ POINTS, SMOOTHED = 100, 36  # where gradients are held against slopes, and again
 
 @dataclass(frozen=True)
 class QuotedWord:
-    """Hold a word of somebody else's for a landscape, and whether it was measured too, None where nobody can tell."""
+    """A word from another source for a landscape, and whether it was measured, None where undecided."""
 
     word: str
     measured: bool | None
@@ -57,10 +57,10 @@ class QuotedWord:
 
 @dataclass(frozen=True)
 class Verdict:
-    """Hold what a slice's words are from: its surface, jumps and gradients, and what limits all of them.
+    """The sources of a slice's words: its surface, jumps and gradients, and the limits of all of them.
 
-    `jumps` and `following` are None where they were not looked for. `deviation` [loss unit] is that of noise, None
-    where it was not measured, `floor` that of numerics, None without replicas. Of `samples` so many `failed`.
+    `jumps` and `following` are None where they were not searched. `deviation` [loss unit] is that of noise, None where
+    not measured, `floor` that of numerics, None without replicas. `failed` of the `samples` failed.
     """
 
     derived: ClassVar = ("words", "reasons", "open", "lines")
@@ -81,7 +81,7 @@ class Verdict:
 
     @property
     def reasons(self) -> dict[str, str]:
-        """Each word with the measure that it comes from."""
+        """Each word with its measure."""
         if self.failed > MOSTLY * self.samples:
             return {FAILS: f"no loss at {self.failed / self.samples:.0%} of the samples"}
         if self.surface.flat:
@@ -98,7 +98,7 @@ class Verdict:
 
     @property
     def open(self) -> tuple[str, ...]:
-        """What is not resolved, and why."""
+        """The unresolved measures, and why."""
         if self.failed > MOSTLY * self.samples or self.surface.flat:
             return ()
         said = []
@@ -114,7 +114,7 @@ class Verdict:
 
     @property
     def lines(self) -> tuple[str, ...]:
-        """What limits every word: jumps that were not found, noise, failed samples, and the numerical floor."""
+        """The limits of every word: undetected jumps, noise, failed samples, and the numerical floor."""
         numerics = self.floor.sentence() if self.floor is not None else "numerical floor not measured"
         always = self._noise(), _failed(self.failed, self.samples), numerics
         if self.jumps is None or self.jumps.found or self.surface.flat:
@@ -123,19 +123,19 @@ class Verdict:
 
     @property
     def noise(self) -> float | None:
-        """How far apart 95 % of repeats are at most, over the range; None where that is not known."""
+        """The largest difference of 95 % of repeats, relative to the range; None where unknown."""
         if self.deviation is None or not self.surface.range > 0:
             return None
         return REPEATS * self.deviation / self.surface.range
 
     def compare_words(self, said: Sequence[str]) -> tuple[QuotedWord, ...]:
-        """Return each word of somebody else's, and whether it was measured."""
+        """Return each word from another source, and whether it was measured."""
         fits, unknown = self.reasons, self.undecided
         return tuple(QuotedWord(word, True if word in fits else None if word in unknown else False) for word in said)
 
     @property
     def undecided(self) -> frozenset[str]:
-        """The words of which nobody can say whether they fit: their measure is not resolved, or was not taken."""
+        """The words that can neither be confirmed nor excluded: their measure is not resolved, or was not taken."""
         if self.failed > MOSTLY * self.samples or self.surface.flat:
             return frozenset()
         unknown = set(FOLLOWING_WORDS if self.following is None else self.following.undecided)
@@ -159,12 +159,12 @@ class Verdict:
 
     def _flat(self) -> str:
         if self.surface.range == 0:
-            return "all losses are the same"
+            return "all losses are equal"
         if self.surface.range <= self.surface.floor:
             return (
                 f"losses range over {self.surface.range:.2g}, noise, numerics or rounding over {self.surface.floor:.2g}"
             )
-        return f"losses range over {self.surface.range:.2g}, less than 1 % of what those of the environment do"
+        return f"losses range over {self.surface.range:.2g}, less than 1 % of the environment's range"
 
     def _noise(self) -> str:
         if self.noise is None:
@@ -173,7 +173,7 @@ class Verdict:
 
 
 class CountedObjective(ObjectiveWrapper):
-    """Evaluate an objective where it may be asked, and count all points and those where it may not, which are `cut`."""
+    """Evaluate an objective where it is defined, and count all points and the `cut` ones outside."""
 
     def __init__(self, objective: Objective) -> None:
         super().__init__(objective)
@@ -181,7 +181,7 @@ class CountedObjective(ObjectiveWrapper):
         self.asked = self.cut = 0
 
     def evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool = True) -> Evaluation:
-        """Return losses, and gradients if asked."""
+        """Return losses, and gradients if requested."""
         self.asked += len(x)
         if not self.objective.beyond_box:
             self.cut += int((~in_box(self.space, x)).sum())
@@ -209,10 +209,9 @@ def judge(
     """Judge slices by new evaluations of their objective, those of all slices in one batch.
 
     `deviation` [loss unit] is that of the losses' noise, `floor` the numerical floor, `own_range` [loss unit] the range
-    of the whole environment where that is known. Losses between samples are those of so many `places`, see
-    `look_between`. At most so many `pairs` of each slice are looked into for jumps, which
-    `events` explain. Gradients are held against slopes at so many `points`, and against those of the smoothed loss at
-    `smoothed` of them.
+    of the whole environment, if known. Losses between samples are evaluated at `places`, see `look_between`. At most
+    `pairs` of each slice are examined for jumps, which `events` explain. Gradients are compared with slopes at
+    `points`, and with those of the smoothed loss at `smoothed` of them.
     """
     floors = [least_difference(one, deviation, floor) for one in datasets]
     between = look_between(objective, datasets, floors, places=places, seed=seed)
@@ -242,7 +241,7 @@ def _follow(
 
 
 def judge_samples(dataset: xr.Dataset, *, deviation: float | None = None) -> Verdict:
-    """Judge a slice from its samples alone: jumps are not searched, gradients compared where samples are close."""
+    """Judge a slice from its samples alone: jumps are not searched, gradients are compared where samples are close."""
     floor = floor_of(dataset)
     surface = measure_surface(dataset, floor=least_difference(dataset, deviation or 0.0, floor))
     following = follow_samples(dataset, deviation=float(np.nan_to_num(deviation or 0.0)), points=dataset["loss"].size)
@@ -257,7 +256,7 @@ def measure_range(objective: Objective, *, seed: int = 0) -> float:
 
 
 def least_difference(dataset: xr.Dataset, deviation: float, floor: Floor | None) -> float:
-    """Return the difference of losses from which on it is more than noise and numerics [loss unit]."""
+    """Return the smallest difference of losses above noise and numerics [loss unit]."""
     return max(noise_floor(float(np.nan_to_num(deviation)), dataset["loss"].size), counted_from(floor))
 
 

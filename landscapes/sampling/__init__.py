@@ -1,1 +1,1 @@
-"""How a slice is filled: in which order, within which memory, by which workers."""
+"""Sampling a slice: the order of its points, its memory, and its workers."""

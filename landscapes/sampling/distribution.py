@@ -1,6 +1,7 @@
-"""The points of a slice are evaluated in this process, or by an executor's workers.
+"""Evaluate the points of a slice in this process, or by an executor's workers.
 
-To a worker go how the objective is made and which tiles; back come their evaluations, which this process writes.
+A worker receives how to make the objective and which tiles to evaluate; it returns evaluations, which this process
+writes.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ class WorkersLostError(OSError):
 
 @dataclass(frozen=True, eq=False)
 class FilledTile:
-    """An evaluated tile, with what to warn of."""
+    """An evaluated tile, with its warnings."""
 
     tile: Tile
     found: Evaluation
@@ -47,9 +48,9 @@ class FilledTile:
 
 @dataclass(frozen=True, eq=False)
 class PortableObjective:
-    """An objective that can be sent to another process: there it is made by `made`, once, and kept.
+    """An objective that can be sent to another process, where `made` makes it once.
 
-    Without `made` the objective itself is pickled. `recipe` is what was sent, where this is another process.
+    Without `made` the objective itself is pickled. In the other process, `recipe` is the received form.
     """
 
     own: MemoryBound | None
@@ -58,12 +59,12 @@ class PortableObjective:
 
     @classmethod
     def of(cls, objective: Objective, made: Callable[[], Objective] | None) -> PortableObjective:
-        """Return an objective as it is sent."""
+        """Return an objective in the form to send."""
         return cls(MemoryBound(objective), made)
 
     @property
     def objective(self) -> MemoryBound:
-        """The objective in this process, made where that has not made it yet."""
+        """The objective in this process, made on first use."""
         return make_objective(self.recipe) if self.own is None else self.own
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -72,7 +73,7 @@ class PortableObjective:
             recipe = self.recipe or cloudpickle.dumps(self.made or (lambda: itself))
         except Exception as error:  # whatever part of it cannot travel
             raise ValueError(
-                f"{self.objective.name} cannot be sent to another process ({error}); give sample made=, a function "
+                f"{self.objective.name} cannot be sent to another process ({error}); pass sample made=, a function "
                 "that makes it there"
             ) from error
         return PortableObjective, (None, None, recipe)
@@ -83,9 +84,9 @@ _making = threading.Lock()
 
 
 def make_objective(recipe: bytes) -> MemoryBound:
-    """Return the objective that a pickled function makes, once in this process; only the last one is kept.
+    """Return the objective from a pickled function, made once in this process; only the last one is kept.
 
-    It may hold all of a GPU's memory.
+    It can hold all of a GPU's memory.
     """
     with _making:
         if recipe not in _objectives:
@@ -96,11 +97,11 @@ def make_objective(recipe: bytes) -> MemoryBound:
 
 
 def equal_groups(tiling: Tiling, tiles: Sequence[Tile], batch: int, workers: int) -> list[list[Tile]]:
-    """Group tiles, in their order, so that every worker gets as many groups, equal and of at most `batch` points.
+    """Group tiles, in order, so that every worker gets the same number of equal groups of at most `batch` points.
 
-    Where gradients are at every few samples alone, groups are larger: of at most so many points with a gradient, and of
-    as many points in all as have so many where they are evenly spread. Where tiles are coarse groups are equal to
-    within one, which may exceed that.
+    If only some samples have gradients, groups are larger: of at most that many points with a gradient, and of as many
+    points in total as contain them on average. Where tiles are coarse, groups are equal to within one tile, which can
+    exceed that.
     """
     share = max(tiling.every, 1) ** len(tiling.shape)  # of so many samples one has a gradient
     sizes = [max(tiling.count(tile), share * int(tiling.sloped(tile).sum())) for tile in tiles]
@@ -122,9 +123,9 @@ class Distributed(ObjectiveWrapper):
         self._sent, self._executor = sent, executor
 
     def evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool = True) -> Evaluation:
-        """Return losses, and gradients if asked, at points `x` in the parameters' own units.
+        """Return losses, and gradients if requested, at points `x` in the parameters' own units.
 
-        Raises WorkersLostError where nobody is left to evaluate them, and what the objective raises.
+        Raises WorkersLostError where no worker is left, and any error of the objective.
         """
         parts = torch.tensor_split(x, max(1, min(len(x), workers_of(self._executor))))
         tasks = [(self._sent, number, part, grad) for number, part in enumerate(parts)]
@@ -133,18 +134,18 @@ class Distributed(ObjectiveWrapper):
 
 
 def evaluator(objective: Objective, executor: Executor | None, made: Callable[[], Objective] | None) -> Objective:
-    """Return an objective as it is to be evaluated: here, or by an executor's workers."""
+    """Return the evaluator of an objective: itself, or an executor's workers."""
     sent = PortableObjective.of(objective, made)
     return sent.objective if executor is None else Distributed(sent, executor)
 
 
 def workers_of(executor: Executor) -> int:
-    """Return how many batches an executor works on at a time, at least 1."""
+    """Return the number of batches an executor works on simultaneously, at least 1."""
     return _workers_there(executor) or 1
 
 
 def _workers_there(executor: Executor) -> int:
-    """Return how many batches an executor works on now, 0 where no worker is left."""
+    """Return the number of batches an executor works on now, 0 where no worker is left."""
     client = getattr(executor, "_client", None)  # Dask's
     if client is None:
         return int(getattr(executor, "_max_workers", 1))
@@ -157,9 +158,9 @@ def _workers_there(executor: Executor) -> int:
 def fill_tiles(
     sent: PortableObjective, tiling: Tiling, pending: Sequence[Tile], batch: int, executor: Executor | None
 ) -> Generator[FilledTile, None, None]:
-    """Evaluate the tiles that are pending, here or group by group on an executor's workers; yield each when it is done.
+    """Evaluate the pending tiles, here or group by group on an executor's workers; yield each when it is done.
 
-    What is not begun when that ends is cancelled.
+    Tasks that have not begun when that ends are cancelled.
     """
     if executor is None:
         yield from _fill(sent, tiling, tiling.tiles(), batch, pending)
@@ -170,11 +171,10 @@ def fill_tiles(
 
 
 def run_tasks(executor: Executor, work: Callable[..., T], tasks: Iterable[Sequence[Any]]) -> Iterator[T]:
-    """Let workers do tasks, and yield each result when it is there; what is not begun when that ends is cancelled.
+    """Let workers do tasks, and yield each result when it is ready; tasks not begun when that ends are cancelled.
 
-    Each worker has one task to do and one to do next, so little is computed again where one dies with its results.
-
-    Raises WorkersLostError where nobody is left to do them, and what a task raises.
+    Each worker has one current and one next task, so little work is lost when one dies with its results. Raises
+    WorkersLostError where no worker is left, and any error of a task.
     """
     left, pending = iter(tasks), set[Future[T]]()
     count, there = workers_of(executor), True
@@ -212,7 +212,7 @@ def _evaluate(
 def _fill(
     sent: PortableObjective, tiling: Tiling, tiles: Sequence[Tile], batch: int, pending: Collection[Tile]
 ) -> Iterator[FilledTile]:
-    """Evaluate the points of those tiles that are pending, in order; a point without gradient has one of NaN."""
+    """Evaluate the points of pending tiles, in order; a point without gradient gets one of NaN."""
     objective, pending = sent.objective, set(pending)
     kinds = [Batches(objective, tiling, tiles, batch, pending, grad).evaluations() for grad in (True, False)]
     for tile, having, lacking in zip([tile for tile in tiles if tile in pending], *kinds, strict=True):
@@ -234,14 +234,12 @@ def _merge(having: Evaluation, lacking: Evaluation, sloped: Tensor, tiling: Tili
 
 @dataclass(frozen=True, eq=False)
 class Batches:
-    """The points of tiles that have a gradient, or with `grad` false those that have none, in batches.
+    """The points of tiles with a gradient, or with `grad` false those without, in batches.
 
-    Where all points are of one kind, a batch is whole tiles: `batch` points or more. Otherwise batches span tiles, so
-    that all are full but the last, however few points of the kind a tile has: they hold `batch` points, or the least
-    multiple of it that the points of any tile fit into.
-
-    Batches are the same however many of the tiles are `pending`, so that a run that continues repeats them; each is
-    evaluated at the points of tiles that are.
+    If all points are of one kind, a batch consists of whole tiles: `batch` points or more. Otherwise batches span
+    tiles, so that all but the last are full, even if a tile has few points of the kind. They have `batch` points, or
+    the least multiple of it that fits the points of any tile. Batches do not depend on which tiles are `pending`, so a
+    continued run repeats them; each is evaluated only at pending points.
     """
 
     objective: Objective
@@ -254,7 +252,7 @@ class Batches:
     def evaluations(self) -> Iterator[Evaluation]:
         """Yield the evaluation of every pending tile's points of the kind, in order.
 
-        No more is evaluated ahead than the batch that a tile's last point is in.
+        Nothing beyond the batch with a tile's last point is evaluated in advance.
         """
         batches, dim = self.points(), self.tiling.plane.dim
         ahead, start = Evaluation.empty(dim, grad=self.grad), 0

@@ -1,4 +1,4 @@
-"""Fill a slice: evaluate the points of its tiles, coarse to fine, and write down each tile whole."""
+"""Fill a slice: evaluate the points of its tiles, coarse to fine, and write each tile whole."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ from .distribution import PortableObjective, WorkersLostError, fill_tiles
 
 @dataclass(frozen=True)
 class Progress:
-    """Hold how far a slice is.
+    """The progress of a slice.
 
     `done` of `total` points are finished, `resumed` of them before this run began; `statuses` counts the finished ones.
-    `levels` coarse pictures are complete, each finer than the last, and `level_complete` says that one has just become
-    so: the time to draw `SliceStore.coarse()`.
+    `levels` coarse pictures are complete, each finer than the last. `level_complete`: one has just become complete, so
+    it is time to draw `SliceStore.coarse()`.
     """
 
     done: int
@@ -51,27 +51,27 @@ def sample(
     made: Callable[[], Objective] | None = None,
     conclude: Callable[[xr.Dataset], Mapping[str, Any]] | None = None,
 ) -> xr.Dataset:
-    """Evaluate an objective on a plane and return the slice; what `store` holds already is not evaluated again.
+    """Evaluate an objective on a plane and return the slice; points already in `store` are not evaluated again.
 
-    Up to three points of a store on disk are evaluated again, to see that they are the objective's. Without a store the
-    slice lives in memory. Losses are at all samples, gradients at every so many along each axis, `gradients`, 0 for
-    none; how far apart they are in a store it says itself. `batch` is the number of points per
-    evaluation, rounded up to whole tiles (default: the objective's `preferred_batch`, else one tile); where some
-    samples have no gradient, there are batches of those that have one and batches of the others, as `Batches` says.
-    `progress` is called once at the start and after every tile. Stop it at any moment: the same call continues. The
-    result is bit for bit that of an uninterrupted one, given an objective whose rows do not depend on their batch. A
-    batch that does not fit into memory is halved.
+    Up to three points of a store on disk are evaluated again, to verify that they come from this objective. Without a
+    store the slice is in memory. Losses are at all samples, and `gradients` is the stride of the samples with gradients
+    along each axis, 0 for none; a store has its own stride. `batch` is the number of points per evaluation, rounded up
+    to whole tiles (default: the objective's `preferred_batch`, else one tile). If some samples have no gradient, these
+    and the others have separate batches, as in `Batches`. `progress` is called once at the start and after every tile.
+    You can stop it at any moment: the same call continues. The result is bit for bit that of an uninterrupted one, if
+    rows of the objective do not depend on their batch. A batch that does not fit into memory is halved.
 
-    With an `executor` its workers evaluate batches. Threads share the objective; in a process `made`, a function that
-    can be pickled, makes it once, or else it is pickled itself. Batches are equal then, and of at most `batch` points.
+    With an `executor` its workers evaluate batches. Threads share the objective. In a process, `made`, a function that
+    can be pickled, makes it once; otherwise the objective itself is pickled. Batches are equal then, and of at most
+    `batch` points.
 
-    `conclude` is called with the slice when it is complete, and returns attributes of it that are kept, too. Of one
-    that was finished before it is not called.
+    `conclude` is called with the complete slice, and returns attributes to store with it. It is not called for a slice
+    that was finished before.
 
-    Raises ValueError where `gradients` or `batch` is no whole number, StoreMismatchError where the store was made by
-    other settings or holds other numbers than the objective gives now, TooLargeError where the slice does not fit into
-    memory, DiskFullError and WorkersLostError where filling ended early, which say what is kept, and MemoryError where
-    a single point is too much for the device.
+    Raises ValueError where `gradients` or `batch` is no whole number. Raises StoreMismatchError where the store has
+    other settings or other numbers than the objective gives now, and TooLargeError where the slice does not fit into
+    memory. Raises DiskFullError and WorkersLostError where filling ended early, with a message on what is kept, and
+    MemoryError where a single point is too much for the device.
     """
     gradients = as_stride(gradients)
     if store is None:
@@ -88,7 +88,9 @@ def sample(
     all_levels = 1 + store.tiles()[-1].level
     levels = min(left, default=all_levels)
     for tile in store.damaged_tiles(pending):
-        warnings.warn(f"{store.place}: tile {tile.index} is damaged and computed again", RuntimeWarning, stacklevel=2)
+        warnings.warn(
+            f"{store.place}: tile {tile.index} is damaged and is computed again", RuntimeWarning, stacklevel=2
+        )
 
     def report() -> None:
         nonlocal levels
@@ -117,12 +119,12 @@ def sample(
 
 
 def describe(objective: Objective) -> dict[str, dict[str, Any]]:
-    """Return what an objective says of itself: an environment its fidelity and options, any its name and unit."""
+    """Return an objective's description: fidelity and options of an environment, name and unit of any."""
     return {"identity": objective.identity(), "provenance": {"loss_unit": objective.loss_unit}}
 
 
 def check_store(store: SliceStore, objective: Objective, plane: Plane, *, grad: bool | None = None) -> None:
-    """Raise StoreMismatchError where a store is of another plane or parameters, or lacks gradients or has some."""
+    """Raise StoreMismatchError where a store has another plane, other parameters, or another choice of gradients."""
     wanted: dict[str, Any] = {"plane": plane.record(), **record_parameters(objective.space)}
     wanted |= {} if grad is None else {"gradients": grad}
     check_identity(store.path, wanted=wanted, found={name: store.identity[name] for name in wanted})
@@ -130,9 +132,9 @@ def check_store(store: SliceStore, objective: Objective, plane: Plane, *, grad: 
 
 @contextmanager
 def resumable(store: SliceStore, counts: Counter[Status]) -> Iterator[None]:
-    """Say what is kept where the disk is full or the workers are lost.
+    """Describe what is kept when the disk is full or the workers are lost.
 
-    Raises DiskFullError and WorkersLostError there, and what is raised otherwise.
+    Raises DiskFullError and WorkersLostError then, and any other error unchanged.
     """
     try:
         yield

@@ -1,4 +1,4 @@
-"""Memory of the device: batches are halved where it runs out."""
+"""Memory of the device: batches are halved when it runs out."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from ..objective import Evaluation, Objective, ObjectiveWrapper, evaluate
 SAID = re.compile(
     r"out of memory|out of CUDA|fail\w* to allocate|can't allocate memory|not enough memory", re.IGNORECASE
 )
-ADVICE = "end what else uses the device, or take a lower --fidelity or another --device"
+ADVICE = "end other programs on the device, or use a lower --fidelity or another --device"
 
 
 class MemoryBound(ObjectiveWrapper):
-    """Evaluate an objective at fewer points at a time once its device ran out of memory, down to one.
+    """Evaluate an objective with smaller batches once its device ran out of memory, down to one point.
 
-    That changes no result, given an objective whose rows do not depend on their batch. One that holds memory for all
-    rows it takes at once, such as an environment, is told to hold less by its method `shrink(rows)`.
+    That changes no result, if rows of the objective do not depend on their batch. An objective that holds memory for
+    all rows of a batch, such as an environment, is told to hold less by its method `shrink(rows)`.
     """
 
     def __init__(self, objective: Objective) -> None:
@@ -33,7 +33,7 @@ class MemoryBound(ObjectiveWrapper):
         self._most: int | None = None
 
     def evaluate(self, x: Float[Tensor, "batch dim"], *, grad: bool = True) -> Evaluation:
-        """Return losses, and gradients if asked, at points `x` in the parameters' own units.
+        """Return losses, and gradients if requested, at points `x` in the parameters' own units.
 
         Raises MemoryError where the device has too little memory for a single point.
         """
@@ -46,19 +46,19 @@ class MemoryBound(ObjectiveWrapper):
                 free_memory()  # the arrays of the attempt that failed
                 self._most = len(rows) // 2
                 self.shrink(self._most)
-                self._notes.append(f"{self.name} ran out of memory at {len(rows)} points; going on with {self._most}")
+                self._notes.append(f"{self.name} ran out of memory at {len(rows)} points; continuing with {self._most}")
                 continue
             parts.append(part)
             start += len(rows)
         return Evaluation.join(parts, dim=x.shape[1], grad=grad)
 
     def take_notes(self) -> tuple[str, ...]:
-        """Return what to warn of since this was called last."""
+        """Return the warnings since the last call."""
         notes, self._notes = tuple(self._notes), []
         return notes
 
     def _try(self, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation | None:
-        """Return the evaluation, None where the device has too little memory for so many points."""
+        """Return the evaluation, None where the device has too little memory for this many points."""
         try:
             return evaluate(self.objective, x, grad=grad)
         except (RuntimeError, MemoryError) as error:
@@ -77,7 +77,7 @@ def free_memory() -> None:
 
 @contextmanager
 def sparing_collections() -> Iterator[None]:
-    """Spare what is there to the collections of garbage meanwhile: to look through it takes longer than a batch."""
+    """Exclude existing objects from garbage collection within this block: scanning them takes longer than a batch."""
     gc.collect()
     gc.freeze()
     try:
@@ -87,5 +87,5 @@ def sparing_collections() -> Iterator[None]:
 
 
 def is_out_of_memory(error: BaseException) -> bool:
-    """Whether an error says that the host or a GPU has too little memory."""
+    """Whether an error means that the host or a GPU has too little memory."""
     return isinstance(error, MemoryError | torch.OutOfMemoryError) or bool(SAID.search(str(error)))

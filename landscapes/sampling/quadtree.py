@@ -1,10 +1,10 @@
-"""Where a slice needs samples: a quadtree over its grid, split where neighbours are not explained by their gradients.
+"""Choose the samples of a slice: a quadtree over its grid, split where gradients do not explain neighbours.
 
 A cell lies between points of a lattice, which is every second, fourth, eighth ... point of the grid along each axis and
-the last one; four corners of a plane, two of a line. Inside, the loss is interpolated in two ways: linearly, and by the
-cubic of its losses and gradients (Hermite; of a plane the incomplete bicubic of Adini & Clough 1961, which is exact for
-cubics). A cell counts by the better of the two at the samples that it was tested by: those of the split it comes from,
-and those that have come to lie in it or at its border.
+the last one; a plane's cell has four corners, a line's two. Inside, the loss is interpolated in two ways: linearly, and
+by the cubic of its losses and gradients (Hermite; in a plane the incomplete bicubic of Adini & Clough 1961, which is
+exact for cubics). A cell is judged by the better of the two at its test samples: those of the split it comes from, and
+later ones inside it or at its border.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ INSIDE = 1e-9  # steps of the grid below its upper border
 
 @dataclass
 class Cells:
-    """Hold the cells that are not split: their lower and upper corners, each shape (cell, rank), and their levels.
+    """The cells that are not split: their lower and upper corners, each shape (cell, rank), and their levels.
 
-    A cell of level k is 2^k points wide, or what is left at the upper border. `error` are those of its parent's cubic
-    and of its linear interpolation, shape (cell, 2), and `before` is the better of its grandparent's: NaN where there
-    was none. `weight` is what came of the surprise that its parent held.
+    A cell of level k is 2^k points wide, or the rest at the upper border. `error` are those of its parent's cubic and
+    linear interpolation, shape (cell, 2), and `before` is the better one of its grandparent: NaN where there was none.
+    `weight` is the reliability of its parent's suspicion.
     """
 
     low: Places
@@ -55,7 +55,7 @@ class Cells:
         return self.pick(np.flatnonzero(which))
 
     def pick(self, numbers: NDArray[np.intp]) -> Cells:
-        """Return cells by their numbers, any as often as it is named."""
+        """Return cells by their numbers, with repetitions."""
         return Cells(*(getattr(self, name)[numbers] for name in self.__dataclass_fields__))
 
     def join(self, others: Cells) -> Cells:
@@ -65,10 +65,10 @@ class Cells:
 
 
 class Quadtree:
-    """Hold what is sampled of a grid, and the cells between the samples.
+    """The samples of a grid, and the cells between them.
 
     `loss` [loss unit], NaN where an evaluation failed, and `slope`, by a step of the grid along each axis of the array,
-    have the grid's shape; `sampled` says where they are known. Without gradients all slopes are NaN.
+    have the grid's shape; `sampled` marks known ones. Without gradients all slopes are NaN.
     """
 
     def __init__(self, shape: Sequence[int]) -> None:
@@ -83,7 +83,7 @@ class Quadtree:
 
     @property
     def range(self) -> float:
-        """The range of the losses. Raises ValueError where they are too large to have differences."""
+        """The range of the losses. Raises ValueError where their differences would overflow."""
         known = self.loss[np.isfinite(self.loss)]
         refuse_large(known)
         return float(np.ptp(known)) if known.size else 0.0
@@ -93,23 +93,23 @@ class Quadtree:
         return self._unique(np.concatenate(list(self._corner_places(self.cells).swapaxes(0, 1))))
 
     def add(self, places: Places, loss: Values, slope: Values) -> None:
-        """Take samples: their losses, shape (count,), and slopes by a step of the grid, shape (count, rank)."""
+        """Add samples: their losses, shape (count,), and slopes by a step of the grid, shape (count, rank)."""
         at = tuple(places.T)
         self.loss[at], self.slope[at], self.sampled[at] = loss, slope, True
         self._known = None
 
     def probe(self, places: Places, said: Values) -> Values:
-        """Take what samples tell that were drawn to test what `predict` said of them: return how far off it was.
+        """Add samples that test `predict`, and return its errors.
 
-        Where an evaluation failed that is infinite, but where the interpolation has failures around it, too.
+        A failed evaluation counts as infinite, unless the interpolation has failures around it, too.
         """
         self.probed, self._known = np.concatenate([self.probed, places]), None
         return _distance(said, self.loss[tuple(places.T)])
 
     def suspects(self) -> Values:
-        """Return what error is suspected in each cell [loss unit], zero where it has no point left to sample.
+        """Return the suspected error in each cell [loss unit], zero where it has no point left to sample.
 
-        Where some corners failed and others did not it is infinite, since what fails has a border.
+        It is infinite where only some corners failed, because failures have a border.
         """
         cells, tested = self.cells, self._tested()
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -123,7 +123,7 @@ class Quadtree:
         return np.where((cells.high - cells.low > 1).any(axis=1), found, 0.0)
 
     def unbalanced(self) -> NDArray[np.bool_]:
-        """Say which cells have neighbours that are smaller than half of them: what is finer there may go on in them."""
+        """Return the cells with neighbours less than half as large, whose fine structure can continue in them."""
         cells, found = self.cells, np.zeros(len(self.cells), bool)
         quarter = 2 ** np.maximum(cells.level - 2, 0)[:, None]
         for axis in range(self.rank if self.rank > 1 else 0):
@@ -141,7 +141,7 @@ class Quadtree:
         )
 
     def split_points(self, which: NDArray[np.bool_]) -> Places:
-        """Return the points that have to be sampled to split some cells, those that are not yet."""
+        """Return the points to sample for splitting some cells."""
         places, inside = self._thirds(self.cells.take(which))
         wanted = self._unique(places[inside])
         new: NDArray[np.bool_] = np.logical_not(self.sampled[tuple(wanted.T)])
@@ -163,7 +163,7 @@ class Quadtree:
         self._known = None
 
     def predict(self, places: Values) -> Values:
-        """Return the interpolated loss at places, shape (count, rank), in steps of the grid."""
+        """Return the interpolated loss at positions, shape (count, rank), in steps of the grid."""
         numbers = self._find(places)
         cells = self.cells.pick(numbers)
         at = (places - cells.low) / (cells.high - cells.low)
@@ -192,7 +192,7 @@ class Quadtree:
         )
 
     def _find(self, places: Values) -> NDArray[np.intp]:
-        """Return the number of the cell that each place is in."""
+        """Return the number of the cell that contains each position."""
         names = zip(self.cells.level.tolist(), *self.cells.low.T.tolist(), strict=True)
         number = {name: at for at, name in enumerate(names)}
         inside = np.minimum(places, np.array(self.shape) - 1 - INSIDE).astype(int)
@@ -216,7 +216,7 @@ class Quadtree:
         return places, there & new.any(axis=2)
 
     def _tested(self) -> Values:
-        """Return the largest errors of both interpolations at samples in each cell that are no corners of it.
+        """Return the largest errors of both interpolations at samples in each cell other than its corners.
 
         NaN where there is no such sample, infinite where one failed.
         """
@@ -232,7 +232,7 @@ class Quadtree:
         return self._known
 
     def _off(self, cells: Cells, places: Places) -> Values:
-        """Return how far both interpolations are off at places of each cell, infinitely where one failed."""
+        """Return the errors of both interpolations at positions of each cell, infinite where one failed."""
         at = (places - cells.low[:, None, :]) / (cells.high - cells.low)[:, None, :]
         both, loss = self._interpolate(cells, at), self.loss[self._index(places)]
         lacking = ~np.isfinite(both[..., :1]) & np.isfinite(both[..., 1:])  # gradients, while there are losses
@@ -241,7 +241,7 @@ class Quadtree:
         )
 
     def _trusts_cubic(self) -> NDArray[np.bool_]:
-        """Say for each cell whether gradients have told more than losses alone, as far as both were tested."""
+        """Return for each cell whether gradients predicted better than losses alone, as far as both were tested."""
         tested = self._tested()
         untested: NDArray[np.bool_] = np.asarray(np.isnan(tested).all(axis=1))
         error = np.where(untested[:, None], self.cells.error, tested)
@@ -250,7 +250,7 @@ class Quadtree:
         return trusted
 
     def _surprise(self) -> Values:
-        """Return what error the edges of cells give away: their losses and gradients contradict each other."""
+        """Return the error suggested by the edges of cells, whose losses and gradients contradict each other."""
         cells = self.cells
         places, found = self._corner_places(cells), np.zeros(len(cells))
         loss, slope = self.loss[self._index(places)], self.slope[self._index(places)]
@@ -306,6 +306,6 @@ def _better(errors: Values) -> Values:
 
 
 def _distance(said: Values, found: Values) -> Values:
-    """Return how far interpolated losses are from those that were found, infinitely where one is not there."""
+    """Return the distance of interpolated losses from found ones, infinite where one is missing."""
     off = np.abs(said - found)
     return np.where(np.isnan(said) & np.isnan(found), 0.0, np.where(np.isnan(off), np.inf, off))

@@ -1,10 +1,9 @@
-"""Refine a slice: sample its grid only where neighbours and their gradients do not explain what is between them.
+"""Refine a slice: sample its grid only where gradients do not explain the losses between neighbours.
 
-The coarsest lattice of the quadtree comes first. Then, round after round, the cells that are suspected of an error are
-split, and those beside much smaller ones. Where none is left, points are drawn at random to test the interpolation by;
-they are samples as well. The grid is done once at least nineteen of twenty such points are as exact as was asked for,
-and the cells of the others are split. What a round samples follows from the samples before it, so that one that was
-stopped continues as it would have.
+The coarsest lattice of the quadtree comes first. Then, round after round, cells with a suspected error are split, and
+those next to much smaller ones. When none is left, points are drawn at random to test the interpolation; they are
+samples as well. The grid is done when at least nineteen of twenty such points reach the requested accuracy; the cells
+of the others are split. Each round depends only on earlier samples, so a stopped run continues as it would have.
 """
 
 from __future__ import annotations
@@ -43,11 +42,10 @@ GRAIN = 1 << 16  # of the random numbers that tell rounds apart
 
 @dataclass(frozen=True)
 class Refinement:
-    """Say how fine a slice has to be: to a `share` of the range of its losses, with a `budget` of points at most.
+    """The required accuracy of a slice: a `share` of the range of its losses, with at most `budget` points.
 
-    A budget alone takes ever smaller shares until it is spent.
-
-    Raises ValueError where neither is given, or a share is none.
+    A budget alone takes ever smaller shares until it is spent. Raises ValueError where neither is given, or a share is
+    invalid.
     """
 
     share: float | None = None
@@ -55,13 +53,13 @@ class Refinement:
 
     def __post_init__(self) -> None:
         if self.share is None and self.budget is None:
-            raise ValueError("a slice is refined to a share of the range, or with a budget; got neither")
+            raise ValueError("refining takes a share of the range, or a budget; got neither")
         if self.share is not None and not 0 < self.share < 1:
-            raise ValueError(f"a slice is refined to a share of the range between 0 and 1; got {self.share:g}")
+            raise ValueError(f"refining takes a share of the range between 0 and 1; got {self.share:g}")
 
     @classmethod
     def of(cls, share: float | None, budget: int | None) -> Refinement | None:
-        """Return how fine a slice has to be, None where neither is given."""
+        """Return the required accuracy of a slice, None where neither is given."""
         return None if share is None and budget is None else cls(share, budget)
 
     def check(self, plane: Plane) -> None:
@@ -70,12 +68,12 @@ class Refinement:
         least = math.prod(map(len, axes))
         if self.budget is not None and self.budget < least:
             raise ValueError(
-                f"a slice of this resolution begins with {least} points; got a budget of {self.budget}: take that many "
-                "or more, or a finer resolution, of which a smaller share is enough to begin with"
+                f"a slice of this resolution begins with {least} points; got a budget of {self.budget}: use at least "
+                f"{least}, or a finer resolution, which begins with a smaller share of its points"
             )
 
     def shares(self) -> Iterator[float]:
-        """Yield the shares of the range to go through, ever smaller."""
+        """Yield the shares of the range, ever smaller."""
         if self.share is not None:
             yield self.share
             return
@@ -87,10 +85,10 @@ class Refinement:
 
 @dataclass(frozen=True)
 class Refined:
-    """Say what a refinement came to, as the attribute of its slice has it.
+    """The result of a refinement, as stored in the attribute of its slice.
 
-    Of `points` in the grid `sampled` were evaluated. `error` is what nineteen of twenty others are exact to, as a share
-    of the range, as far as `tested` points at random say, None where there are none or a loss is infinitely far off.
+    Of `points` in the grid `sampled` were evaluated. `error` is the accuracy of nineteen of twenty others, as a share
+    of the range, from `tested` random points, None where there are none or a loss is infinitely far off.
     """
 
     share: float | None
@@ -101,7 +99,7 @@ class Refined:
     error: float | None
 
     def attribute(self) -> dict[str, str]:
-        """Return the attribute that a slice holds it in, as text."""
+        """Return the text of the attribute in which a slice stores it."""
         return {REFINED: json.dumps(asdict(self))}
 
     @classmethod
@@ -112,7 +110,7 @@ class Refined:
         return None
 
     def say(self) -> str:
-        """Say it in a line."""
+        """Describe it in a line."""
         others = f", 95 % of the others to {100 * self.error:.2g} % of the range" if self.error is not None else ""
         return f"{self.sampled} of {self.points} points sampled{others}"
 
@@ -131,18 +129,17 @@ def refine(
 ) -> xr.Dataset:
     """Evaluate an objective where a slice needs it, and return the slice; the other points are INTERPOLATED.
 
-    Their losses are NaN, and what is interpolated is the variable of its own, `interpolated`. Samples are the same bits
-    as in a slice that is sampled everywhere. What `store` holds already is not evaluated again. `progress`, `executor`,
-    `made` and `conclude` are those of `sample`.
-
-    Raises StoreMismatchError where the store was made by other settings, ValueError for a budget that does not cover
-    the coarsest lattice, DamagedError where a finished one is damaged, and what `sample` does.
+    Their losses are NaN; the interpolated values are in the separate variable `interpolated`. Samples have the same
+    bits as in a fully sampled slice. Points already in `store` are not evaluated again. `progress`, `executor`, `made`
+    and `conclude` are those of `sample`. Raises StoreMismatchError where the store has other settings, ValueError for a
+    budget that does not cover the coarsest lattice, DamagedError where a finished one is damaged, and any error of
+    `sample`.
     """
     check_store(store, objective, plane)
     refinement.check(plane)
     if store.ascending:
         if store.path is not None and store.pending():
-            raise DamagedError.of(store.path, "samples are lost", "restore it, or begin again with --force")
+            raise DamagedError.of(store.path, "samples are lost", "restore it, or start again with --force")
         dataset = store.dataset()
     else:
         batch = max(LEAST_BATCH, objective.preferred_batch)
@@ -158,7 +155,7 @@ def refine(
 
 
 def partly_refined(store: SliceStore) -> xr.Dataset:
-    """Return what is sampled of a slice so far."""
+    """Return the present samples of a slice."""
     samples, empty = _Samples(store.shape, store.plane.dim), store.dataset()
     if store.parts is None:
         return empty
@@ -167,7 +164,7 @@ def partly_refined(store: SliceStore) -> xr.Dataset:
 
 
 class _Samples:
-    """Hold what was evaluated of a grid, in the order of its axes, as its pieces have it."""
+    """The evaluations of a grid, in the order of its axes, as in its parts."""
 
     def __init__(self, shape: tuple[int, ...], dim: int) -> None:
         self.loss, self.grad = np.full(shape, np.nan), np.full((*shape, dim), np.nan)
@@ -180,13 +177,13 @@ class _Samples:
         return found
 
     def load(self, checkpoint: Checkpoint) -> None:
-        """Take what is in the checkpoint."""
+        """Load the content of the checkpoint."""
         for name in checkpoint.names():
             if piece := checkpoint.load(name):
                 self.take(piece["at"], piece["loss"], piece["status"], piece.get("grad"))
 
     def take(self, at: Places, loss: Values, status: NDArray[np.int8], grad: Values | None) -> None:
-        """Take evaluations of points."""
+        """Add evaluations of points."""
         index = tuple(at.T)
         self.loss[index], self.status[index] = loss, status
         if grad is not None:
@@ -200,7 +197,7 @@ class _Samples:
 
 @dataclass(eq=False)
 class Refining:
-    """A refinement under way: `tree` holds what is sampled, and interpolates the rest."""
+    """A refinement in progress: `tree` contains the samples, and interpolates the rest."""
 
     objective: Objective
     batch: int
@@ -219,7 +216,7 @@ class Refining:
             self.resumed = int(self.samples.sampled.sum())
 
     def go(self) -> None:
-        """Sample until it is as fine as was asked for, or the budget is spent."""
+        """Sample until the requested accuracy is reached, or the budget is spent."""
         self._report()
         self._evaluate(self.tree.lattice())
         for share in self.refinement.shares():
@@ -249,7 +246,7 @@ class Refining:
         return dataset.assign(interpolated=(dataset["loss"].dims, inside, said)).assign_attrs(about.attribute())
 
     def _refine_to(self, share: float) -> bool:
-        """Split and test until the error is below a share of the range; say whether there is budget left."""
+        """Split and test until the error is below a share of the range; return whether budget is left."""
         passed = False
         while True:
             least = share * self.tree.range
@@ -267,7 +264,7 @@ class Refining:
                 passed = float((off > least).mean()) <= OFF
 
     def _split(self, suspects: Values, least: float) -> bool:
-        """Split the cells that are suspected, the worst first where the budget ends; say whether it went round."""
+        """Split the suspected cells, the worst first where the budget ends; return whether it covered all."""
         order = np.argsort(-suspects, kind="stable")
         which = suspects > least
         new = self.tree.split_points(which)
@@ -284,7 +281,7 @@ class Refining:
         return bool(enough)
 
     def _affordable(self, order: NDArray[np.intp]) -> int:
-        """Return how many of cells, in their order, can be split by what is left of the budget."""
+        """Return how many of the cells, in order, can be split with the remaining budget."""
         low, high = 0, len(order)
         while low < high:
             middle = (low + high + 1) // 2
@@ -294,7 +291,7 @@ class Refining:
         return low
 
     def _test(self) -> Values | None:
-        """Sample some points at random, and return how far off the interpolation was; None without budget."""
+        """Sample some points at random, and return the errors of the interpolation; None without budget."""
         unknown = np.argwhere(np.logical_not(self.tree.sampled))
         count = min(len(unknown), PROBES)
         if count > self._left():
@@ -312,7 +309,7 @@ class Refining:
         return math.inf if budget is None else budget - int(self.tree.sampled.sum())
 
     def _evaluate(self, at: Places) -> None:
-        """Evaluate points that are not kept, a batch at a time, and give the tree all of them."""
+        """Evaluate points that are not stored, a batch at a time, and pass all of them to the tree."""
         new = at[np.logical_not(self.samples.sampled[tuple(at.T)])]
         for start in range(0, len(new), self.batch):
             self._ask(new[start : start + self.batch])

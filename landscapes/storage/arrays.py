@@ -58,10 +58,10 @@ Arrays = dict[str, NDArray[Any]]  # loss, status and, unless sampled without gra
 
 
 def need_of(shape: tuple[int, ...], dim: int, *, grad: bool) -> Need:
-    """Return an upper bound of what sampling a slice takes: memory in addition to what the process holds, and disk.
+    """Return an upper bound of the need of sampling a slice: memory in addition to that of the process, and disk.
 
-    In memory there are four copies of the arrays when it is finished and sorted, and what a picture takes. On the disk
-    there are the files of the tiles, and for a moment the finished slice next to them.
+    Memory has four copies of the arrays when the slice is finished and sorted, and a picture. The disk has the files of
+    the tiles, and for a moment the finished slice next to them.
     """
     points, depth = math.prod(shape), dim if grad else 0
     tiles = math.prod(chunk_counts(shape, list(map(tile_side, shape))))
@@ -70,7 +70,7 @@ def need_of(shape: tuple[int, ...], dim: int, *, grad: bool) -> Need:
 
 
 def refuse_too_large(plane: Plane, path: Path | None, *, grad: bool) -> None:
-    """Refuse a slice that is larger than this machine, in memory alone where there is no path.
+    """Refuse a slice that does not fit on this machine, or in its memory if there is no path.
 
     Raises TooLargeError.
     """
@@ -85,7 +85,7 @@ def refuse_too_large(plane: Plane, path: Path | None, *, grad: bool) -> None:
 def blank(
     identity: Mapping[str, Any], provenance: Mapping[str, Any], units: Sequence[str], *, error: str = ""
 ) -> xr.Dataset:
-    """Return a slice of which nothing is sampled yet; its arrays take no memory, and cannot be written to."""
+    """Return a slice without samples; its arrays take no memory, and cannot be written to."""
     plane, parameters = Plane.from_record(identity["plane"]), identity["parameters"]
     names, shape, unit = AXES[: plane.rank][::-1], plane.resolution[::-1], str(provenance.get("loss_unit", ""))
     arrays: dict[str, Any] = {"loss": (names, _nothing("float64", shape), {"long_name": "loss"})}
@@ -109,9 +109,9 @@ def _nothing(dtype: str, shape: tuple[int, ...]) -> NDArray[Any]:
 
 
 def write_finished(path: Path, dataset: xr.Dataset) -> None:
-    """Write a slice that is complete to a new file, a zarr store in a zip: ascending, in chunks as analysis wants them.
+    """Write a complete slice to a new file, a zarr store in a zip: ascending, in chunks for analysis.
 
-    The same slice makes the same bytes. Chunks are compressed by themselves, what describes them by the zip.
+    The same slice makes the same bytes. Chunks are compressed one by one, their metadata by the zip.
     """
     files: dict[str, Buffer] = {}
     group = zarr.create_group(MemoryStore(files), zarr_format=3)
@@ -144,7 +144,7 @@ def parameters_of(dataset: xr.Dataset) -> list[tuple[str, str]]:
 
 
 def count_statuses(dataset: xr.Dataset) -> dict[str, int]:
-    """Count the points of a slice by how they ended."""
+    """Count the points of a slice by status."""
     status = dataset["status"].to_numpy()
     return {kind.name.lower(): int((status == kind).sum()) for kind in Status}
 
@@ -156,7 +156,7 @@ def _axis(plane: Plane, number: int) -> dict[str, str]:
 
 
 def _about(identity: Mapping[str, Any], provenance: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the attributes of a slice: what it is, in words, and its identity and provenance as JSON."""
+    """Return the attributes of a slice: its description, and its identity and provenance as JSON."""
     over = " and ".join(label.partition(" [")[0] for label in identity["plane"]["labels"])
     made = " ".join(str(provenance[name]) for name in ("created", "command") if provenance.get(name))
     return {
@@ -178,7 +178,7 @@ SIDE, VALUES = 256, 1 << 20  # of a chunk of a finished slice: samples along an 
 
 
 def open_group(path: Path, mode: Literal["r", "r+"] = "r") -> zarr.Group:
-    """Open a folder or a zip of zarr's format 3 alone: format 2 has a codec (pickle) that runs what it reads."""
+    """Open a folder or a zip only of zarr's format 3: format 2 has a codec (pickle) that executes its data."""
     store = ZipStore(path, mode="r") if path.is_file() else path
     return zarr.open_group(store, mode=mode, zarr_format=3, use_consolidated=False)
 
@@ -193,7 +193,7 @@ def create_array(
     codecs: Sequence[Any] = CODECS,
     **attributes: Any,
 ) -> zarr.Array[Any]:
-    """Make an empty array of named dimensions whose torn or altered chunks do not decode."""
+    """Make an empty array with named dimensions whose torn or altered chunks do not decode."""
     return group.create_array(
         name,
         shape=shape,
@@ -208,21 +208,21 @@ def create_array(
 
 
 def analysis_chunks(samples: Sequence[int], *deep: int) -> tuple[int, ...]:
-    """Return the chunk of an array over so many samples along each axis, which may have another dimension after them.
+    """Return the chunk sizes of an array with this many samples along each axis, and possibly another dimension.
 
-    A chunk holds a whole map where that is not large, and of as many components of the gradient as make 8 MB.
+    A chunk has a whole map unless that is large, and as many components of the gradient as make 8 MB.
     """
     sides = tuple(min(count, SIDE) for count in samples)
     return (*sides, *(min(size, max(1, VALUES // math.prod(sides))) for size in deep))
 
 
 def flags(kind: type[IntEnum]) -> dict[str, Any]:
-    """Return the attributes (CF conventions) that say what the codes of an int8 array mean."""
+    """Return the attributes (CF conventions) that name the codes of an int8 array."""
     return {"flag_values": [int(k) for k in kind], "flag_meanings": " ".join(k.name.lower() for k in kind)}
 
 
 def consolidate(store: Path | Store) -> None:
-    """Gather a store's layout in one file, so that plain xarray.open_zarr reads it."""
+    """Gather a store's metadata in one file, for plain xarray.open_zarr."""
     with _QUIET, warnings.catch_warnings():  # not in zarr's specification yet
         warnings.simplefilter("ignore")
         zarr.consolidate_metadata(store)
@@ -236,25 +236,26 @@ class Tile:
 
     @classmethod
     def named(cls, name: str) -> Tile | None:
-        """Return the tile of this name, None where it is no tile's."""
+        """Return the tile of this name, None for another name."""
         return cls(tuple(map(int, name.split("-")))) if re.fullmatch(r"\d+(-\d+)?", name) else None
 
     @property
     def name(self) -> str:
-        """What the file of its samples is called."""
+        """The name of the file of its samples."""
         return "-".join(map(str, self.index))
 
     @property
     def level(self) -> int:
-        """Which square of tiles this one helps to complete: 0 is the first, coarsest picture."""
+        """The square of tiles that this one helps to complete: 0 is the first, coarsest picture."""
         return max(self.index)
 
 
 @dataclass(frozen=True)
 class Tiling:
-    """Say which samples of a slice are in which tile: coarse to fine, or the chunks of a finished slice.
+    """The samples of a slice in each tile: coarse to fine, or the chunks of a finished slice.
 
-    Gradients are at every so many samples along each axis, `every`, 0 for none. `chunks` are the sides of the chunks.
+    `every` is the stride of the samples with gradients along each axis, 0 for none. `chunks` are the sides of the
+    chunks.
     """
 
     plane: Plane
@@ -273,7 +274,7 @@ class Tiling:
 
     @cached_property
     def order(self) -> list[NDArray[np.intp]]:
-        """The samples along each axis in the order in which tiles take them."""
+        """The samples along each axis in the order of tiles."""
         pairs = zip(self.shape, self.sides, strict=True)
         return [np.arange(n) if self.chunks else np.array(coarse_to_fine(n, side)) for n, side in pairs]
 
@@ -285,12 +286,12 @@ class Tiling:
         )
 
     def rows(self, tile: Tile) -> list[NDArray[np.intp]]:
-        """Return the places of a tile's samples along each axis."""
+        """Return the positions of a tile's samples along each axis."""
         parts = zip(tile.index, self.order, self.sides, strict=True)
         return [order[at * side : (at + 1) * side] for at, order, side in parts]
 
     def count(self, tile: Tile) -> int:
-        """Return how many points a tile has."""
+        """Return the number of points of a tile."""
         return math.prod(map(len, self.rows(tile)))
 
     def sloped(self, tile: Tile) -> NDArray[np.bool_]:
@@ -309,7 +310,7 @@ class Tiling:
 
 
 def chunk_counts(shape: Sequence[int], sides: Sequence[int]) -> tuple[int, ...]:
-    """Return how many chunks of these sides are along each axis."""
+    """Return the number of chunks with these sides along each axis."""
     return tuple(-(-points // side) for points, side in zip(shape, sides, strict=True))
 
 
@@ -318,15 +319,15 @@ def _box(index: tuple[int, ...], sides: Sequence[int]) -> tuple[slice, ...]:
 
 
 def tile_side(points: int) -> int:
-    """Return how many of an axis' points make a tile: an eighth of them, at least 4 and at most 16."""
+    """Return the number of an axis' points per tile: an eighth of them, at least 4 and at most 16."""
     return min(points, max(4, min(16, points // 8)))
 
 
 def coarse_to_fine(points: int, side: int) -> list[int]:
-    """Order an axis so that each `side` points in turn spread evenly over the whole of it.
+    """Order an axis so that every `side` consecutive points spread evenly over the whole of it.
 
     The axis is cut into `side` cells, equal to within one point. The first group takes the middle of each cell, the
-    next ones the place in the cell that is farthest (cyclically) from those taken.
+    next ones the position in the cell farthest (cyclically) from those taken.
     """
     edges = [cell * points // side for cell in range(side + 1)]
     orders = {width: _offsets(width) for width in {high - low for low, high in pairwise(edges)}}
@@ -335,9 +336,9 @@ def coarse_to_fine(points: int, side: int) -> list[int]:
 
 
 def _offsets(size: int) -> list[int]:
-    """Order the places of a cell: its middle, then always the first of those farthest from all before, cyclically.
+    """Order the positions of a cell: its middle, then always the first of the farthest from all previous ones.
 
-    Between two that are taken the farthest is halfway, so that gaps wait in a heap, the widest first.
+    Distances are cyclic. Between two taken ones, the farthest is halfway, so gaps wait in a heap, the widest first.
     """
     taken = [size // 2]
     gaps = [_halfway(taken[0], size, size)]
@@ -352,7 +353,7 @@ def _offsets(size: int) -> list[int]:
 
 
 def _halfway(start: int, width: int, size: int) -> tuple[int, int, int, int]:
-    """Return a gap between taken places of a cycle as the heap sorts it: how far its middle is, and where that is."""
+    """Return a gap between taken positions of a cycle as a heap key: the distance of its middle, and its position."""
     middles = ((start + width // 2) % size, (start + width - width // 2) % size)  # of an odd gap there are two
     return -(width // 2), min(middles), start, width
 
@@ -360,7 +361,7 @@ def _halfway(start: int, width: int, size: int) -> tuple[int, int, int, int]:
 class Chunks:
     """Read the samples of a finished slice, a chunk at a time, each with a checksum.
 
-    A chunk counts when it decodes and its checksum is right. Copies that xarray wrote have no checksums.
+    A chunk counts if it decodes and its checksum is right. Copies written by xarray have no checksums.
     """
 
     def __init__(self, open_it: Callable[[], zarr.Group], shape: tuple[int, ...], sides: tuple[int, ...]) -> None:
@@ -381,16 +382,16 @@ class Chunks:
 
     @classmethod
     def open(cls, path: Path) -> tuple[xr.Dataset, Path, Chunks]:
-        """Return a finished slice as it would be without samples, its path and its chunks.
+        """Return a finished slice without samples, its path and its chunks.
 
-        Raises DamagedError where its layout or its axes are not what was written.
+        Raises DamagedError where its layout or its axes differ from what was written.
         """
         check_layouts(path)
         try:
             group = open_group(path)
             status = group["status"]
             if not isinstance(status, zarr.Array):
-                raise TypeError("its status is no array")
+                raise TypeError("its status is not an array")
             return _read_blank(path, group), path, cls(lambda: group, status.shape, status.chunks)
         except DamagedError:
             raise
@@ -399,14 +400,14 @@ class Chunks:
 
     @classmethod
     def written(cls, path: Path, dataset: xr.Dataset) -> tuple[xr.Dataset, Path, Chunks]:
-        """Return the same of a slice that was just written there; nothing is read before a sample is wanted."""
+        """Return the same for a slice that was just written; it reads nothing before a sample is needed."""
         arrays = {name: dataset.variables[name] for name in SAMPLES if name in dataset}
         empty = {name: one.copy(data=_nothing(one.dtype.name, one.shape)) for name, one in arrays.items()}
         shape = dataset["status"].shape
         return dataset.assign(empty), path, cls(lambda: open_group(path), shape, analysis_chunks(shape))
 
     def read(self, tile: Tile) -> Arrays | None:
-        """Return the samples of a chunk, None where they are not what was written."""
+        """Return the samples of a chunk, None where they differ from what was written."""
         try:
             values = {name: np.asarray(array[_box(tile.index, self.sides)]) for name, array in self._arrays.items()}
             known = None if self._sums is None else int(np.asarray(self._sums[tile.index]))
@@ -416,13 +417,13 @@ class Chunks:
 
 
 def _read_blank(path: Path, group: zarr.Group) -> xr.Dataset:
-    """Return a finished slice as it would be without samples, from its plane, which its axes must agree with."""
+    """Return a finished slice without samples, from its plane, which must match its axes."""
     about, arrays = attributes_of(group), dict(group.arrays())
     stored = json.loads(str(about["identity"]))
     identity, provenance = current_identity(stored), current_provenance(json.loads(str(about["provenance"])), stored)
     units = [str(unit) for unit in np.asarray(arrays["unit"][:])]
     if attributes_of(arrays["unit"]).get("checksum", sums := text_sum(units)) != sums:
-        raise damage(path / "unit", "it is not what was written")
+        raise damage(path / "unit", "it differs from what was written")
     empty = blank(identity, provenance, units)
     axes = {str(name): one.to_numpy() for name, one in empty.coords.items()}
     check_axes(path, group, axes, list(map(str, empty.data_vars)))
@@ -437,7 +438,7 @@ def _read_blank(path: Path, group: zarr.Group) -> xr.Dataset:
 
 
 def tile_sum(index: tuple[int, ...], values: Arrays) -> int:
-    """Return the checksum of a tile, at least 1: of its place, and of the names and the content of its arrays."""
+    """Return the checksum of a tile, at least 1: of its position, and of the names and the content of its arrays."""
     total = zlib.crc32(str(index).encode())
     for name in sorted(values):
         total = zlib.crc32(np.ascontiguousarray(values[name]).tobytes(), total)
@@ -467,7 +468,7 @@ ANEW = "restore it, or sample the slice again in another folder"
 
 
 def check_layouts(path: Path) -> None:
-    """Raise DamagedError, naming the file, where how an array is stored is not readable or not what the index says."""
+    """Raise DamagedError, naming the file, where an array's layout is unreadable or contradicts the index."""
     at = path
     try:
         with _files(path) as read:
@@ -476,12 +477,12 @@ def check_layouts(path: Path) -> None:
             index = root.get("consolidated_metadata", {"metadata": {}})  # copies that xarray wrote may have none
             known = index.get("metadata") if isinstance(index, dict) else None
             if not isinstance(known, dict) or not (known or "consolidated_metadata" not in root):
-                raise damage(path, "the index of its arrays is not what it was made")
+                raise damage(path, "the index of its arrays differs from what was written")
             for name in known or [name for name in (*SAMPLES, *AXES, "dim", "unit") if (path / name).is_dir()]:
                 at = path / name / ROOT
                 layout = _object(read(f"{name}/{ROOT}"))
                 if layout.get("node_type") != "array" or known.get(name, layout) != layout:
-                    raise damage(path / name, "its layout is not what the store's index says")
+                    raise damage(path / name, "its layout contradicts the store's index")
     except DamagedError:
         raise
     except Exception as error:  # a damaged zip raises anything
@@ -489,13 +490,13 @@ def check_layouts(path: Path) -> None:
 
 
 def check_axes(path: Path, group: zarr.Group, axes: Mapping[str, NDArray[Any]], values: Sequence[str]) -> None:
-    """Raise DamagedError where a slice lacks arrays, `axes` or other `values`, or where an axis is not what it was."""
+    """Raise DamagedError where a slice lacks arrays, `axes` or other `values`, or where an axis has changed."""
     wanted = {*axes, *values}
     if not wanted <= set(group.array_keys()):
         raise damage(path, f"it needs the arrays {', '.join(sorted(wanted))}")
     for name, axis in axes.items():
         if not np.array_equal(_values(path / name, group[name]), axis):
-            raise damage(path / name, "it is not what the store's identity says")
+            raise damage(path / name, "it contradicts the store's identity")
 
 
 def _values(path: Path, array: Any) -> NDArray[Any]:
@@ -507,7 +508,7 @@ def _values(path: Path, array: Any) -> NDArray[Any]:
 
 @contextmanager
 def _files(store: Path) -> Iterator[Callable[[str], bytes]]:
-    """Give what reads a file of a store, a folder or a zip, by its name in it."""
+    """Return a reader for the files of a store, a folder or a zip, by name."""
     if store.is_file():
         with ZipFile(store) as archive:
             yield archive.read
@@ -516,9 +517,9 @@ def _files(store: Path) -> Iterator[Callable[[str], bytes]]:
 
 
 def read_layout(store: Path) -> dict[str, Any]:
-    """Return how a store, a folder or a zip, is laid out, with its attributes.
+    """Return the layout of a store, a folder or a zip, with its attributes.
 
-    Raises whatever a file raises that is damaged or something else.
+    Raises any error of a damaged or different file.
     """
     with _files(store) as read:
         return _object(read(ROOT))
@@ -527,12 +528,12 @@ def read_layout(store: Path) -> dict[str, Any]:
 def _object(content: bytes) -> dict[str, Any]:
     found = json.loads(content)
     if not isinstance(found, dict):
-        raise TypeError("it is no JSON object")
+        raise TypeError("it is not a JSON object")
     return found
 
 
 def is_torn(archive: Path) -> bool:
-    """Whether a file is a finished slice's, empty or as it begins, and does not open any more."""
+    """Whether a file is a finished slice's, empty or truncated, and does not open."""
     with archive.open("rb") as file:
         begins = file.read(64)
     try:
@@ -542,5 +543,5 @@ def is_torn(archive: Path) -> bool:
 
 
 def damage(path: Path, why: str) -> DamagedError:
-    """Return what to raise for a file of a slice that is not what was written."""
+    """Return the error for a file of a slice that differs from what was written."""
     return DamagedError.of(path, why, ANEW)

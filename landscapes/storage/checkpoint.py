@@ -1,7 +1,7 @@
 """The checkpoint of a study: its arrays by name in a folder, each written whole, so that it can be stopped.
 
-Every part says which study it is of, so that one from elsewhere counts as damaged. What a study's simulator said at a
-few points when it began is a part of its own, by which it is verified before it is continued.
+Every part names its study, so one from another study counts as damaged. A separate part has the results of the study's
+simulator at a few points when it began. They verify it before it is continued.
 """
 
 from __future__ import annotations
@@ -32,23 +32,23 @@ AGAIN = "it is computed again"
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """Hold the arrays of a study in `folder`, together with what decides its numbers, whose digest is `study`."""
+    """The arrays of a study in `folder`, with the settings that decide its numbers; their digest is `study`."""
 
     folder: Path
     study: str = ""
 
     @classmethod
     def open(cls, folder: Path, identity: Mapping[str, Any], *, what: str, force: bool = False) -> Checkpoint:
-        """Continue a study of the same settings, or begin one; `force` begins again where another one is.
+        """Continue a study with the same settings, or start one; `force` starts again over another one.
 
-        Raises ValueError where the folder holds something else, StoreMismatchError where it holds another study, and
-        StoreError where another process fills the study that is to be begun again.
+        Raises ValueError where the folder contains something else, StoreMismatchError where it contains another study,
+        and StoreError where another process fills the study to be replaced.
         """
         wanted, path = plain_json({"kind": what, **identity}, f"a {what}'s identity"), folder / SETTINGS
         if not path.exists():
             refuse_others(folder, visible_files(folder), what)
         if path.exists():
-            with reading(path, f"it is no study's or damaged: write elsewhere with --out, or delete {folder}"):
+            with reading(path, f"it belongs to no study or is damaged: write elsewhere with --out, or delete {folder}"):
                 found = read_json(path)
                 text(found["kind"])
             if not force:
@@ -61,19 +61,17 @@ class Checkpoint:
         return cls(folder, digest(wanted))
 
     def verify(self, objective: Objective, *, of: str = "") -> None:
-        """Hold an objective against what it said when the study began; where it begins, keep what it says.
+        """Compare an objective with its results when the study began; at the beginning, store its results.
 
-        Three points of its space are evaluated with their gradients. In a study of several objectives it is the one
-        `of` the part of this name.
-
-        Raises StoreMismatchError where it says other numbers now, and DamagedError where there are parts and not what
-        the study began with.
+        Three points of its space are evaluated with their gradients. A study of several objectives has a part for each,
+        `of` this name. Raises StoreMismatchError where its numbers differ now, and DamagedError where there are parts
+        but not those results.
         """
         name, x = f"{PROBES}-{of}" if of else PROBES, objective.space.sobol(POINTS, seed=0)
-        path, todo = self._path(name), f"restore it, or begin {self.folder} again with --force"
+        path, todo = self._path(name), f"restore it, or start {self.folder} again with --force"
         if not path.exists():
             if any(map(self._is_ours, [of] if of else self.names())):
-                raise DamagedError.of(path, "it is missing, so nothing says what the other pieces are of", todo)
+                raise DamagedError.of(path, "it is missing, so the other parts cannot be identified", todo)
             now = evaluate(objective, x, grad=True)
             self.save(name, **{part: getattr(now, part).numpy() for part in ("loss", "grad", "status")})
             return
@@ -84,11 +82,11 @@ class Checkpoint:
             known = slope.shape[1]
         if known != objective.space.dim:
             has = f"{objective.name} has {objective.space.dim}"
-            raise StoreMismatchError(f"{self.folder} is a study of {known} parameters, and {has}; {todo}")
+            raise StoreMismatchError(f"{self.folder} is a study of {known} parameters, but {has}; {todo}")
         verify(objective, [StoredPoints(self.folder, "study", x, then, True)])
 
     def _is_ours(self, name: str) -> bool:
-        """Whether a part is there, whole and of this study; those of earlier versions do not say."""
+        """Whether a part exists, is whole and belongs to this study; those of earlier versions do not say."""
         try:
             self.read(name)
         except (DamagedError, FileNotFoundError):
@@ -96,7 +94,7 @@ class Checkpoint:
         return True
 
     def load(self, name: str) -> dict[str, NDArray[Any]] | None:
-        """Return the arrays of a part, None where it is missing or damaged; the latter raises a warning, too."""
+        """Return the arrays of a part, None where it is missing or damaged; the latter also raises a warning."""
         if not self._path(name).exists():
             return None
         try:
@@ -106,14 +104,14 @@ class Checkpoint:
             return None
 
     def read(self, name: str, todo: str = AGAIN) -> dict[str, NDArray[Any]]:
-        """Return the arrays of a part. Raises DamagedError, which says what `todo`, where it is damaged."""
+        """Return the arrays of a part. Raises DamagedError, with the advice `todo`, where it is damaged."""
         path = self._path(name)
         with reading(path, todo), path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
             found = dict(arrays)
             if str(found.pop(NAME_KEY, "")) != name:
                 raise ValueError("it is another part")
             if str(found.pop(STUDY_KEY, None)) != self.study:
-                raise ValueError("it is not of this study, or of an earlier version, which did not say")
+                raise ValueError("it belongs to another study, or to an earlier version without a name")
             return found
 
     def save(self, name: str, **arrays: Any) -> None:
@@ -122,14 +120,14 @@ class Checkpoint:
             np.savez(file, **{NAME_KEY: np.array(name), STUDY_KEY: np.array(self.study), **arrays})
 
     def load_or_compute(self, name: str, compute: Callable[[], Mapping[str, Any]]) -> dict[str, NDArray[Any]]:
-        """Return the arrays of a part, which are computed and saved where it is missing or damaged."""
+        """Return the arrays of a part, computed and saved where it is missing or damaged."""
         if (found := self.load(name)) is None:
             found = {key: np.asarray(value) for key, value in compute().items()}
             self.save(name, **found)
         return found
 
     def names(self) -> list[str]:
-        """Return the names of the parts, in order, but for what the study is verified by."""
+        """Return the names of the parts, in order, without those for verification."""
         paths = (self.folder / PARTS).glob("[!.]*.npz")
         return sorted(path.stem for path in paths if not path.stem.startswith(PROBES))
 

@@ -1,7 +1,7 @@
 """Files and folders that appear whole or not at all.
 
-What is being made lies in a hidden folder next to its place, which its maker holds by a lock as long as it lives. So
-what a process that was killed has left is known at once, by anyone and on any clock: nobody holds it.
+Work in progress is in a hidden folder next to its final path; its process holds a lock on it. So anyone can recognise
+the remains of a killed process at once, without a clock: nobody holds the lock.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ MAKING = re.compile(r"\..+\.[0-9a-f]{32}\.making", re.DOTALL)  # the hidden fold
 
 
 def resolve(path: str | Path) -> Path:
-    """Return a path from the root, without links; raises ValueError for links that lead in a circle."""
+    """Return an absolute path without links; raises ValueError for links that lead in a circle."""
     try:
         os.stat(path)
     except OSError as error:
         if error.errno == errno.ELOOP:
-            raise ValueError(f"{path} leads in a circle, by symbolic links; give another path") from None
+            raise ValueError(f"{path} leads in a circle of symbolic links; use another path") from None
     return Path(os.path.realpath(path))
 
 
 def make_folder(folder: Path) -> None:
-    """Make a folder and those it is in, where they are missing, however deep: `mkdir` calls itself for each."""
+    """Make a folder and its missing parents, at any depth: `mkdir` calls itself for each."""
     if not folder.is_dir():  # which raises OSError for a path that is too long, before any of it is made
         for one in (*reversed(folder.parents), folder):
             one.mkdir(exist_ok=True)
@@ -45,9 +45,9 @@ def make_folder(folder: Path) -> None:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Give a path of its own to write to, and put what was written in the place of `path` at the end.
+    """Give a temporary path to write to, and move the result to `path` at the end.
 
-    An empty folder there, which a damaged disk may leave instead of a file, is replaced; one with files is not.
+    An empty folder there, which a damaged disk can leave instead of a file, is replaced; one with files is not.
     """
     with _hidden_folder(path) as folder:
         partial = folder / f"{path.name}.partial"
@@ -58,23 +58,23 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def visible_files(folder: Path) -> list[Path]:
-    """Return what a folder holds, but for hidden files: a process that was killed may have left what it was making.
+    """Return the content of a folder without hidden files: a killed process can leave unfinished work.
 
     Raises ValueError where a file is in its place.
     """
     if folder.exists() and not folder.is_dir():
-        raise ValueError(f"{folder} is a file and no folder; give another path")
+        raise ValueError(f"{folder} is a file, not a folder; use another path")
     return [path for path in folder.iterdir() if not path.name.startswith(".")] if folder.exists() else []
 
 
 def print_width(name: str, picture: str) -> float | None:
-    """Return for how wide a page [mm] a file of this name is a print of a picture, None where it is none."""
+    """Return the page width [mm] for which a file of this name is a print of a picture, None if it is none."""
     found = re.fullmatch(rf"{re.escape(Path(picture).stem)}-(\d+(?:\.\d+)?)mm\.(?:pdf|svg)", name)
     return float(found[1]) if found else None
 
 
 def other_files(folder: Path, ours: Collection[str], picture: str) -> list[Path]:
-    """Return what a folder holds beside files of our names and prints of a picture."""
+    """Return the content of a folder except files of our names and prints of a picture."""
     return [file for file in visible_files(folder) if not _is_ours(file, ours, picture)]
 
 
@@ -90,18 +90,17 @@ def _is_ours(file: Path, ours: Collection[str], picture: str) -> bool:
 
 
 def write_json(path: Path, record: object) -> None:
-    """Write a JSON file; its numbers are as Python writes them, NaN and Infinity included."""
+    """Write a JSON file; its numbers are as Python writes them, including NaN and Infinity."""
     with replacing(path) as partial:
         partial.write_text(json.dumps(record, indent=1) + "\n")
 
 
 @contextmanager
 def placing(path: Path, *, overwrite: bool, check: Callable[[], None] = lambda: None) -> Iterator[Path]:
-    """Give a folder's path of its own to build at, and rename it to `path` at the end, unless that is taken by then.
+    """Give a temporary folder to build in, and rename it to `path` at the end, unless that is taken by then.
 
-    `check` is called just before a folder that is there is replaced, to refuse that.
-
-    Raises FileExistsError where another process has made it meanwhile, and what `check` raises.
+    `check` is called just before an existing folder is replaced, and can refuse that. Raises FileExistsError where
+    another process has made it meanwhile, and any error of `check`.
     """
     with _hidden_folder(path) as folder:
         new, old = folder / f"{path.name}.partial", folder / f"{path.name}.replaced"
@@ -121,7 +120,7 @@ def placing(path: Path, *, overwrite: bool, check: Callable[[], None] = lambda: 
 
 
 def discard(folder: Path) -> None:
-    """Remove a folder at once, if it is there: killed in the middle of it, nothing is left under its name."""
+    """Remove a folder at once, if it exists: after a kill, nothing is left under its name."""
     _clear_left(folder)
     if folder.exists():
         with _hidden_folder(folder) as gone, contextlib.suppress(FileNotFoundError):  # another process was quicker
@@ -129,7 +128,7 @@ def discard(folder: Path) -> None:
 
 
 def tidy(folder: Path) -> None:
-    """Remove what processes that were killed were making in a folder, at any depth; what a living one makes stays."""
+    """Remove the unfinished work of killed processes in a folder, at any depth; that of running ones stays."""
     for parent, names, _ in os.walk(folder):
         for name in [name for name in names if MAKING.fullmatch(name)]:
             names.remove(name)
@@ -138,7 +137,7 @@ def tidy(folder: Path) -> None:
 
 @contextmanager
 def _hidden_folder(path: Path) -> Iterator[Path]:
-    """Give a hidden folder beside `path`, held while something is made in it; clear away those that nobody holds."""
+    """Give a hidden folder next to `path`, locked during use; clear away unlocked ones."""
     make_folder(path.parent)
     _clear_left(path)
     folder, lock = _hold(path)
@@ -150,7 +149,7 @@ def _hidden_folder(path: Path) -> Iterator[Path]:
 
 
 def _hold(path: Path) -> tuple[Path, int]:
-    """Make a hidden folder beside `path` and hold it; return it with the descriptor that does."""
+    """Make a hidden folder next to `path` and lock it; return it with the descriptor of the lock."""
     while True:
         folder = path.with_name(f".{path.name}.{uuid.uuid4().hex}.making")
         folder.mkdir()
@@ -170,7 +169,7 @@ def _clear_left(path: Path) -> None:
 
 
 def _clear(folder: Path) -> None:
-    """Remove a hidden folder that nobody holds."""
+    """Remove an unlocked hidden folder."""
     with contextlib.suppress(OSError):
         lock = os.open(folder, os.O_RDONLY | os.O_NOFOLLOW)
         try:
@@ -186,7 +185,7 @@ HALF = r"\.[0-9a-f]{32}\.partial"  # the end of the name of a file that zarr has
 
 
 def store_files(arrays: Iterable[str], *others: str) -> Ours:
-    """Return what tells the files of a zarr store of these arrays, and `others` in its folder, from all else."""
+    """Return the pattern for the files of a zarr store with these arrays, and `others` in its folder."""
     names = "|".join(map(re.escape, arrays))
     root, own = rf"zarr(?:\.json|{HALF})", "".join(f"|{re.escape(one)}" for one in others)
     return re.compile(rf"{root}|(?:{names})/(?:{root}|c(?:/\d+)*(?:{HALF})?){own}").fullmatch
@@ -195,7 +194,7 @@ def store_files(arrays: Iterable[str], *others: str) -> Ours:
 def foreign_files(folder: Path, ours: Ours) -> Iterator[str]:
     """Yield the files of a folder, at any depth, that are not `ours`, by their paths in it.
 
-    A link is ours only if it leads nowhere: a damaged disk may leave one instead of a file of ours.
+    A link is ours only if it leads nowhere: a damaged disk can leave one instead of a file of ours.
     """
     for path, name in _files(folder):
         leads_somewhere = path.is_symlink() and path.exists()
@@ -204,29 +203,29 @@ def foreign_files(folder: Path, ours: Ours) -> Iterator[str]:
 
 
 def check_ours(folder: Path, ours: Ours, what: str) -> None:
-    """Raise ValueError, naming some, where a folder that is to be replaced holds files that no such thing does."""
+    """Raise ValueError, naming some, where a folder to be replaced has files that do not belong to it."""
     others = list(islice(foreign_files(folder, ours), LISTED_FILES + 1))
     if others:
         more = " and more" if len(others) > LISTED_FILES else ""
         raise ValueError(
-            f"{folder} is not replaced, as it holds files that are not of {what}: "
+            f"{folder} is not replaced, because it has files that do not belong to {what}: "
             f"{', '.join(others[:LISTED_FILES])}{more}; move them away, or write elsewhere with --out"
         )
 
 
 def refuse_others(folder: Path, strange: Iterable[Path], what: str) -> None:
-    """Raise ValueError, naming some, where a folder that results are to go to holds files of something else."""
+    """Raise ValueError, naming some, where a folder for results has files of something else."""
     names = sorted(path.name for path in strange)
     if names:
         more = f" and {len(names) - LISTED_FILES} more" if len(names) > LISTED_FILES else ""
         raise ValueError(
-            f"{folder} holds other files and no {what}: {', '.join(names[:LISTED_FILES])}{more}; "
-            "give --out a new or an empty folder"
+            f"{folder} has other files but no {what}: {', '.join(names[:LISTED_FILES])}{more}; give --out a new or an "
+            "empty folder"
         )
 
 
 def lost_root(store: Path, ours: Ours) -> bool:
-    """Whether a zarr store has lost the file that says what it is, and everything else in it is of ours."""
+    """Whether a zarr store has lost the file that identifies it, and everything else in it is ours."""
     try:
         said = json.loads((store / "zarr.json").read_text())
     except (OSError, ValueError):
@@ -236,7 +235,7 @@ def lost_root(store: Path, ours: Ours) -> bool:
 
 
 def remove(folder: Path, ours: Ours) -> None:
-    """Remove a folder, at once where everything in it is of ours; what is not stays where it is."""
+    """Remove a folder, at once if everything in it is ours; foreign files stay."""
     if not any(foreign_files(folder, ours)):
         discard(folder)
         return
@@ -246,14 +245,14 @@ def remove(folder: Path, ours: Ours) -> None:
 
 
 def clear_halves(folder: Path) -> None:
-    """Remove from a store that nobody else writes to what zarr had not written whole when a process was killed."""
+    """Remove from a store without other writers the files that zarr had not finished when a process was killed."""
     for path, name in _files(folder):
         if re.search(rf"{HALF}$", name):
             path.unlink(missing_ok=True)
 
 
 def _files(folder: Path) -> Iterator[tuple[Path, str]]:
-    """Yield the files of a folder at any depth, with their paths in it; a link to a folder is one of them.
+    """Yield the files of a folder at any depth, with their paths in it, including links to folders.
 
     A folder that another process removes meanwhile has none.
     """
@@ -271,7 +270,7 @@ def _files(folder: Path) -> Iterator[tuple[Path, str]]:
 
 @contextmanager
 def holding(folder: Path, say: Callable[[str], object] = lambda text: None) -> Iterator[bool]:
-    """Hold a folder, and give whether it had to be waited for; where another process holds it, that is said first."""
+    """Lock a folder, and return whether that took waiting; a message announces the wait."""
     waited = False
     while True:
         lock = _open(folder)
@@ -289,15 +288,15 @@ def holding(folder: Path, say: Callable[[str], object] = lambda text: None) -> I
 
 
 def check_free(folder: Path) -> None:
-    """Raise StoreError where another process fills a folder that is to be begun again."""
+    """Raise StoreError where another process fills a folder to be replaced."""
     if not folder.is_dir():
         return
     lock = _open(folder)
     try:
         if not _lock(lock, wait=False):
             raise StoreError(
-                f"{folder} is being filled by another process, so it is not begun again; wait for it or stop it, or "
-                "write elsewhere with --out"
+                f"{folder} is being filled by another process, so it is not started again; wait for that process or "
+                "stop it, or write elsewhere with --out"
             )
     finally:
         os.close(lock)
@@ -309,7 +308,7 @@ def _open(folder: Path) -> int:
 
 
 def _lock(lock: int, *, wait: bool) -> bool:
-    """Take a lock, and say whether it is taken; Ctrl-C ends the waiting."""
+    """Take a lock, and return whether it is taken; Ctrl-C ends the waiting."""
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
     except BlockingIOError:
@@ -320,7 +319,7 @@ def _lock(lock: int, *, wait: bool) -> bool:
 
 
 def _is_in_place(folder: Path, lock: int) -> bool:
-    """Whether the folder is still the one that was opened: another process may have removed it meanwhile."""
+    """Whether the folder is still the opened one: another process can have removed it."""
     with contextlib.suppress(FileNotFoundError):
         return folder.stat().st_ino == os.fstat(lock).st_ino
     return False
@@ -331,47 +330,47 @@ FULL_DISK_WORDS = "No space left on device"  # of a program that writes for us, 
 
 
 class _SaidError(OSError):
-    """An error of the system whose message is its own."""
+    """A system error with its own message."""
 
     def __str__(self) -> str:
         return str(self.strerror)
 
 
 class DiskFullError(_SaidError):
-    """A disk is full; the message says what is kept of the job."""
+    """A disk is full; the message says what is kept."""
 
 
 class UnwritableError(_SaidError):
-    """A folder that the system chose cannot be written to; the message says how it is moved."""
+    """A folder chosen by the system cannot be written to; the message says how to move it."""
 
 
 @contextmanager
 def moved_by(variable: str, what: str) -> Iterator[None]:
-    """Raise UnwritableError where `what` cannot be kept, which says that an environment variable moves its folder."""
+    """Raise UnwritableError where `what` cannot be stored, with the environment variable that moves its folder."""
     try:
         yield
     except OSError as error:
         if is_full(error) or error.filename is None or error.strerror is None:
             raise
-        why = f"{what} cannot be kept at {error.filename} ({error.strerror.lower()})"
-        said = f"{why}; set the environment variable {variable} to a folder that can be written to"
+        why = f"{what} cannot be stored at {error.filename} ({error.strerror.lower()})"
+        said = f"{why}; set the environment variable {variable} to a writable folder"
         raise UnwritableError(error.errno, said) from error
 
 
 def is_full(error: BaseException) -> TypeGuard[OSError]:
-    """Whether an error comes of a disk or a quota that is full."""
+    """Whether an error comes from a full disk or quota."""
     return isinstance(error, OSError) and (error.errno in CODES or FULL_DISK_WORDS in str(error))
 
 
 def full(error: OSError, kept: str) -> DiskFullError:
-    """Return the error to raise for a full disk; `kept` says what of the job is."""
-    said = f"the disk is full; {kept}: make room, and the same command continues from there"
+    """Return the error for a full disk; `kept` describes what is kept."""
+    said = f"the disk is full; {kept}: free some space, and the same command continues from there"
     return DiskFullError(error.errno or errno.ENOSPC, said)
 
 
 @contextmanager
 def until_full(kept: Callable[[], str]) -> Iterator[None]:
-    """Say what is `kept` where the disk is full, unless that is said already.
+    """Report what is `kept` when the disk is full, unless that is already reported.
 
     Raises DiskFullError then; every other error passes.
     """

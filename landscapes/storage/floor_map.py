@@ -19,12 +19,12 @@ FLOOR, FILLING = "floor.zarr", "floor.filling"  # the map, and the slices of rep
 
 
 def replica_paths(folder: Path, names: Sequence[str]) -> list[Path]:
-    """Return where the slices of replicas are until the map in a folder is made of them."""
+    """Return the paths of the slices of replicas, until the map in a folder is made from them."""
     return [folder / FILLING / f"{number}-{plain_name(name)}.zarr" for number, name in enumerate(names)]
 
 
 def save_floor_map(folder: Path, found: xr.Dataset) -> None:
-    """Write a map whole or not at all, and clear away what it is made of."""
+    """Write a map whole or not at all, and clear away its sources."""
     with contextlib.suppress(FileExistsError), placing(folder / FLOOR, overwrite=True) as new:
         found.to_zarr(new, zarr_format=3, consolidated=False)
         consolidate(new)
@@ -32,7 +32,7 @@ def save_floor_map(folder: Path, found: xr.Dataset) -> None:
 
 
 def open_floor_map(path: Path, dataset: xr.Dataset) -> xr.Dataset | None:
-    """Return the map next to a slice, given by its store or its folder; None where there is none of this slice."""
+    """Return the map next to a slice, given by its store or its folder; None where there is none for this slice."""
     place = slice_path(path).parent / FLOOR
     if not place.is_dir():
         return None
@@ -44,12 +44,12 @@ def open_floor_map(path: Path, dataset: xr.Dataset) -> xr.Dataset | None:
 
 
 def with_map(dataset: xr.Dataset, found: xr.Dataset | None) -> xr.Dataset:
-    """Return a slice with the floor of its map, which is that of all samples."""
+    """Return a slice with the floor of its map, over all samples."""
     floor = floor_of(found) if found is not None else None
     return dataset if floor is None else dataset.assign_attrs(floor_attribute(floor))
 
 
 def discard_floor_map(folder: Path) -> None:
-    """Remove a map, and what was made of it."""
+    """Remove a map and its sources."""
     for name in (FLOOR, FILLING):
         discard(folder / name)

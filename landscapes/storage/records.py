@@ -1,4 +1,4 @@
-"""JSON files that one verb writes and another reads; an error names the file that is damaged."""
+"""JSON files that one command writes and another reads; an error names the damaged file."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ REASON_LENGTH = 160  # characters of what is wrong
 
 @contextmanager
 def reading(path: Path, todo: str) -> Iterator[None]:
-    """Read a file within this context: any error that its content leads to says that the file is damaged.
+    """Read a file within this context: any error from its content is reported as a damaged file.
 
-    Raises DamagedError, which says what `todo`; that a file is missing or may not be read passes.
+    Raises DamagedError, with the advice `todo`; errors of missing or unreadable files pass.
     """
     try:
         yield
@@ -35,14 +35,14 @@ def reading(path: Path, todo: str) -> Iterator[None]:
 
 
 def write_record(path: Path, record: Mapping[str, Any]) -> None:
-    """Write what `read_json` reads again, with a checksum."""
+    """Write a file for `read_json`, with a checksum."""
     write_json(path, sign(record))
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Return the JSON object that a file holds, held against its checksum if it has one.
+    """Return the JSON object in a file, compared with its checksum if it has one.
 
-    Raises ValueError where it is no JSON or not what was written, TypeError where it is no object.
+    Raises ValueError where it is no JSON or differs from what was written, TypeError where it is no object.
     """
     return verify(json.loads(path.read_text()))
 
@@ -55,13 +55,13 @@ def sign(record: Mapping[str, Any]) -> dict[str, Any]:
 def verify(found: Any) -> dict[str, Any]:
     """Return a record without its checksum; those of earlier versions have none.
 
-    Raises TypeError where it is no JSON object, ValueError where the checksum is not that of the rest.
+    Raises TypeError where it is not a JSON object, ValueError where the checksum does not match.
     """
     if not isinstance(found, dict):
-        raise TypeError("it is no JSON object")
+        raise TypeError("it is not a JSON object")
     record = {name: value for name, value in found.items() if name != CHECKSUM}
     if CHECKSUM in found and found[CHECKSUM] != _sum(record):
-        raise ValueError("it is not what was written")
+        raise ValueError("it differs from what was written")
     return record
 
 

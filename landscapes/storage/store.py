@@ -1,16 +1,16 @@
-"""A slice on disk: a file for each tile while it is being filled, and one file, a zarr store, once it is finished.
+"""A slice on disk: a file for each tile while it is being filled, and one file, a zarr store, when it is finished.
 
 A slice is `loss(v, u)`, `grad(v, u, dim)` unless sampled without gradients, `status(v, u)` and the coordinates `u`,
-`v`, `dim`, `unit(dim)`; a line has no `v`. It lies in one of two places:
+`v`, `dim`, `unit(dim)`; a line has no `v`. It is in one of two places:
 
-- `slice.filling` while it is being filled: a record of what it is, and a file for each tile, written whole. Samples
+- `slice.filling` while it is being filled: a record of its identity, and a file for each tile, written whole. Samples
   are taken coarse to fine (`arrays.coarse_to_fine`), so the first tile is a coarse picture of the whole box and every
-  square of tiles from it a finer one. A file that is damaged is as if it had never been written.
-- `slice.zarr.zip` once every point is there, with ascending axes and chunks as large as analysis wants them
-  (`arrays.analysis_chunks`), so that anybody's xarray or zarr reads it right. It appears whole, and only then the tiles
-  go: a process killed at any instant leaves one or the other. Its tiles are its chunks, each with a checksum. It is
-  never changed: where a chunk is damaged and computed again, another whole file takes its place. Earlier versions left
-  the same store as a folder, `slice.zarr`, which is read alike.
+  square of tiles from it a finer one. A damaged file counts as never written.
+- `slice.zarr.zip` when every point is there, with ascending axes and large chunks for analysis
+  (`arrays.analysis_chunks`), so that any xarray or zarr reads it correctly. It appears whole, and only then the tiles
+  are removed: a process killed at any moment leaves one or the other. Its tiles are its chunks, each with a checksum.
+  It never changes: if a damaged chunk is computed again, another whole file replaces it. Earlier versions left the
+  same store as a folder, `slice.zarr`, which is read in the same way.
 """
 
 from __future__ import annotations
@@ -85,10 +85,10 @@ T = TypeVar("T")
 
 
 class SliceStore:
-    """Keep a slice on disk tile by tile, so that a run stopped at any instant can continue.
+    """Store a slice on disk tile by tile, so that a run stopped at any moment can continue.
 
     Make one with `create`, `open`, `open_or_create` or `in_memory`, all by the `path` of the finished slice; `place` is
-    where it is now. Two processes may fill the same store: a tile is the same whoever writes it, and each file appears
+    its present path. Two processes can fill the same store: a tile is the same whoever writes it, and each file appears
     whole or not at all.
     """
 
@@ -97,7 +97,7 @@ class SliceStore:
         self._adopt(empty, path, chunks)
 
     def _adopt(self, empty: xr.Dataset, path: Path | None, chunks: Chunks | None) -> None:
-        """Become the slice in which nothing is sampled yet, or the finished one with these chunks."""
+        """Become the empty slice, or the finished one with these chunks."""
         self.path, self._empty, self._chunks = path, empty, chunks
         self.place = path if path is None or chunks else filling_path(path)
         self._inode = self.place.stat().st_ino if self.place else None
@@ -124,21 +124,20 @@ class SliceStore:
         grad: bool = True,
         overwrite: bool = False,
     ) -> SliceStore:
-        """Make an empty store at a path where there is none, all at once.
+        """Make an empty store at a new path in one step.
 
-        `identity` holds what decides the numbers (objective, options, fidelity, device); plane, parameters and
-        gradients are added here. `provenance` is anything else worth keeping. Both must be plain JSON. `overwrite`
-        replaces a slice store with nothing else in it, and refuses to replace anything else.
-
-        Raises StoreExistsError where the path is taken, StoreError where what is there is not replaced, and
-        TooLargeError where the slice does not fit onto the disk or into memory.
+        `identity` contains the settings that decide the numbers (objective, options, fidelity, device); plane,
+        parameters and gradients are added here. `provenance` is any other information to store. Both must be plain
+        JSON. `overwrite` replaces a slice store without other files, and nothing else. Raises StoreExistsError where
+        the path is taken, StoreError where its content is not replaced, and TooLargeError where the slice does not fit
+        onto the disk or into memory.
         """
         path = _resolve(path)
         header = _header(plane, space, identity, provenance or {}, grad=grad)
         for taken in filter(Path.exists, slice_places(path)):
             if not overwrite:
                 raise StoreExistsError(
-                    f"{taken} exists already; write elsewhere with --out, or replace it with --force"
+                    f"{taken} already exists; write elsewhere with --out, or replace it with --force"
                 )
             check_replaceable(taken)
         refuse_too_large(plane, path, grad=grad)
@@ -153,9 +152,9 @@ class SliceStore:
 
     @classmethod
     def open(cls, path: str | Path) -> SliceStore:
-        """Open a store that exists, the finished slice where there is one.
+        """Open an existing store, the finished slice if there is one.
 
-        Raises StoreError where there is none, DamagedError where it is not what was written.
+        Raises StoreError where there is none, DamagedError where it differs from what was written.
         """
         path = _resolve(path)
         place = path if path.exists() else filling_path(path)
@@ -164,8 +163,8 @@ class SliceStore:
         if not is_slice(place):
             if has_lost_root(place):
                 root = place if place.is_file() else place / (ROOT if place == path else HEADER)
-                raise damage(root, "it does not say what it is of")
-            raise StoreError(f"{place} is no slice store of format {FORMAT}; move it away or write elsewhere")
+                raise damage(root, "it has no identity")
+            raise StoreError(f"{place} is not a slice store of format {FORMAT}; move it away or choose another folder")
         if place == path:
             return cls(*Chunks.open(path))
         with reading(place / HEADER, ANEW):
@@ -182,7 +181,7 @@ class SliceStore:
         provenance: Mapping[str, Any] | None = None,
         grad: bool = True,
     ) -> SliceStore:
-        """Continue the store at `path`, or make it; a store made by other settings raises `StoreMismatchError`."""
+        """Continue the store at `path`, or make it; a store with other settings raises `StoreMismatchError`."""
         try:
             return cls.create(path, plane, space, identity=identity, provenance=provenance, grad=grad)
         except StoreExistsError:
@@ -211,17 +210,17 @@ class SliceStore:
 
     @property
     def ascending(self) -> bool:
-        """Whether this is a slice that was complete once, and so lies in its final place and order."""
+        """Whether this slice was complete once, and so is in its final place and order."""
         return self._chunks is not None
 
     @property
     def grad(self) -> bool:
-        """Whether the slice holds gradients."""
+        """Whether the slice has gradients."""
         return "grad" in self._empty
 
     @property
     def every(self) -> int:
-        """At every how many samples along each axis there is a gradient, in a slice that holds gradients."""
+        """The stride of the samples with gradients along each axis, in a slice that has gradients."""
         return gradient_stride(self.identity)
 
     @property
@@ -243,12 +242,12 @@ class SliceStore:
         return [tile for tile in self.tiles() if tile not in finished]
 
     def damaged_tiles(self, pending: Sequence[Tile]) -> list[Tile]:
-        """Return those of the tiles not finished that once were: what was written of them cannot be read."""
+        """Return the unfinished tiles that were once finished: their files cannot be read."""
         written = set(self._written())
         return [tile for tile in pending if tile in written and self.read_tile(tile) is None]
 
     def read_tile(self, tile: Tile) -> Arrays | None:
-        """Return the arrays of a tile that is finished, None of one that is not."""
+        """Return the arrays of a finished tile, None for another one."""
         if self._chunks is not None and tile not in self._tiles:
             values = self._chunks.read(tile)
             return values if values is not None and self._is_whole(tile, values) else None
@@ -282,7 +281,9 @@ class SliceStore:
         replaced.
         """
         if self.grad and evaluation.grad is None:
-            raise ValueError("this slice holds gradients; got an evaluation without, so evaluate with grad=True")
+            raise ValueError(
+                "this slice has gradients; got an evaluation without gradients, so evaluate with grad=True"
+            )
         if bool((evaluation.status == Status.MISSING).any()):
             raise ValueError("a tile is written whole; got an evaluation with status MISSING")
         shape = tuple(map(len, self.tiling.rows(tile)))
@@ -299,7 +300,7 @@ class SliceStore:
         self._tiles[tile] = arrays
 
     def keep_error(self, error: str) -> None:
-        """Keep what the first point that raised said, as an attribute; what later ones say is not kept."""
+        """Store the message of the first point that raised, as an attribute; later ones are not stored."""
         if not error or self.error:
             return
         self.error = self._empty.attrs[ERROR] = error
@@ -320,26 +321,24 @@ class SliceStore:
         return self._read_steadily(self._dataset)
 
     def finish(self, dataset: xr.Dataset) -> None:
-        """Put the whole slice, which `dataset` returned, in the place of its tiles: ascending, in large chunks.
+        """Replace the tiles by the whole slice, as returned by `dataset`: ascending, in large chunks.
 
-        It appears at once, and only then the tiles go. Of a slice that was finished before, this is for chunks that
-        were computed again.
-
-        Raises StoreError where the slice is not complete, or the store was replaced.
+        It appears at once, and only then the tiles are removed. A slice that was finished before gets its recomputed
+        chunks. Raises StoreError where the slice is not complete, or the store was replaced.
         """
         if self.path is None or self._follow_finished() or (self.ascending and not self._tiles):
             return
         if bool((dataset["status"] == Status.MISSING).any()):
-            raise StoreError(f"{self.path} is not complete; run the command that samples it again")
+            raise StoreError(f"{self.path} is not complete; run its sampling command again")
         archive = archive_path(self.path)
         with replacing(archive) as new:
             write_finished(new, dataset)
         self._move_on(*Chunks.written(archive, dataset))
 
     def coarse(self) -> xr.Dataset | None:
-        """Return the largest coarse picture of the whole that is complete, axes ascending; None before the first.
+        """Return the largest complete coarse picture of the whole, axes ascending; None before the first.
 
-        It has no gradients where those of the whole are at every few samples, of which it has some alone.
+        It has no gradients where the whole has them only at some samples, of which the picture has only a few.
         """
         pending = self.pending()
         if not pending:
@@ -361,13 +360,13 @@ class SliceStore:
         return bool((said & (status != Status.MISSING)).all())
 
     def _written(self) -> list[Tile]:
-        """Return the tiles that something was written of."""
+        """Return the tiles with a file."""
         if self.parts is None:
             return self.tiles() if self._chunks else list(self._tiles)
         return [tile for name in self.parts.names() if (tile := Tile.named(name)) is not None]
 
     def _finished(self) -> Iterator[tuple[Tile, Arrays]]:
-        """Yield the tiles that are finished, with their arrays."""
+        """Yield the finished tiles, with their arrays."""
         for tile in self._written():
             if (values := self.read_tile(tile)) is not None:
                 yield tile, values
@@ -386,13 +385,13 @@ class SliceStore:
         return self._empty.assign({name: self._empty.variables[name].copy(data=one) for name, one in found.items()})
 
     def _read_steadily(self, read: Callable[[], T]) -> T:
-        """Return what is read, once more where another process has finished the slice meanwhile."""
+        """Return the result of reading, repeated if another process has finished the slice meanwhile."""
         self._follow_finished()
         found = read()
         return read() if self._follow_finished() else found
 
     def _follow_finished(self) -> bool:
-        """Continue the finished slice where another process has finished this one meanwhile, and say whether it has.
+        """Continue the finished slice if another process has finished this one meanwhile, and return whether it has.
 
         Raise StoreError where the store was replaced or removed.
         """
@@ -409,29 +408,28 @@ class SliceStore:
         raise StoreError(f"{self.path} was replaced or removed while it was being filled; run the command again")
 
     def _move_on(self, empty: xr.Dataset, path: Path, chunks: Chunks) -> None:
-        """Become the finished slice, and clear away what it was made of."""
+        """Become the finished slice, and clear away its sources."""
         self._adopt(empty, path, chunks)
         self._clear_others(path)
 
     @staticmethod
     def _clear_others(path: Path) -> None:
-        """Remove the tiles of a finished slice, and the folder that an earlier version left where it is a file."""
+        """Remove the tiles of a finished slice, and the folder of an earlier version if it is a file now."""
         remove(filling_path(path), FILLING_FILES)
         if path != folder_path(path) and folder_path(path).is_dir():
             remove(folder_path(path), FILES)
 
 
 def _resolve(path: str | Path) -> Path:
-    """Return where a slice is or will be once it is finished, given any of its names, without links."""
+    """Return the present or future path of a finished slice, given any of its names, without links."""
     return resolve(finished_path(resolve(path)))
 
 
 def open_slice(path: str | Path) -> xr.Dataset:
-    """Read a slice from disk: loss and gradient in float64, axes ascending, MISSING where it is not sampled yet.
+    """Read a slice from disk: loss and gradient in float64, axes ascending, MISSING where not yet sampled.
 
-    `path` is the slice, or the folder that `landscape slice` left it in.
-
-    Raises StoreError where there is no slice, DamagedError where it is not what was written.
+    `path` is the slice, or its folder from `landscape slice`. Raises StoreError where there is no slice, DamagedError
+    where it differs from what was written.
     """
     return SliceStore.open(slice_path(Path(path))).dataset()
 
@@ -439,7 +437,7 @@ def open_slice(path: str | Path) -> xr.Dataset:
 def _header(
     plane: Plane, space: ParameterSpace, identity: Mapping[str, Any], provenance: Mapping[str, Any], *, grad: bool
 ) -> dict[str, Any]:
-    """Return the record of a slice that is begun: what it is, and how it came about."""
+    """Return the record of a new slice: its identity and provenance."""
     bounds = [space.to_values(bound).tolist() for bound in (space.lower, space.upper)]
     about = plain_json(provenance, "a slice's provenance")
     return {

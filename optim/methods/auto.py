@@ -1,4 +1,4 @@
-"""A search that first measures the landscape, then takes the method that is advised for such a one."""
+"""A search that first measures the landscape, then uses the method advised for such landscapes."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ TABLES = 40  # of points x points, that measures make
 
 @dataclass(frozen=True)
 class AutoOptions(MethodOptions):
-    """`evaluations` are spent on measuring the landscape before a method is chosen, a quarter of them with gradients.
+    """`evaluations` measure the landscape before a method is chosen, a quarter of them with gradients.
 
-    The cases that advice is learnt from were measured with as many as the default.
+    The cases behind the advice were measured with the default number.
     """
 
     method = "auto"
@@ -34,11 +34,11 @@ class AutoOptions(MethodOptions):
 
 
 class Auto(Optimizer):
-    """Measure what the landscape is like, then search by the method that `landscape advise` would advise.
+    """Measure the landscape, then search with the method that `landscape advise` would advise.
 
-    What is measured counts as episodes, and the method begins with it: a descent at the best point, a model with all
-    points. Which method that is, and why, the run says as its `remark`. A budget is refused of which the measures would
-    be more than a tenth.
+    The measurements count as episodes, and the method begins with them: a descent at the best point, a model with all
+    points. The run reports the chosen method, and the reason, as its `remark`. Measuring may take at most a tenth of
+    the budget; a smaller budget is refused.
     """
 
     name = "auto"
@@ -47,17 +47,17 @@ class Auto(Optimizer):
 
     @classmethod
     def memory(cls, options: Mapping[str, Any], size: SearchSize) -> float:
-        """Estimate what the points that are measured take, and tables of their distances [bytes]."""
+        """Estimate the memory of the measured points, and of tables of their distances [bytes]."""
         return float(FLOAT * options["evaluations"] * (TABLES * options["evaluations"] + 10 * size.dim))
 
     @classmethod
     def require_budget(cls, options: Any, budget: int) -> None:
-        """Refuse a budget of which the measures would be more than a tenth."""
+        """Refuse a budget of which measuring would take more than a tenth."""
         if budget < 10 * options.evaluations:
             lower = f"or --option evaluations={budget // 10}" if budget >= 10 * MIN_EVALUATIONS else "or name a method"
             raise ValueError(
-                f"auto measures {options.evaluations} episodes first, a tenth of the budget at most; got a budget of "
-                f"{budget}: take {10 * options.evaluations} or more, {lower}"
+                f"auto first measures {options.evaluations} episodes, at most a tenth of the budget; got a budget of "
+                f"{budget}: use {10 * options.evaluations} or more, {lower}"
             )
 
     def _setup(self) -> None:
@@ -66,7 +66,7 @@ class Auto(Optimizer):
         self.slopes: Points = np.empty((0, self.space.dim))
 
     def attach(self, objective: Objective) -> None:
-        """Take the objective in hand, for the method that was chosen, too."""
+        """Attach the objective, also for the chosen method."""
         super().attach(objective)
         if self.inner is not None:
             self.inner.attach(objective)
@@ -100,7 +100,7 @@ class Auto(Optimizer):
                 self.inner = self._begin(found.method)
             except ValueError:  # it cannot search such a space, or not here
                 able.remove(found.method)
-        self.remark = f"auto took {found.method}: {found.reason}"
+        self.remark = f"auto chose {found.method}: {found.reason}"
         loss = np.concatenate([self.loss, others])
         if np.isfinite(loss).any():
             self.inner.learn(np.concatenate([2.0 * sample.first - 1.0, z]), loss)

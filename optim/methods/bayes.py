@@ -1,4 +1,4 @@
-"""Bayesian optimisation: alone, followed by gradient descents, by gradients too, and in a trust region (TuRBO-1)."""
+"""Bayesian optimisation: alone, followed by gradient descents, with gradients, and in a trust region (TuRBO-1)."""
 
 from __future__ import annotations
 
@@ -50,10 +50,10 @@ MODELLED = SurrogateOptions(kernel="matern", initial=1)
 
 
 class BO(Optimizer):
-    """Evaluate where the lower confidence bound of a Gaussian process over all losses so far is least.
+    """Evaluate the point that minimises the lower confidence bound of a Gaussian process over all losses.
 
-    One point at a time, without gradients. The first `initial` are drawn at random: a process without data is the same
-    everywhere. The process is written here, since BoTorch's takes five times as long.
+    It evaluates one point after the other, without gradients. The first `initial` points are random, because a process
+    without data is the same everywhere. The process is our own code, because BoTorch's takes five times as long.
     """
 
     name = "bo"
@@ -62,7 +62,7 @@ class BO(Optimizer):
 
     @classmethod
     def memory(cls, options: Mapping[str, Any], size: SearchSize) -> float:
-        """Estimate what the process takes [bytes]."""
+        """Estimate the memory of the process [bytes]."""
         return surrogate_memory(options["max_points"], size)
 
     def _setup(self) -> None:
@@ -89,9 +89,9 @@ class BODescentsOptions(SurrogateOptions, DescentOptions):
 
 
 class BODescents(BO):
-    """Descend from where the lower confidence bound is least; the process learns the loss of every iterate.
+    """Descend from the minimum of the lower confidence bound; the process learns the loss of every iterate.
 
-    The first starts are drawn at random. Gradients steer the descents only: the process sees losses.
+    The first starts are random. Only the descents use gradients: the process uses losses.
     """
 
     name = "bo-descents"
@@ -117,10 +117,10 @@ class BODescents(BO):
 
 @dataclass(frozen=True)
 class BOGradientOptions(MethodOptions):
-    """How much is ventured where little is known.
+    """Options for the balance of exploration and exploitation.
 
-    `coefficient` is how many standard deviations the bound lies below the mean. Points are drawn at random until
-    `initial` of them are known.
+    `coefficient` is the number of standard deviations of the bound below the mean. Points are random until `initial` of
+    them are known.
     """
 
     method = "bo-gradient"
@@ -130,14 +130,14 @@ class BOGradientOptions(MethodOptions):
 
 
 class BOGradient(BO):
-    """Evaluate where the lower confidence bound of a process over losses and gradients is least.
+    """Evaluate the point that minimises the lower confidence bound of a process over losses and gradients.
 
-    The process has GPyTorch's squared-exponential covariance of a function and its slopes (`RBFKernelGrad`). A point
-    with its gradient in d parameters makes d + 1 rows, and the cost grows with the cube of the rows: 1000 are modelled
-    at most, those of the points with the least losses for one half and points spread over the run for the other. So it
-    is for few parameters: of 10 it models 90 points, and more than 49, of which it could model 20, are refused. A point
-    that has a loss and no gradient is one row. Where losses jump, slopes mislead it. The process is written here, since
-    GPyTorch's takes ten times as long.
+    The process has GPyTorch's squared-exponential covariance of a function and its derivatives (`RBFKernelGrad`). A
+    point with its gradient in d parameters makes d + 1 rows, and the cost grows with the cube of the rows. So at most
+    1000 rows are modelled: half of the points have the lowest losses, the others are spread over the run. The method is
+    for few parameters. With 10 it models 90 points. With more than 49 it could model only 20 points, and refuses. A
+    point with a loss but no gradient is one row. Where losses jump, gradients mislead it. The process is our own code,
+    because GPyTorch's takes ten times as long.
     """
 
     name = "bo-gradient"
@@ -154,13 +154,13 @@ class BOGradient(BO):
         points = ROWS // (self.space.dim + 1)
         if points < MIN_POINTS:
             raise ValueError(
-                f"{self.name} models slopes of {ROWS // MIN_POINTS - 1} parameters at most; "
-                f"this space has {self.space.dim}"
+                f"{self.name} models gradients in at most {ROWS // MIN_POINTS - 1} parameters; this space has "
+                f"{self.space.dim}"
             )
         self.surrogate = SlopeSurrogate(self.space.dim, self.options, points)
 
     def learn(self, z: Points, loss: Points) -> None:
-        """Model these points, too, without slopes."""
+        """Model these points, too, without gradients."""
         self.surrogate.learn(z, loss, np.full_like(z, np.nan))
 
     def _tell(self, z: Points, loss: Points, grad: Points | None) -> None:
@@ -169,7 +169,7 @@ class BOGradient(BO):
 
 
 class SlopeSurrogate(Surrogate):
-    """Model losses and their slopes by a process of both; see `Surrogate`."""
+    """Model losses and their gradients by one process; see `Surrogate`."""
 
     def __init__(self, dim: int, options: BOGradientOptions, most: int) -> None:
         super().__init__(dim, SurrogateOptions(options.coefficient, initial=options.initial, max_points=most))
@@ -189,7 +189,7 @@ class SlopeSurrogate(Surrogate):
         return with_parameters(GradientProcess(self._places(chosen), rows), self._hyper)
 
     def _places(self, rows: Rows) -> Float[Tensor, "point column"]:
-        """Return points of [0, 1]^dim, with a column that says whose slopes are missing where some are."""
+        """Return points of [0, 1]^dim, with a column that marks missing gradients if there are any."""
         lacking = np.isnan(self.grad[rows]).any(axis=1, keepdims=True)
         return torch.from_numpy(np.hstack([unit(self.z[rows]), lacking])) if lacking.any() else unit(self.z[rows])
 
@@ -201,7 +201,7 @@ class SlopeSurrogate(Surrogate):
 
 
 class GradientProcess(ExactGP, GPyTorchModel):  # type: ignore[misc]
-    """A Gaussian process of a function with zero mean and its slopes, of points in [0, 1]^dim."""
+    """A Gaussian process of a function with zero mean and its derivatives, at points in [0, 1]^dim."""
 
     num_outputs = 1
 
@@ -217,14 +217,14 @@ class GradientProcess(ExactGP, GPyTorchModel):  # type: ignore[misc]
         self.double()
 
     def forward(self, u: Float[Tensor, "point dim"]) -> MultitaskMultivariateNormal:
-        """Return the distribution of the function and its slopes at points."""
+        """Return the distribution of the function and its derivatives at points."""
         return MultitaskMultivariateNormal(self.mean_module(u), self.covar_module(u))
 
 
 def standardised(loss: Points, grad: Points) -> Points:
-    """Return losses with mean 0 and deviation 1 and their slopes along [0, 1]^dim, shape (point, 1 + dim).
+    """Return losses with mean 0 and deviation 1 and their derivatives along [0, 1]^dim, shape (point, 1 + dim).
 
-    A failure counts as the worst loss so far, with slopes of zero; slopes that are missing are zero, too.
+    A failure counts as the worst loss so far, with zero derivatives; missing derivatives are zero, too.
     """
     grad = np.where(np.isnan(grad), 0.0, grad)
     finite = np.isfinite(loss)
@@ -239,11 +239,11 @@ def standardised(loss: Points, grad: Points) -> Points:
 class TuRBOOptions(MethodOptions):
     """How the trust region changes; lengths and successes are those of Eriksson et al. 2019.
 
-    A region's side is `length` widths of the box at first. It doubles after `successes` batches in a row that improve
-    the best loss, and halves after as many in a row that do not as hold a point for each parameter, or four points;
-    where it is shorter than `shortest` the search begins again. `batch_size` points are drawn at a time, each where a
-    sample of the process is least among `candidates` points of the region, 0 for 100 for each parameter and at most
-    2000: more cost much and gain little.
+    The side of a region is initially `length` box widths. It doubles after `successes` batches in a row that improve
+    the best loss. It halves after consecutive batches without improvement that together have as many points as there
+    are parameters, and at least four. When it is shorter than `shortest`, the search starts again. Each batch has
+    `batch_size` points. Each of them minimises a sample of the process among `candidates` points of the region. 0 means
+    100 for each parameter, at most 2000: more cost much and gain little.
     """
 
     method = "turbo"
@@ -258,19 +258,19 @@ class TuRBOOptions(MethodOptions):
         super().__post_init__()
         if self.shortest >= self.length:
             raise ValueError(
-                f"{self.method} option shortest takes less than the length {self.length}; got {self.shortest}"
+                f"{self.method} option shortest must be below the length {self.length}; got {self.shortest}"
             )
 
 
 class TuRBO(Optimizer):
     """Search a trust region around the best point of a Gaussian process of its own (Eriksson et al., NeurIPS 2019).
 
-    A search begins with 2 dim uniformly random points, of which the first search shares as many as it can with other
-    methods of its seed; the paper's are a Latin hypercube. Then a process with a Matern-5/2 kernel is fitted
-    to all its points, the region is a box around the best of them, longer where the length-scales are, and each point
-    of a batch is where another sample of the process is least (Thompson sampling) among Sobol points of the region,
-    which differ from the best in 20 parameters at most on average. A search whose region has become too short is given
-    up, and another begins. The process is written here, since BoTorch's takes twice as long.
+    A search begins with 2 dim uniformly random points. The first search shares as many of them as it can with other
+    methods of its seed; the paper uses a Latin hypercube. A process with a Matern-5/2 kernel is then fitted to all its
+    points. The region is a box around the best of them, longer where the length-scales are longer. Each point of a
+    batch minimises another sample of the process (Thompson sampling) among Sobol points of the region. These differ
+    from the best point in at most 20 parameters on average. When the region becomes too short, the search is abandoned
+    and another begins. The process is our own code, because BoTorch's takes twice as long.
     """
 
     name = "turbo"
@@ -278,7 +278,7 @@ class TuRBO(Optimizer):
 
     @classmethod
     def memory(cls, options: Mapping[str, Any], size: SearchSize) -> float:
-        """Estimate what process and samples take [bytes]."""
+        """Estimate the memory of process and samples [bytes]."""
         candidates = candidates_of(options["candidates"], size.dim)
         samples = 8 * FLOAT * (candidates**2 + candidates * size.dim)
         return float(surrogate_memory(MODELLED.max_points, size) + samples + 4 * FLOAT * size.dim**2)
@@ -332,7 +332,7 @@ class TuRBO(Optimizer):
 def _sample(
     surrogate: Surrogate, options: TuRBOOptions, length: float, random: np.random.Generator
 ) -> tuple[Points, dict[str, Any]]:
-    """Return a batch of points of the region, and what the process knows then."""
+    """Return a batch of points of the region, and the present knowledge of the process."""
     with exclusive():
         process = surrogate.process()
         scales, count = process.covariance.scale.numpy(), candidates_of(options.candidates, surrogate.z.shape[1])
@@ -345,7 +345,7 @@ def _sample(
 
 
 def candidates_of(option: int, dim: int) -> int:
-    """Return how many candidates an option asks for in so many dimensions."""
+    """Return the number of candidates that an option gives in this dimension."""
     return option or min(100 * dim, 2000)
 
 

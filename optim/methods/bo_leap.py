@@ -1,4 +1,4 @@
-"""BO-Leap: Bayesian optimisation proposes, a population looks around, gradient descent leaps, and so on from there."""
+"""BO-Leap: Bayesian optimisation proposes, a population explores, gradient descent leaps, and so on from there."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ LARGEST_LOSS = np.finfo(float).max / 4  # what a failure counts as: pycma adds t
 
 @dataclass(frozen=True)
 class BOLeapOptions(SurrogateOptions, DescentOptions):
-    """How the semi-local search goes.
+    """Options of the semi-local search.
 
-    Populations of `population` points (K) are drawn with step size `sigma` at first, in the box scaled to [-1, 1]; the
-    `best` of them with the least losses make the mean that descends. No new population is drawn once a semi-local
-    search has spent `local_budget` episodes, so that it may spend more by up to one population and one descent.
+    The first population of `population` points (K) is drawn with step size `sigma`, in the box scaled to [-1, 1]. The
+    mean of the `best` of them, those with the lowest losses, descends. After a semi-local search has spent
+    `local_budget` episodes, it draws no new population. It can exceed that by up to one population and one descent.
     """
 
     method = "bo-leap"
@@ -50,11 +50,11 @@ class BOLeapOptions(SurrogateOptions, DescentOptions):
 class BOLeap(Optimizer):
     """Search as in algorithm 1 of "Rethinking Optimization with Differentiable Simulation from a Global Perspective".
 
-    Where the lower confidence bound of a Gaussian process is least, a semi-local search begins: draw a population from
-    N(mu, sigma^2 C), take the mean of its best points, descend from there, let the end of the descent be the next mu,
-    adapt sigma and C. The process learns the loss of every point, population and descent. Its proposal itself is not
-    evaluated; the first is drawn at random. Points beyond the box are moved to its border before they are evaluated,
-    and adapt sigma and C from where they were evaluated.
+    A semi-local search begins at the minimum of a Gaussian process's lower confidence bound. It draws a population from
+    N(mu, sigma^2 C), takes the mean of its best points and descends from there. The end of the descent is the next mu,
+    and sigma and C are adapted. The process learns the loss of every point of populations and descents. Its proposal
+    itself is not evaluated; the first one is random. Points outside the box are moved to its border before evaluation,
+    and adapt sigma and C from there.
     """
 
     name = "bo-leap"
@@ -63,12 +63,12 @@ class BOLeap(Optimizer):
 
     @classmethod
     def memory(cls, options: Mapping[str, Any], size: SearchSize) -> float:
-        """Estimate what process and populations take [bytes]."""
+        """Estimate the memory of process and populations [bytes]."""
         return surrogate_memory(options["max_points"], size) + population_memory(options["population"], size.dim)
 
     def _setup(self) -> None:
         if self.space.dim < 2:
-            raise ValueError(f"bo-leap searches two parameters or more; this space has {self.space.dim}")
+            raise ValueError(f"bo-leap needs two parameters or more; this space has {self.space.dim}")
         self.surrogate = Surrogate(self.space.dim, self.options)
         self.local: SemiLocal | None = None
         self.descent = Descent(np.zeros(self.space.dim), self.options, done=True)
@@ -109,9 +109,9 @@ class BOLeap(Optimizer):
 class SemiLocal:
     """Adapt sigma and C to populations by equations 14-17 of Hansen & Ostermeier 2001; their mean leaps.
 
-    The paths of those equations see mean of the best - mu, where mu is what the population was drawn around: not the
-    leap, which says nothing of how a population was selected. pycma does it, cut back to 2001: equal weights, the
-    rank-one update alone and never stalled, the constants of table 1.
+    The paths of those equations use (mean of the best - mu), where the population was drawn around mu. They ignore the
+    leap, which says nothing about the selection of a population. pycma does the computation, reduced to the state of
+    2001: equal weights, only the rank-one update, which never stalls, and the constants of table 1.
     """
 
     def __init__(self, mu: Points, options: BOLeapOptions, random: np.random.Generator) -> None:
@@ -152,12 +152,12 @@ class SemiLocal:
         return np.array(self.es.mean)
 
     def leap(self, mu: Points) -> None:
-        """Let the next population be drawn around `mu`."""
+        """Draw the next population around `mu`."""
         self.es.mean = mu.copy()
         self._leaps.append(mu)
 
     def state(self) -> dict[str, Any]:
-        """Return what the library has been told, and where that began: its own state could only be pickled."""
+        """Return everything that the library was told, and its start: its own state could only be pickled."""
         points, losses = ([told[part] for told in self._told] for part in (0, 1))
         return {
             "began": self._began,
@@ -181,9 +181,9 @@ class SemiLocal:
 
 
 class PathLength(CMAAdaptSigmaCSA):  # type: ignore[misc]
-    """Adapt sigma by the length of its path, and never stall the path of C, as was done only later."""
+    """Adapt sigma by the length of its path, and never stall the path of C; stalling came only later."""
 
     def hsig(self, es: cma.CMAEvolutionStrategy) -> bool:
-        """Bring the path up to date, and say that that of C is to be, too."""
+        """Update the path, and return that the path of C is to be updated, too."""
         self._update_ps(es)
         return True

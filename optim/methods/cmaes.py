@@ -20,17 +20,17 @@ MATRICES = 8  # of dim x dim, that CMA-ES holds while it is written to disk: C, 
 POPULATION = 7000  # bytes for each member of a population, in addition to its numbers (measured with pycma 4)
 
 OTHERS = (
-    "cma-es continues with the points and losses that the run holds; cma or its linear algebra draws others here than "
-    "where the run began, so that it ends in other points than it would have there"
+    "cma-es continues with the points and losses of the run; cma or its linear algebra draws different numbers here "
+    "than where the run began, so the run will differ from one continued there"
 )
 
 
 @dataclass(frozen=True)
 class CMAESOptions(MethodOptions):
-    """`sigma` is the first step size in the box scaled to [-1, 1]; `population` 0 means 4 + 3 ln(dim) of them.
+    """`sigma` is the first step size in the box scaled to [-1, 1]; `population` 0 means 4 + 3 ln(dim) points.
 
-    A quarter of the box's width is what the library's author advises: the minimum is then expected within three
-    standard deviations of wherever in the box the search starts.
+    The library's author advises a quarter of the width of the box. The minimum is then expected within three standard
+    deviations of any start in the box.
     """
 
     method = "cma-es"
@@ -45,12 +45,12 @@ class CMAESOptions(MethodOptions):
 
 
 class CMAES(Optimizer):
-    """Adapt a normal distribution's mean, step size and covariance to what its samples are worth.
+    """Adapt a normal distribution's mean, step size and covariance to the losses of its samples.
 
-    The mean starts at random. The box is kept by the library's `BoundTransform`: the distribution lives on an unbounded
-    space that is folded, smoothly, into the box, so that every sample is inside and none is on the border by force.
-    When the library finds that the search has ended (converged, stagnated, a flat loss), it begins again from another
-    random point, for there is a budget to spend. A failed episode counts as the worst loss so far.
+    The mean starts at random. The library's `BoundTransform` keeps samples in the box. The distribution is on an
+    unbounded space that is folded smoothly into the box, so every sample is inside and none is forced onto the border.
+    When the library ends the search (converged, stagnated, a flat loss), it begins again from another random point,
+    until the budget is spent. A failed episode counts as the worst loss so far.
     """
 
     name = "cma-es"
@@ -58,12 +58,12 @@ class CMAES(Optimizer):
 
     @classmethod
     def memory(cls, options: Mapping[str, Any], size: SearchSize) -> float:
-        """Estimate what the matrices of the distribution take, and its population [bytes]."""
+        """Estimate the memory of the distribution's matrices and of its population [bytes]."""
         return population_memory(options["population"], size.dim)
 
     def _setup(self) -> None:
         if self.space.dim < 2:
-            raise ValueError(f"cma-es searches two parameters or more; this space has {self.space.dim}")
+            raise ValueError(f"cma-es needs two parameters or more; this space has {self.space.dim}")
         self._start()
 
     def learn(self, z: Points, loss: Points) -> None:
@@ -97,7 +97,7 @@ class CMAES(Optimizer):
         self._told.append((np.stack(self._asked), loss))
 
     def _state(self) -> dict[str, Any]:
-        """Return what the library has been told since it began last: its own state could only be pickled."""
+        """Return everything that the library was told since its last start: its own state could only be pickled."""
         points, losses = ([told[part] for told in self._told] for part in (0, 1))
         return {"began": self._began, "mean": self._given, "points": np.array(points), "losses": np.array(losses)}
 
@@ -114,17 +114,17 @@ class CMAES(Optimizer):
             self.strategy.stop()
 
     def _repeat(self) -> None:
-        """Repeat what was done before a population was drawn: nothing, but of those who derive from this."""
+        """Repeat the preparation of a population: nothing, except in derived classes."""
 
 
 def population_memory(population: int, dim: int) -> float:
-    """Return what a search by populations takes in so many dimensions [bytes]."""
+    """Return the memory of a search by populations in this many dimensions [bytes]."""
     return float(FLOAT * MATRICES * dim**2 + population * (POPULATION + 20 * FLOAT * dim))
 
 
 @dataclass(frozen=True)
 class Normal:
-    """Draw standard normal numbers of a shape, as numpy.random.randn does, from a generator of one's own."""
+    """Draw standard normal numbers of a shape, as numpy.random.randn does, from a given generator."""
 
     random: np.random.Generator
 
@@ -134,7 +134,7 @@ class Normal:
 
 
 def quiet_options(random: np.random.Generator) -> dict[str, Any]:
-    """Return the library's options by which it draws from one's own generator, prints nothing and writes no file."""
+    """Return the library's options to draw from a given generator, print nothing and write no file."""
     return {
         "randn": Normal(random),
         "seed": np.nan,  # leave numpy's global generator alone
@@ -153,10 +153,10 @@ class CMAESGradientOptions(CMAESOptions):
 class CMAESGradient(CMAES):
     """Inject a step down the gradient at the mean into every population of CMA-ES.
 
-    Before each population the mean is evaluated with its gradient g. The population's first point is then mean -
-    sigma sqrt(dim) C g / sqrt(g' C g), as far from the mean as a typical sample and in the direction that the natural
-    gradient has (Hansen 2011, "Injecting External Solutions Into CMA-ES"); the library sees to it that no point counts
-    as farther than its own samples may be. Where the episode of the mean failed, or its gradient is zero or missing,
+    Before each population, the mean is evaluated with its gradient g. The first point of the population is then mean -
+    sigma sqrt(dim) C g / sqrt(g' C g). It is as far from the mean as a typical sample, in the direction of the natural
+    gradient (Hansen 2011, "Injecting External Solutions Into CMA-ES"). The library ensures that no point counts as
+    farther away than its own samples can be. If the episode of the mean failed, or its gradient is zero or missing,
     nothing is injected.
     """
 

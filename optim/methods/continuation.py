@@ -24,15 +24,15 @@ STALL = 10  # evaluations without progress that end a polish
 class ContinuationOptions(LBFGSBOptions):
     """How a schedule of smoothing goes, and when the next one begins elsewhere.
 
-    A schedule has `widths` standard deviations of the Gaussian, in geometric order, from `sigma`, a share of every side
-    of the box, to `narrowest` times that. At each one the gradient of the smoothed loss is estimated from `pairs` of
-    opposite points, and the centre moves against it by `step` widths in each parameter, root mean square. `order` mixed
-    takes losses and gradients, zeroth losses alone. Then L-BFGS-B goes on for up to `evaluations` episodes.
+    A schedule has `widths` standard deviations of the Gaussian, in geometric order, from `sigma`, a fraction of every
+    side of the box, to `narrowest` times that. At each one, `pairs` of opposite points estimate the gradient of the
+    smoothed loss, and the centre moves against it by `step` widths in each parameter, root mean square. `order` mixed
+    takes losses and gradients, zeroth only losses. Then L-BFGS-B continues for up to `evaluations` episodes.
 
-    The next schedule begins at the best point since the last random start. One that has not lowered the best loss by
-    `tolerance`, a fraction of it, nor by more than `floor` [loss unit] halves the next one's widths; after `halvings`
-    of these comes another random start. `landscape study symmetry` measures the floor of a scene. Ten evaluations of
-    L-BFGS-B that have not lowered its loss by more than that end it.
+    The next schedule begins at the best point since the last random start. If a schedule has not lowered the best loss
+    by `tolerance`, a fraction of it, nor by more than `floor` [loss unit], the next one has half its widths. After
+    `halvings` of these there is another random start. `landscape study symmetry` measures the floor of a scene. Ten
+    evaluations in a row that do not lower the loss by more than the floor end L-BFGS-B.
     """
 
     method = "continuation"
@@ -54,12 +54,12 @@ class ContinuationOptions(LBFGSBOptions):
 
 
 class Continuation(LBFGSB):
-    """Descend on the loss under a Gaussian whose width fades, polish by L-BFGS-B, and begin again at the best point.
+    """Descend on the loss under a Gaussian whose width fades, polish by L-BFGS-B, and restart at the best point.
 
-    The strong smoothing leads past local minima, the weak one to the minimum of the loss itself: graduated
-    non-convexity (Blake & Zisserman 1987; Mobahi & Fisher 2015). Gradients of the smoothed loss are estimated as
-    `shrunk_gradient` says, after Suh et al. 2022. A failed episode counts as the worst loss so far, with a gradient of
-    zero, and so does the gradient of an episode that has a loss alone: of such losses the estimate is of zeroth order.
+    Strong smoothing leads past local minima, weak smoothing to the minimum of the loss itself: graduated non-convexity
+    (Blake & Zisserman 1987; Mobahi & Fisher 2015). `shrunk_gradient` estimates gradients of the smoothed loss, after
+    Suh et al. 2022. A failed episode counts as the worst loss so far, with a gradient of zero. An episode with a loss
+    but no gradient also counts with zero; the estimate from such losses is of zeroth order.
     """
 
     name = "continuation"
@@ -67,7 +67,7 @@ class Continuation(LBFGSB):
 
     @classmethod
     def memory(cls, options: Mapping[str, Any], size: SearchSize) -> float:
-        """Estimate what is kept of the longest polish, and what the estimate of a gradient takes [bytes]."""
+        """Estimate the memory of the longest polish, and of the estimate of a gradient [bytes]."""
         estimate = FLOAT * options["pairs"] * (20 * size.dim + 6 * options["pairs"])
         return super().memory(options, size) + float(estimate)
 
@@ -77,7 +77,7 @@ class Continuation(LBFGSB):
         self.local = self._begin(self._start_anywhere())
 
     def _start_anywhere(self) -> Points:
-        """Draw the first point of a search that knows of no best one."""
+        """Draw the first point of a search without a best one."""
         self.best, self.best_loss = self.random.uniform(-1.0, 1.0, self.space.dim), math.inf
         self.halved = 0
         return self._start_schedule()
@@ -90,7 +90,7 @@ class Continuation(LBFGSB):
 
     @property
     def width(self) -> float:
-        """The present standard deviation of the Gaussian, a share of every side of the box."""
+        """The present standard deviation of the Gaussian, a fraction of every side of the box."""
         share = self.level / max(1, self.options.widths - 1)
         return float(self.options.sigma * 0.5**self.halved * self.options.narrowest**share)
 
@@ -119,7 +119,7 @@ class Continuation(LBFGSB):
             self.local = self._begin(2.0 * self.centre - 1.0 if self.needs_grad else self._next_start())
 
     def _move(self, loss: Points, grad: Points | None) -> Points:
-        """Return where the centre goes from the losses of pairs and, where there are some, their gradients."""
+        """Return the next centre from the losses of pairs and, if there are some, their gradients."""
         shape = (2, self.options.pairs, self.space.dim)
         half = loss[: shape[1]] / 2 - loss[shape[1] :] / 2  # by a move of one width
         first = np.zeros(shape[1:])
@@ -136,7 +136,7 @@ class Continuation(LBFGSB):
         return np.asarray(np.clip(self.centre - move, 0.0, 1.0))
 
     def _polish(self, z: Points, loss: Points, grad: Points | None) -> None:
-        """Go on with L-BFGS-B, or begin the next schedule where it has ended or stalls."""
+        """Continue with L-BFGS-B, or begin the next schedule when it has ended or stalls."""
         polished = self.local
         super()._tell(z, loss, grad)
         known = polished.loss
@@ -145,7 +145,7 @@ class Continuation(LBFGSB):
             self.local = self._begin(self._next_start())
 
     def _next_start(self) -> Points:
-        """Begin the next schedule: at the best point, narrower where the last brought nothing, or anywhere."""
+        """Begin the next schedule: at the best point, narrower if the last one gained nothing, or at random."""
         least = max(self.options.floor, self.options.tolerance * abs(self.before)) if self.before < math.inf else 0.0
         self.halved += not self.best_loss < self.before - least
         return self._start_anywhere() if self.halved > self.options.halvings else self._start_schedule()

@@ -20,11 +20,11 @@ from ..options import LIBRARY, MANY, PAPER, MethodOptions, number
 class DescentOptions(MethodOptions):
     """How a descent moves in the box scaled to [-1, 1], and when it ends.
 
-    `step` [scaled parameter^2 / loss unit] is what gradients are multiplied by. A move whose largest component exceeds
-    `max_step` is shortened to it; below that the step is plain. Both shrink by the factor `shrink` wherever the loss
-    has risen (1: never), or one step could not do for scenes whose gradients differ by a factor of a thousand. A
-    descent ends after `steps` iterates, or when the loss has failed more than `patience` times in a row to fall below
-    the best so far by `tolerance`, a fraction of it.
+    `step` [scaled parameter^2 / loss unit] multiplies the gradient. A move whose largest component exceeds `max_step`
+    is shortened to it; smaller moves are unchanged. Both shrink by the factor `shrink` whenever the loss has risen (1:
+    never). Otherwise one step could not suit scenes whose gradients differ by a factor of a thousand. A descent ends
+    after `steps` iterates, or when the loss has failed more than `patience` times in a row to fall below the best so
+    far by `tolerance`, a fraction of it.
     """
 
     method = "a descent"
@@ -43,11 +43,10 @@ def lacks(grad: Points) -> bool:
 
 
 class Descending(Part, ABC):
-    """A descent in the scaled box: `at` is the iterate to evaluate next, until `done`; `best` is the least loss so far.
+    """A descent in the scaled box: `at` is the next iterate to evaluate, until `done`; `best` is the lowest loss.
 
     By its options it ends after `steps` iterates, or after more than `patience` in a row that have not lowered the best
-    loss by `tolerance`, a fraction of it. An iterate without a gradient, which is NaN then, ends it: nothing says where
-    to go from there.
+    loss by `tolerance`, a fraction of it. An iterate without a gradient (NaN) ends it, because no direction is known.
     """
 
     def __init__(self, start: Points, options: Any, *, done: bool = False) -> None:
@@ -58,7 +57,7 @@ class Descending(Part, ABC):
 
     @abstractmethod
     def tell(self, loss: float, grad: Points) -> None:
-        """Take in the iterate's loss, +inf where the episode failed, and gradient, shape (dim,); move on or end."""
+        """Take the iterate's loss, +inf where the episode failed, and gradient, shape (dim,); move on or end."""
 
     def _ends_with(self, loss: float) -> bool:
         """Count an iterate with this loss; return whether it is the last."""
@@ -72,8 +71,8 @@ class Descending(Part, ABC):
 class Descent(Descending):
     """Follow gradients from `start`, by steps along them.
 
-    Every iterate is evaluated once, loss and gradient, and both are used; the one that ends it stays in `at`, also
-    where it has a loss and no gradient, unless its episode failed: then the one before, the last that has a loss.
+    Every iterate is evaluated once, and both its loss and its gradient are used. The one that ends the descent stays in
+    `at`, even without a gradient. If its episode failed, the previous one stays, the last with a loss.
     """
 
     def __init__(self, start: Points, options: DescentOptions, *, done: bool = False) -> None:
@@ -109,7 +108,7 @@ class Descent(Descending):
 
 @dataclass(frozen=True)
 class DescentsOptions(DescentOptions):
-    """`batch_size` descents are evaluated as one batch, 1 for one after the other."""
+    """`batch_size` descents are evaluated as one batch; 1 runs them one after the other."""
 
     method = "descents"
 
@@ -127,7 +126,7 @@ class Descents(Optimizer):
 
     @classmethod
     def memory(cls, options: Mapping[str, Any], size: SearchSize) -> float:
-        """Estimate what the descents of a batch take [bytes]."""
+        """Estimate the memory of the descents of a batch [bytes]."""
         return float(options["batch_size"] * (cls.held + 20 * FLOAT * size.dim))
 
     def _setup(self) -> None:
@@ -156,7 +155,7 @@ class Descents(Optimizer):
 class AdamOptions(MethodOptions):
     """How a descent moves in the box scaled to [-1, 1], and when it ends.
 
-    `rate` is the learning rate, about what a parameter moves by in a step at first; `beta1` and `beta2` say how slowly
+    `rate` is the learning rate, about the size of the first steps in each parameter. `beta1` and `beta2` set how slowly
     the means of gradients and of their squares forget (torch's defaults). A descent ends after `steps` iterates, or
     when the loss has failed more than `patience` times in a row to fall below the best so far by `tolerance`, a
     fraction of it. `batch_size` descents are evaluated as one batch.
@@ -194,13 +193,13 @@ class AdamDescent(Descending):
         self.at = self._z.clamp_(-1.0, 1.0).numpy().copy()
 
     def state(self) -> dict[str, Any]:
-        """Return where the descent stands, as data."""
+        """Return the state of the descent, as data."""
         moments = {name: value.numpy() for name, value in self._adam.state[self._z].items()}
         kept = {name: value for name, value in super().state().items() if name not in ("_z", "_adam")}
         return kept | {"moments": moments}
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Take back what `state` returned."""
+        """Restore a result of `state`."""
         super().restore({name: value for name, value in state.items() if name != "moments"})
         self._z.copy_(torch.from_numpy(self.at))
         if state["moments"]:

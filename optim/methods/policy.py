@@ -1,14 +1,14 @@
-"""PPO and SAC of Stable-Baselines3: neural policies that see what an episode has come to, and decide what comes next.
+"""PPO and SAC of Stable-Baselines3: neural policies that observe the state of an episode and decide the next action.
 
-A point of the box is an episode: its parameters are the controls of `decisions` equally long stretches, one after the
-other. The objective's `observe` shows the policy what has come of the earlier ones, and the whole is then evaluated
-once: an episode. (That the simulator starts over for every look shows in a run's seconds, not in its episodes.) An
-objective without `decisions` leaves one action to decide and nothing to see: a bandit.
+A point of the box is an episode: its parameters are the controls of `decisions` equally long stretches, in order. The
+objective's `observe` shows the policy the effect of the earlier ones. The whole is then evaluated once: an episode.
+(Each observation restarts the simulator, which counts in a run's seconds, not in its episodes.) An objective without
+`decisions` has a single action and nothing to observe: a bandit.
 
-The reward is the paper's, minus the episode's loss after its last decision and 0 before, as (m - loss) / s with the
-mean m and the deviation s of the first episodes: losses lie anywhere between 1e-3 and 1e2, and SB3 scales advantages
-but neither values nor SAC's entropy. A failed episode is rewarded like the worst so far. The paper has three layers of
-64; what it leaves open is as SB3 has it, but for rollouts and learning rates that suit budgets of 1000 episodes.
+The reward is the paper's, minus the episode's loss after its last decision and 0 before. It is scaled to (m - loss) / s
+with the mean m and the deviation s of the first episodes. Losses range from 1e-3 to 1e2, and SB3 scales advantages but
+neither values nor SAC's entropy. A failed episode gets the reward of the worst so far. The paper has three layers of
+64. Everything it leaves open is SB3's default, except rollouts and learning rates, which suit budgets of 1000 episodes.
 """
 
 from __future__ import annotations
@@ -39,12 +39,12 @@ from ..options import LIBRARY, MethodOptions, number
 
 
 def read_weights(model: Any) -> dict[str, Any]:
-    """Return the weights of a model's networks and what its optimisers have gathered about them, as arrays."""
+    """Return the weights of a model's networks and the state of its optimisers, as arrays."""
     return {name: _arrays(_inner(part)) for name, part in _parts(model).items()}
 
 
 def put_weights(model: Any, weights: Mapping[str, Any]) -> None:
-    """Put what `read_weights` returned into a model that was made by the same options."""
+    """Restore a result of `read_weights` in a model made with the same options."""
     for name, part in _parts(model).items():
         if isinstance(part, Tensor):
             part.data.copy_(torch.from_numpy(weights[name]))
@@ -91,12 +91,11 @@ Numbers = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class PPOOptions(MethodOptions):
-    """`episodes` of a rollout, shared by so many `minibatches`; `epochs` over them.
+    """`episodes` of a rollout, split into `minibatches`; `epochs` over them.
 
-    `learning_rate` of policy and value, `discount` of later rewards.
-
-    SB3's rollout of 2048 steps would outlast 1000 episodes with one decision and make three updates of 1000 with five.
-    Its learning rate is 3e-4, with which 600 episodes in a bowl (2-D) came to a mean loss of 2.4; they come to 1.5.
+    `learning_rate` of policy and value, `discount` of later rewards. SB3's rollout of 2048 steps would take more than
+    1000 episodes with one decision, and make three updates in 1000 episodes with five. With SB3's learning rate of
+    3e-4, 600 episodes in a bowl (2-D) reach a mean loss of 2.4; with ours, 1.5.
     """
 
     method = "ppo"
@@ -111,18 +110,18 @@ class PPOOptions(MethodOptions):
         super().__post_init__()
         if self.episodes % self.minibatches or self.episodes < 2 * self.minibatches:
             raise ValueError(
-                f"ppo shares a rollout's episodes equally by its minibatches, two or more for each; "
-                f"got episodes={self.episodes}, minibatches={self.minibatches}"
+                "ppo splits a rollout's episodes equally into its minibatches, at least two episodes each; got "
+                f"episodes={self.episodes}, minibatches={self.minibatches}"
             )
 
 
 @dataclass(frozen=True)
 class SACOptions(MethodOptions):
-    """`warmup`: random episodes before the policy plays; then a gradient step on a `batch` for every transition.
+    """`warmup`: random episodes before the policy plays; then one gradient step on a `batch` for every transition.
 
-    `learning_rate` of policy and critics, `discount` of later rewards. `memory`: transitions that are kept; the default
-    is all of 1000 episodes with 100 decisions. SB3's learning rate is 3e-4, with which 600 episodes of five decisions
-    came to a mean loss of 1.3; they come to 0.3.
+    `learning_rate` of policy and critics, `discount` of later rewards. `memory`: number of stored transitions; the
+    default fits 1000 episodes with 100 decisions. With SB3's learning rate of 3e-4, 600 episodes of five decisions
+    reach a mean loss of 1.3; with ours, 0.3.
     """
 
     method = "sac"
@@ -136,7 +135,7 @@ class SACOptions(MethodOptions):
 
 @dataclass(frozen=True, eq=False)
 class Rollout:
-    """Hold episodes as the policy saw and played them: what it saw, shape (decision, episode, feature), and did."""
+    """Episodes as a policy played them: its observations, shape (decision, episode, feature), and its actions."""
 
     seen: Numbers
     actions: Numbers
@@ -148,10 +147,10 @@ class Rollout:
 
 
 class PolicySearch(Optimizer):
-    """Play episodes with a policy, and train it by how they end.
+    """Play episodes with a policy, and train it on their rewards.
 
-    SB3 draws from the process's generators. It does so here under a lock and with states of the optimiser's own, which
-    are put back afterwards: searches in other threads neither see nor change them. Simulations are not under the lock.
+    SB3 draws from the process's generators. Here it does so under a lock and with the optimiser's own states, which are
+    stored afterwards. Searches in other threads neither see nor change them. Simulations do not need the lock.
     """
 
     _rollout: Rollout  # between `_ask` and `_tell`
@@ -162,9 +161,9 @@ class PolicySearch(Optimizer):
         self._generators = _seed_generators(int(self.random.integers(1 << 32)))
 
     def attach(self, objective: Objective) -> None:
-        """Take the objective that the policy plays in.
+        """Attach the objective in which the policy plays.
 
-        Raises ValueError where its decisions have not equally many controls.
+        Raises ValueError where its decisions differ in their number of controls.
         """
         super().attach(objective)
         self.decisions = objective.decisions
@@ -180,20 +179,20 @@ class PolicySearch(Optimizer):
 
     @abc.abstractmethod
     def _make_model(self, spaces: gymnasium.Env[Any, Any]) -> Any:
-        """Return the algorithm's model as it begins."""
+        """Return the new model of the algorithm."""
 
     @abc.abstractmethod
     def _act(self, seen: Tensor) -> Tensor:
-        """Draw an action for every row of what is seen."""
+        """Draw an action for every row of observations."""
 
     @abc.abstractmethod
     def _learn(self, rollout: Rollout, rewards: Numbers) -> None:
         """Train on episodes that ended with these rewards, shape (episode,)."""
 
     def _play(self, episodes: int) -> Asking[Rollout]:
-        """Play episodes side by side."""
+        """Play episodes in parallel."""
         if self._model is None:
-            raise ValueError(f"{self.name} plays in the objective itself; attach it before the first ask")
+            raise ValueError(f"{self.name} plays in the objective itself; call attach(objective) before the first ask")
         self._refuse_diverged(self._model.policy.parameters())
         z = torch.zeros(episodes, self.decisions, self.space.dim // self.decisions, dtype=torch.float64)
         seen, actions = [], []
@@ -209,8 +208,7 @@ class PolicySearch(Optimizer):
     def _refuse_diverged(self, numbers: Iterable[Tensor]) -> None:
         if not all(bool(part.isfinite().all()) for part in numbers):
             raise ValueError(
-                f"the policy of {self.name} has diverged; give it a smaller learning_rate than "
-                f"{self.options.learning_rate:g}"
+                f"the policy of {self.name} has diverged; use a learning_rate below {self.options.learning_rate:g}"
             )
 
     def _tell(self, z: Points, loss: Points, grad: Points | None) -> None:
@@ -226,7 +224,7 @@ class PolicySearch(Optimizer):
         del self._rollout
 
     def _observe(self, x: Tensor, decision: int) -> Asking[Numbers]:
-        """Return what is seen before a decision, shape (episode, feature); a zero where there is only one."""
+        """Return the observation before a decision, shape (episode, feature); zero where there is only one decision."""
         if self.decisions == 1:
             return np.zeros((len(x), 1), dtype=np.float32)
         seen, _ = yield Observe(x, decision)
@@ -265,7 +263,7 @@ class PPO(PolicySearch):
 
     @classmethod
     def memory(cls, options: Mapping[str, Any], size: SearchSize) -> float:
-        """Estimate what a rollout and the networks take [bytes]."""
+        """Estimate the memory of a rollout and the networks [bytes]."""
         each = ROLLOUT + size.decisions * _transition_memory(size)
         return float(options["episodes"] * each + _network_memory(size))
 
@@ -311,7 +309,7 @@ class SAC(PolicySearch):
 
     @classmethod
     def memory(cls, options: Mapping[str, Any], size: SearchSize) -> float:
-        """Estimate what the replay buffer, a batch and the networks take [bytes]."""
+        """Estimate the memory of the replay buffer, a batch and the networks [bytes]."""
         transitions = options["memory"] + options["warmup"] * size.decisions
         return float(transitions * _transition_memory(size) + options["batch"] * ROW + _network_memory(size))
 
@@ -376,7 +374,7 @@ class SAC(PolicySearch):
 
 
 def _transition_memory(size: SearchSize) -> float:
-    """Return the bytes of what is seen before and after an action, and of the action, in float32."""
+    """Return the bytes of the observations before and after an action, and of the action, in float32."""
     return 4 * (2 * FEATURES + size.dim // size.decisions + 10)
 
 
@@ -386,7 +384,7 @@ def _network_memory(size: SearchSize) -> float:
 
 
 class _Spaces(gymnasium.Env[Any, Any]):
-    """Say what is seen and done; the episodes themselves are played by the optimiser."""
+    """Describe observations and actions; the optimiser itself plays the episodes."""
 
     def __init__(self, features: int, controls: int) -> None:
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (features,))
@@ -406,7 +404,7 @@ def _seed_generators(seed: int) -> tuple[Tensor, dict[str, Any]]:
 
 
 def _exchange(states: tuple[Tensor, dict[str, Any]]) -> tuple[Tensor, dict[str, Any]]:
-    """Put the global generators into other states, and return those they were in."""
+    """Set the states of the global generators, and return the former ones."""
     before = torch.get_rng_state(), np.random.get_state(legacy=False)
     torch.set_rng_state(states[0])
     np.random.set_state(states[1])

@@ -1,8 +1,8 @@
 """Gaussian processes with zero mean: covariances, their factors, and fits of hyper-parameters.
 
 Covariances are GPyTorch's `RBFKernel`, `MaternKernel` and `RBFKernelGrad` without their bookkeeping and without reverse
-differentiation, which take longer than the numbers themselves where a process has a few hundred points. Fits maximise
-the marginal likelihood times priors by BoTorch's optimiser.
+differentiation. For a process of a few hundred points, these take longer than the numbers themselves. Fits maximise the
+marginal likelihood times priors by BoTorch's optimiser.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _factors: OrderedDict[tuple[Any, ...], Factor] = OrderedDict()  # by covariance,
 class Covariance(abc.ABC):
     """A covariance of points of [0, 1]^dim, each of which has one row or more; the first is its value.
 
-    It depends on nothing but its class and its length-scales, `scale`.
+    It depends only on its class and its length-scales, `scale`.
     """
 
     scale: Float[Tensor, " dim"]
@@ -200,9 +200,9 @@ class GradientCovariance(Covariance):
 
 
 def fitted(model: ExactGP) -> dict[str, Points]:
-    """Return the parameters at which marginal likelihood times priors is largest, from where they are, by name.
+    """Return the parameters at which marginal likelihood times priors is largest, from their present values, by name.
 
-    Beside them it holds what they stand for: the length-scales, `scale`, and the noise's variance, `noise`, shape (1,).
+    It also contains the derived values: the length-scales, `scale`, and the noise's variance, `noise`, shape (1,).
     """
     likelihood = ExactMarginalLogLikelihood(model.likelihood, model).train()
     parameters = {name: one for name, one in likelihood.named_parameters() if one.requires_grad}
@@ -213,7 +213,7 @@ def fitted(model: ExactGP) -> dict[str, Points]:
 
 
 def with_parameters(model: Model, parameters: Mapping[str, Points]) -> Model:
-    """Return a process, those of its parameters that are named set to these."""
+    """Return a process with the named parameters set to these values."""
     with torch.no_grad():
         for name, value in model.named_parameters():
             if name in parameters:
@@ -222,9 +222,9 @@ def with_parameters(model: Model, parameters: Mapping[str, Points]) -> Model:
 
 
 def closure_of(likelihood: ExactMarginalLogLikelihood) -> Callable[[], tuple[Tensor, list[Tensor]]]:
-    """Return what gives minus the logarithm of likelihood times priors, for each row, and its slopes by parameters.
+    """Return a function for minus the logarithm of likelihood times priors, and its derivatives by parameters.
 
-    It is what BoTorch's closure gives for a process without mean.
+    It returns them for each row, and equals BoTorch's closure for a process without mean.
     """
     model = likelihood.model
     u, values = model.train_inputs[0], model.train_targets.reshape(-1)
@@ -270,7 +270,7 @@ def marginal_likelihood(
 
 
 def covariance_of(kernel: Kernel) -> Covariance:
-    """Return what a kernel of GPyTorch computes, as it is now. Raises ValueError for one that is not known here."""
+    """Return the present covariance of a kernel of GPyTorch. Raises ValueError for an unknown one."""
     scale = kernel.lengthscale.detach().reshape(-1).clone()
     if isinstance(kernel, RBFKernelGrad):
         return GradientCovariance(scale)
@@ -278,15 +278,15 @@ def covariance_of(kernel: Kernel) -> Covariance:
         return SquaredExponential(scale)
     if isinstance(kernel, MaternKernel) and kernel.nu == 2.5:
         return Matern(scale)
-    raise ValueError(f"a covariance is an RBFKernel, an RBFKernelGrad or a MaternKernel of 5/2; got {kernel}")
+    raise ValueError(f"covariance_of takes an RBFKernel, an RBFKernelGrad or a MaternKernel of 5/2; got {kernel}")
 
 
 @dataclass(frozen=True)
 class Process:
     """A process over [0, 1]^dim with zero mean, given `values`, a number for each row of the points `u`.
 
-    `noise` is the variance of what is added to each row. The factor of the `first` points is kept for the next process
-    that begins with them.
+    `noise` is the variance of the noise of each row. The factor of the `first` points is kept for the next process that
+    begins with them.
     """
 
     covariance: Covariance
@@ -296,7 +296,7 @@ class Process:
     first: int
 
     def factor(self) -> Factor:
-        """Return the factor of the covariance of what is known, going on from one that is kept where there is one."""
+        """Return the factor of the covariance of the known points, extending a kept one if there is one."""
         key = (type(self.covariance), self.noise, *map(_bytes, (self.covariance.scale, self.u[: self.first])))
         found = _factors.get(key)
         if found is None:
@@ -314,7 +314,7 @@ class Process:
 
     @torch.no_grad()
     def posterior(self, u: PointsTensor) -> tuple[Float[Tensor, " point"], Matrix]:
-        """Return mean and covariance of the values at points, given what is known, of points with one row each."""
+        """Return mean and covariance of the values at points, given the known ones, for points with one row each."""
         factor, cross = self.factor(), self.covariance.dense(u, self.u)
         white = factor.whiten(cross)
         return cross @ factor.weights(self.values), self.covariance.dense(u, u).addmm_(white, white.T, alpha=-1.0)
@@ -324,9 +324,8 @@ class Process:
 class Factor:
     """The Cholesky factor L of the covariance of points with noise, in blocks: `head` of the first, the others below.
 
-    Points are added one by one, so that what comes out is the same to the last bit whether an earlier factor was kept
-    or not. To solve with it takes half as long as to multiply with its inverse, for the few points that a bound is
-    asked of.
+    Points are added one by one, so the result is the same to the last bit whether an earlier factor was kept or not.
+    For the few points of a bound, solving takes half as long as multiplying with its inverse.
     """
 
     u: PointsTensor

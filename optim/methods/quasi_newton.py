@@ -21,18 +21,18 @@ INTERVAL, TARGET, FACTOR = 50, 0.5, 0.9  # of hops, of those accepted, of a hop'
 
 
 class _Unknown(Exception):  # noqa: N818 -- no error: it takes control back from scipy
-    """Carry the point out of scipy whose loss is not known yet."""
+    """Carry the point with the unknown loss out of scipy."""
 
     def __init__(self, z: Points) -> None:
         self.z = z.copy()
 
 
 class LocalSearch(Part):
-    """Minimise by scipy's L-BFGS-B from `start`, in the scaled box: `at` is the point it asks for next, until `done`.
+    """Minimise by scipy's L-BFGS-B from `start`, in the scaled box: `at` is the next point it needs, until `done`.
 
-    scipy calls a function and wants its value at once, so every `tell` minimises from the start again, with the values
-    known so far, up to the first point that is not known: the points are the same every time. That takes 1 ms for a
-    point of a search of 100, 3 ms of 200 (50 parameters). `failed` says that it ended as scipy calls no success.
+    scipy calls a function and needs its value at once. So every `tell` minimises from the start again, with the known
+    values, up to the first unknown point: the points are the same every time. That takes 1 ms for a point of a search
+    of 100, 3 ms of 200 (50 parameters). `failed`: scipy reports that the search ended without success.
     """
 
     def __init__(self, start: Points, evaluations: int) -> None:
@@ -44,9 +44,9 @@ class LocalSearch(Part):
         self.done = self.failed = False
 
     def tell(self, loss: float, grad: Points) -> None:
-        """Take in the loss and the gradient, shape (dim,), of the point asked for; raises whatever scipy raises.
+        """Take the loss and the gradient, shape (dim,), of the requested point; raises whatever scipy raises.
 
-        A point that has no gradient ends the search, at the least loss so far: scipy makes nothing of NaN.
+        A point without a gradient ends the search, at the lowest loss so far, because scipy cannot use NaN.
         """
         self.z, self.grad = np.vstack([self.z, self.at]), np.vstack([self.grad, grad])
         self.loss.append(loss)
@@ -87,8 +87,8 @@ class LBFGSBOptions(MethodOptions):
 class LBFGSB(Optimizer):
     """Minimise by scipy's L-BFGS-B from uniformly random starts: where one search ends, the next begins.
 
-    Every episode is with gradient. A failed one counts as the worst loss so far, on a plain; one that has a loss and no
-    gradient ends its search.
+    Every episode has a gradient. A failed one counts as the worst loss so far, with a gradient of zero. One that has a
+    loss but no gradient ends its search.
     """
 
     name = "l-bfgs-b"
@@ -97,7 +97,7 @@ class LBFGSB(Optimizer):
 
     @classmethod
     def memory(cls, options: Mapping[str, Any], size: SearchSize) -> float:
-        """Estimate what is kept of the longest search [bytes]."""
+        """Estimate the memory of the longest search [bytes]."""
         points = min(options["evaluations"], size.budget or MANY) + 2 * MEMORY
         return float(3 * FLOAT * size.dim * points)
 
@@ -121,7 +121,7 @@ class LBFGSB(Optimizer):
             self.local = self._begin(self._next_start())
 
     def _next_start(self) -> Points:
-        """Return where the next search begins, now that one has ended."""
+        """Return the start of the next search, after one has ended."""
         return self.random.uniform(-1.0, 1.0, self.space.dim)
 
 
@@ -129,7 +129,7 @@ class LBFGSB(Optimizer):
 class BasinHoppingOptions(LBFGSBOptions):
     """How the search goes from minimum to minimum; the defaults of hops are scipy's.
 
-    A hop is uniform, up to `step` along each parameter of the box scaled to [-1, 1]; its length is adapted every 50
+    A hop is uniform, up to `step` along each parameter of the box scaled to [-1, 1]. Its length is adapted every 50
     hops so that half of them are accepted. A minimum that is worse by `temperature` [loss unit] is accepted with
     probability 1/e.
     """
@@ -141,9 +141,10 @@ class BasinHoppingOptions(LBFGSBOptions):
 
 
 class BasinHopping(LBFGSB):
-    """Hop from minimum to minimum as scipy's `basinhopping` does: displace, minimise by L-BFGS-B, accept or go back.
+    """Hop from minimum to minimum like scipy's `basinhopping`: displace, minimise by L-BFGS-B, accept or go back.
 
-    It is written here to propose points one by one; on what scipy minimises itself it evaluates the same points.
+    It is our own code, to propose points one by one. On functions that scipy can minimise itself it evaluates the same
+    points.
     """
 
     name = "basin-hopping"
@@ -170,7 +171,7 @@ class BasinHopping(LBFGSB):
         return self.here + self.random.uniform(-self.length, self.length, self.space.dim)
 
     def _accept(self) -> bool:
-        """Accept the minimum found as Metropolis does, unless its search failed and that before did not."""
+        """Accept the found minimum as Metropolis does, unless its search failed and the previous one did not."""
         worse = max(0.0, self.local.best_loss - self.here_loss)
         drawn = self.random.uniform()
         return bool(

@@ -18,10 +18,9 @@ them; RBFKernelGrad for bo-gradient) took, over three seeds of 100 episodes at d
 | | bo-leap | 0.8, 0.7 | 0.9 | 0.00014, 0.00014 |
 | rope (30) | bo | 26.0, 120 | 4.6 | 10.3, 10.4 |
 
-bo-leap asks a process once or twice in 100 episodes. The comparison of bo-gradient on rope had not ended after 20
-minutes; which half of it was running then is not known. One model for all seeds could save two thirds at most, which
-leaves bo and bo-gradient 1.6 to 3.4 times slower. That BoTorch's models find no more is what three seeds show, without
-a test.
+bo-leap uses a process once or twice in 100 episodes. The comparison of bo-gradient on rope had not ended after 20
+minutes. One model for all seeds could save at most two thirds, which leaves bo and bo-gradient 1.6 to 3.4 times slower.
+On three seeds BoTorch's models find nothing better; that is no statistical test.
 """
 
 from __future__ import annotations
@@ -68,9 +67,9 @@ MIN_SPREAD = 1e-8  # of losses that are put in deviations from their average, as
 class LowerBound:
     """The lower confidence bound of a process, in standard deviations of the losses from their average.
 
-    It is that of BoTorch's `UpperConfidenceBound` with `maximize=False`, before the losses' scale is put back: of a
-    process of one function, alone or with its slopes, with a variance of one where nothing is known. What does not
-    change from point to point is computed once: weights of what is known, and a factor of the covariance.
+    It equals BoTorch's `UpperConfidenceBound` with `maximize=False`, before the losses are scaled back, for a process
+    of one function, alone or with its derivatives, with a variance of one far from data. Everything that is the same
+    for all points is computed once: weights of the data, and a factor of the covariance.
     """
 
     @torch.no_grad()
@@ -89,7 +88,7 @@ class LowerBound:
 
     @torch.no_grad()
     def with_slope(self, u: Float[Tensor, "count dim"]) -> tuple[Float[Tensor, " count"], Float[Tensor, "count dim"]]:
-        """Return the bound at points, and its slopes there."""
+        """Return the bound at points, and its derivatives."""
         covariance, pull = self.covariance.across(u, self.known)
         white = self.factor.whiten(covariance)
         deviation = _deviation(white)
@@ -103,7 +102,7 @@ def _deviation(white: Matrix) -> Float[Tensor, " count"]:
 
 
 def least_point(bound: LowerBound, z: Points, loss: Points, random: np.random.Generator) -> Points:
-    """Return where in [-1, 1]^dim the bound is least, shape (dim,), given the points z and their losses so far."""
+    """Return the point in [-1, 1]^dim with the lowest bound, shape (dim,), from the points z and losses so far."""
 
     def at(x: Points) -> tuple[Points, Points]:
         value, slope = bound.with_slope(torch.from_numpy(x))
@@ -117,7 +116,7 @@ def least_point(bound: LowerBound, z: Points, loss: Points, random: np.random.Ge
 
 
 def _starts(bound: LowerBound, z: Points, loss: Points, random: np.random.Generator) -> Float[Tensor, "start dim"]:
-    """Return where the search for the least bound starts: the best of many points all over, and near the best."""
+    """Return the starts of the search for the lowest bound: the best of many points everywhere, and near the best."""
     leaders = z[np.argsort(loss, kind="stable")[:8]]
     near = np.resize(leaders, (NEAR, z.shape[1])) + 2 * JITTER * random.standard_normal((NEAR, z.shape[1]))
     near[: len(leaders)] = leaders
@@ -132,7 +131,7 @@ def unit(z: Points) -> Float[Tensor, "count dim"]:
 
 @contextmanager
 def exclusive() -> Iterator[None]:
-    """Keep other threads out, let torch use one core, and quiet what is no news: iteration limits, jitter added."""
+    """Keep other threads out, let torch use one core, and hide warnings of iteration limits and added jitter."""
     with ONE_AT_A_TIME, one_torch_thread(), warnings.catch_warnings():
         for category in (BotorchWarning, NumericalWarning, GPInputWarning):
             warnings.simplefilter("ignore", category)
@@ -141,13 +140,13 @@ def exclusive() -> Iterator[None]:
 
 @dataclass(frozen=True)
 class SurrogateOptions(MethodOptions):
-    """How losses are modelled, and how much is ventured where little is known.
+    """How losses are modelled, and how exploration and exploitation are balanced.
 
-    `coefficient` is how many standard deviations the bound lies below the mean. `kernel` is squared-exponential or
-    Matern-5/2, with a length-scale per parameter. Points are drawn at random until `initial` of them are known: fewer
-    say nothing about length-scales, and the search would settle on what they suggest. `max_points` points are
-    modelled at most: of more, those with the least losses for one half and as many of the others, spread evenly over
-    the run, chosen again whenever the process is full or its length-scales are fitted.
+    `coefficient` is the number of standard deviations of the bound below the mean. `kernel` is squared-exponential or
+    Matern-5/2, with a length-scale per parameter. Points are random until `initial` of them are known. Fewer points say
+    nothing about length-scales, and the search would follow arbitrary ones. At most `max_points` points are modelled.
+    Of more, half are those with the lowest losses, and half are others, spread evenly over the run. They are chosen
+    again whenever the process is full or its length-scales are fitted.
     """
 
     method = "bo"
@@ -164,13 +163,13 @@ class SurrogateOptions(MethodOptions):
 
 
 class Surrogate(Part):
-    """Model losses over the box scaled to [-1, 1] by an exact Gaussian process, float64, whose mean is zero.
+    """Model losses over the box scaled to [-1, 1] by an exact Gaussian process, float64, with mean zero.
 
-    Losses are standardised before, so that zero is their average and one their spread: a raw zero mean would promise
-    low losses everywhere to a search that has seen none below a hundred. Hyper-parameters (length-scales and noise)
-    maximise the marginal likelihood times BoTorch's priors, which scale with the dimension (Hvarfner et al. 2024): with
-    fewer points than dimensions the likelihood alone would decide nothing. They are fitted to at most 300 points,
-    evenly spread over the run, and again whenever the data have grown by a tenth; the process itself holds all points.
+    Losses are standardised first, so zero is their average and one their deviation. Otherwise a search that has seen
+    only losses above a hundred would expect low losses everywhere. Hyper-parameters (length-scales and noise) maximise
+    the marginal likelihood times BoTorch's priors, which scale with the dimension (Hvarfner et al. 2024). With fewer
+    points than dimensions the likelihood alone would decide nothing. They are fitted to at most 300 points, evenly
+    spread over the run, and again whenever the data have grown by a tenth. The process itself contains all points.
     """
 
     def __init__(self, dim: int, options: SurrogateOptions) -> None:
@@ -184,16 +183,16 @@ class Surrogate(Part):
 
     @property
     def informed(self) -> bool:
-        """Whether there are points enough to ask the process, and a loss among them."""
+        """Whether there are enough points to use the process, and a loss among them."""
         return len(self.loss) >= self.options.initial and bool(np.isfinite(self.loss).any())
 
     def add(self, z: Points, loss: Points) -> None:
-        """Take in points, shape (count, dim), and their losses, shape (count,), +inf where an episode failed."""
+        """Take points, shape (count, dim), and their losses, shape (count,), +inf where an episode failed."""
         self.z = np.concatenate([self.z, z])
         self.loss = np.concatenate([self.loss, loss])
 
     def minimise(self, random: np.random.Generator) -> Asking[Points]:
-        """Return where mean - coefficient * standard deviation is least, shape (dim,); a random point before."""
+        """Return the point with the lowest bound, shape (dim,); a random point before there are enough."""
         if not self.informed:
             return np.asarray(random.uniform(-1.0, 1.0, self.z.shape[1]))
         least, learnt = yield from compute_drawing(random, _minimise, self)
@@ -201,7 +200,7 @@ class Surrogate(Part):
         return least
 
     def process(self) -> Process:
-        """Return the process over [0, 1]^dim given the points, its hyper-parameters fitted if that is due."""
+        """Return the process over [0, 1]^dim for the points, its hyper-parameters fitted if that is due."""
         with exclusive():
             rows = self._learn()
             u, values = self._places(rows), torch.from_numpy(self._values(rows))
@@ -253,25 +252,25 @@ class Surrogate(Part):
 
 
 def _minimise(surrogate: Surrogate, random: np.random.Generator) -> tuple[Points, dict[str, Any]]:
-    """Return where the bound of a surrogate is least, and what it knows then."""
+    """Return the point with the lowest bound of a surrogate, and the new state of the surrogate."""
     with exclusive():
         bound = LowerBound(surrogate.process(), surrogate.options.coefficient)
         return least_point(bound, surrogate.z, surrogate.loss, random), surrogate.state()
 
 
 def surrogate_memory(max_points: int, size: SearchSize) -> float:
-    """Return what the process takes at the end of a search [bytes]."""
+    """Return the memory of the process at the end of a search [bytes]."""
     points = min(max_points, size.budget)
     return float(FLOAT * (ARRAYS * points**2 + 20 * (SPREAD + NEAR + points) * size.dim))
 
 
 def _thin(rows: Rows, count: int) -> Rows:
-    """Return at most so many of the rows, evenly spread."""
+    """Return at most this many of the rows, evenly spread."""
     return rows if len(rows) <= count else rows[np.linspace(0, len(rows) - 1, count).astype(int)]
 
 
 def select(loss: Points, count: int) -> Rows:
-    """Return which points are modelled: all, or half those with the least losses and half of the others, spread."""
+    """Return which points are modelled: all, or the best for one half and evenly spread others for the second half."""
     if len(loss) <= count:
         return np.arange(len(loss))
     best, others = np.split(np.argsort(loss, kind="stable"), [count // 2])

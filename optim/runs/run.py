@@ -1,4 +1,4 @@
-"""A run of an optimiser, as one works with it: its episodes, the best of them, its picture."""
+"""A run of an optimiser for users: its episodes, the best of them, its picture."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ LABELS = {"forwards": "forward equivalents"}  # of columns whose stored names sa
 
 @dataclass(frozen=True)
 class BestEpisode:
-    """The episode of least loss: the values `x` of its parameters, each in its own unit, and its number, from 1 on."""
+    """The episode with the lowest loss: the values `x` of its parameters in their own units, and its number, from 1."""
 
     x: Float[Tensor, " dim"]
     loss: float
@@ -35,12 +35,12 @@ class BestEpisode:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Run:
-    """Hold the episodes of a run: `data` is an xarray dataset of x(evaluation, dim), loss(evaluation) and others.
+    """The episodes of a run: `data` is an xarray dataset of x(evaluation, dim), loss(evaluation) and others.
 
-    `x` are points as `evaluate` takes them: of a logarithmic parameter decimal logarithms; `best` and `table` have
-    values. `grad`(evaluation, dim) is the gradient where one was asked for, `status` how the episode ended, `kind` what
-    it was evaluated for; `episodes`, `forwards` and `seconds` [s] are what the run had cost by then, the second in
-    forward equivalents: episodes without gradient. `folder` is where its files are, None of one in memory.
+    `x` are points as `evaluate` takes them: a logarithmic parameter is its decimal logarithm. `best` and `table` have
+    values. `grad`(evaluation, dim) is the gradient where it was requested, `status` the end of the episode, and `kind`
+    the purpose of the evaluation. `episodes`, `forwards` and `seconds` [s] are the cost of the run up to that row.
+    `forwards` are forward equivalents: episodes without gradient. `folder` contains its files, None for one in memory.
     """
 
     data: xr.Dataset
@@ -48,12 +48,12 @@ class Run:
 
     @cached_property
     def identity(self) -> dict[str, Any]:
-        """What decides the numbers, as plain JSON: scene, options, fidelity, device, engine, method, seed, code."""
+        """The settings that decide the numbers, as plain JSON."""
         return stored_identity(self.data)
 
     @cached_property
     def provenance(self) -> dict[str, Any]:
-        """What else is known of how it was made: command, date, versions, the loss's unit."""
+        """How the run was made: command, date, versions, the loss's unit."""
         return stored_provenance(self.data)
 
     @property
@@ -68,7 +68,7 @@ class Run:
 
     @cached_property
     def best(self) -> BestEpisode:
-        """The episode of least loss. Raises ValueError where no episode has succeeded."""
+        """The episode with the lowest loss. Raises ValueError where no episode has succeeded."""
         loss = self.data["loss"].to_numpy()
         if not np.isfinite(loss).any():
             raise ValueError(f"{self._name()} has no best episode: none of {len(loss)} succeeded")
@@ -78,12 +78,12 @@ class Run:
 
     @property
     def remark(self) -> str:
-        """What the method had to say of its search, such as which method `auto` took; empty for most."""
+        """The method's remark on its search, such as the method that `auto` chose; empty for most."""
         return str(self.data.attrs.get("remark", ""))
 
     @property
     def errors(self) -> str:
-        """How many episodes raised and what the first of them said, in a line; empty where none did."""
+        """The number of episodes that raised and the first message, in a line; empty where none did."""
         return errors_of(self.data)
 
     def table(self) -> pd.DataFrame:
@@ -98,8 +98,8 @@ class Run:
     def plot(self, *, width: float | None = None) -> Picture:
         """Draw every loss and the best so far against episodes.
 
-        The picture is matplotlib's figure, shown by a notebook as it is; `width` draws it for a page so wide [mm].
-        Raises ValueError where there is no episode yet.
+        It returns a matplotlib figure, which notebooks show. `width` draws it for a page of this width [mm]. Raises
+        ValueError where there is no episode yet.
         """
         if not self.data.sizes["evaluation"]:
             raise ValueError(f"{self._name()} has no episode to draw yet")
@@ -108,7 +108,7 @@ class Run:
         return run_figure(self.data, width=width)
 
     def __repr__(self) -> str:
-        """Return in a line what searched and what it found."""
+        """Return the search and its result in a line."""
         count = self.data.sizes["evaluation"]
         found = f"best loss {self.best.loss:.6g}" if np.isfinite(self.data["loss"]).any() else "none succeeded"
         where = f", in {self.folder}" if self.folder else ""

@@ -1,14 +1,14 @@
-"""A run on disk: every point an optimiser evaluated, and what it is continued from.
+"""A run on disk: every point an optimiser evaluated, and the state from which it continues.
 
-A run is a zarr group of columns along `evaluation`, as long as the budget; a row without a status is not there yet.
-Beside the columns lies the file `state` (see `Journal`): it counts the rows and those the optimiser has been told, has
-their checksums, and then the optimiser itself, its random numbers included, as data that is read and never run. Rows
-are written first, that file at once after them, so rows it does not count do not exist: whatever is lost by stopping a
-run at any instant is computed again, to the same bits. Rows that are not what the file says are damage, which is
-refused by name.
+A run is a zarr group of columns along `evaluation`, as long as the budget; a row without a status does not exist yet.
+The file `state` (see `Journal`) is next to the columns. It counts the rows and those the optimiser has been told, and
+has their checksums. It also contains the optimiser itself with its random numbers, as data that is read and never
+executed. Rows are written first, and that file immediately after them, so rows that it does not count do not exist.
+After a stop at any moment, the lost part is computed again, to the same bits. Rows that differ from the file are
+damage, which an error reports by name.
 
-Rows that are there and not told belong to a proposal that the budget cut short. The optimiser is told of none of its
-points, so that a run continued to a larger budget is the run that had it from the beginning.
+Rows that the optimiser has not been told belong to a proposal that the budget cut short. The optimiser is told none of
+its points, so a run continued to a larger budget equals a run with that budget from the beginning.
 """
 
 from __future__ import annotations
@@ -85,9 +85,9 @@ SHARE = 0.05  # most of the time that may go into writing, summed over all runs 
 
 
 def encode(state: Any) -> bytes:
-    """Return a state as the bytes of an `.npz` file: its arrays by number, and as `outline` the rest, which is JSON.
+    """Return a state as the bytes of an `.npz` file: its arrays by number, and the rest as JSON in `outline`.
 
-    Raises TypeError where something in it is no number, string, array, list or mapping.
+    Raises TypeError for anything but numbers, strings, arrays, lists and mappings.
     """
     arrays: list[NDArray[Any]] = []
 
@@ -97,7 +97,7 @@ def encode(state: Any) -> bytes:
             return {ARRAY: len(arrays) - 1}
         if isinstance(value, np.generic):
             return value.item()
-        raise TypeError(f"a state holds numbers, strings and arrays; got a {type(value).__name__}")
+        raise TypeError(f"a state can contain numbers, strings and arrays; got a {type(value).__name__}")
 
     outline = json.dumps(state, default=stand_in).encode()
     kept = io.BytesIO()
@@ -118,12 +118,12 @@ def decode(kept: bytes) -> Any:
 
 @dataclass(frozen=True)
 class Journal:
-    """What the file `state` of a run holds: which rows count, their checksums, and what the optimiser continues from.
+    """The content of a run's file `state`: the valid rows, their checksums, and the state of the optimiser.
 
-    Its first line is the SHA-256 digest of all that follows, its second a JSON object, and the rest what `encode`
-    wrote. A file that is not what was written is refused, whatever became of it. `rows` are there, `told` of them the
-    optimiser has been told; `sums` are the checksums of every 64 of them. `gradient_cost` is that of the run, `about`
-    the digest of what the run says of itself; `state` is encoded.
+    Its first line is the SHA-256 digest of everything after it, its second a JSON object, and the rest is a result of
+    `encode`. A changed file is refused. There are `rows` rows, of which the optimiser has been told `told`; `sums` are
+    the checksums of every 64 of them. `gradient_cost` is that of the run, `about` the digest of the run's attributes;
+    `state` is encoded.
     """
 
     rows: int = 0
@@ -142,13 +142,13 @@ class Journal:
 
     @classmethod
     def read(cls, run: Path) -> Journal:
-        """Read the file of a run. Raises StoreError, which names it, where it is missing or not what was written."""
+        """Read the file of a run. Raises StoreError, which names it, where it is missing or was changed."""
         try:
             digest, _, content = (run / STATE).read_bytes().partition(b"\n")
         except OSError as error:
             raise damage_error(run / STATE, f"it cannot be read ({error.strerror})") from None
         if digest.decode(errors="replace") != hashlib.sha256(content).hexdigest():
-            raise damage_error(run / STATE, "it is not what was written")
+            raise damage_error(run / STATE, "it differs from what was written")
         head, _, state = content.partition(b"\n")
         try:
             return cls(**(json.loads(head) | {"state": state}))
@@ -157,12 +157,12 @@ class Journal:
 
 
 def damage_error(path: Path, why: str) -> StoreError:
-    """Return the error that says of a run, or of a file in it, that it is not what was written."""
-    return StoreError(f"{path} is damaged: {why}; restore it, or begin the run again in another folder")
+    """Return the error for a damaged run, or a damaged file in it."""
+    return StoreError(f"{path} is damaged: {why}; restore it, or start the run again in another folder")
 
 
 def digest_of(attributes: Mapping[str, Any]) -> str:
-    """Return a digest of what a run says of itself, but for what changes while it is filled."""
+    """Return a digest of a run's attributes, except those that change while it is filled."""
     lasting = {name: value for name, value in attributes.items() if name not in CHANGING}
     return hashlib.sha256(json.dumps(lasting, sort_keys=True).encode()).hexdigest()
 
@@ -170,7 +170,7 @@ def digest_of(attributes: Mapping[str, Any]) -> str:
 def checksums(columns: Mapping[str, NDArray[Any]], count: int, known: list[int]) -> list[int]:
     """Return the checksum of every 64 of the first `count` rows, given those of the first ones.
 
-    Each begins with the number of its first row, so that rows in another place have another one.
+    Each includes the number of its first row, so rows moved elsewhere have another checksum.
     """
     found = list(known)
     for low in range(len(known) * CHUNK, count, CHUNK):
@@ -182,7 +182,7 @@ def checksums(columns: Mapping[str, NDArray[Any]], count: int, known: list[int])
 
 
 def find_damage(sums: list[int], journal: Journal) -> range | None:
-    """Return the first rows whose checksum is not the journal's, None where all are right."""
+    """Return the first rows whose checksum differs from the journal's, None where all are right."""
     for low, pair in zip(range(0, journal.rows, CHUNK), zip_longest(sums, journal.sums), strict=False):
         if len({*pair}) > 1:
             return range(low, min(low + CHUNK, journal.rows))
@@ -190,7 +190,7 @@ def find_damage(sums: list[int], journal: Journal) -> range | None:
 
 
 def empty(rows: int, dim: int) -> Columns:
-    """Return columns of so many rows, in which nothing is yet."""
+    """Return empty columns of this many rows."""
     return {
         name: np.full((rows, dim) if name in DEEP else rows, FILL[dtype], dtype) for name, (dtype, _) in COLUMNS.items()
     }
@@ -205,16 +205,16 @@ def read_rows(path: Path, group: zarr.Group, name: str, rows: int, dim: int) -> 
     try:
         array: Any = group[name]
         if (array.dtype, array.shape[1:], array.chunks[0]) != (wanted.dtype, wanted.shape[1:], CHUNK):
-            raise ValueError("its layout is not what it was made")
+            raise ValueError("its layout differs from what was written")
         if array.shape[0] < rows:
-            raise ValueError(f"it has room for {array.shape[0]} rows, and {rows} were written")
+            raise ValueError(f"it has room for {array.shape[0]} rows, but {rows} were written")
         return np.asarray(array[:rows])
     except Exception as error:  # whatever a missing array, a damaged layout or a codec raises
         raise damage_error(path / name, f"it cannot be read ({' '.join(str(error).split())})") from None
 
 
 def plain_attributes(attributes: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a run's attributes as any format of files has them; what is not known yet is left out."""
+    """Return a run's attributes in a form for any file format; unknown ones are left out."""
     known = {name: value for name, value in attributes.items() if value is not None and name != "units"}
     return {name: json.dumps(value) if isinstance(value, dict) else value for name, value in known.items()}
 
@@ -227,7 +227,7 @@ def dims_of(column: str) -> tuple[str, ...]:
 def attributes_of(
     space: ParameterSpace, identity: Mapping[str, Any], provenance: Mapping[str, Any], budget: int
 ) -> dict[str, Any]:
-    """Return what a run says of itself, on disk as attributes of its group."""
+    """Return a run's description, stored as attributes of its group."""
     box = {**record_parameters(space), "lower": space.lower.tolist(), "upper": space.upper.tolist()}
     whole = plain_json({**identity, **box}, "a run's identity")
     return {
@@ -263,11 +263,11 @@ def lay_out(group: zarr.Group, attributes: dict[str, Any]) -> None:
 
 
 class RunStore:
-    """Keep what an optimiser evaluates, row by row, so that a run stopped at any instant can be continued.
+    """Store the evaluations of an optimiser, row by row, so that a run can be stopped at any moment and continued.
 
-    Make one with `open`, `open_or_create` or `in_memory`; `search` fills it. `identity` holds what decides
-    the numbers (objective, options, fidelity, device, method, its options, seed); the budget is not of it, since a run
-    can be continued to a larger one.
+    Make one with `open`, `open_or_create` or `in_memory`; `search` fills it. `identity` contains the settings that
+    decide the numbers (objective, options, fidelity, device, method, its options, seed). The budget is not part of it,
+    because a run can be continued to a larger one.
     """
 
     def __init__(self, attributes: Mapping[str, Any], path: Path | None = None) -> None:
@@ -295,7 +295,7 @@ class RunStore:
         if not is_run(path):
             if lost_root(path, FILES):
                 raise damage_error(path / "zarr.json", "it cannot be read")
-            raise StoreError(f"{path} is no run of format {FORMAT}; move it away or write elsewhere")
+            raise StoreError(f"{path} is not a run of format {FORMAT}; move it away or choose another folder")
         return cls(open_group(path).attrs.asdict(), path)
 
     @classmethod
@@ -309,9 +309,9 @@ class RunStore:
         budget: int,
         overwrite: bool = False,
     ) -> RunStore:
-        """Continue the run at `path`, or make an empty one, all at once; `overwrite` replaces a run, nothing else.
+        """Continue the run at `path`, or make an empty one in one step; `overwrite` replaces a run and nothing else.
 
-        Raises StoreMismatchError for a run made by other settings, StoreError where something else is to be replaced,
+        Raises StoreMismatchError for a run with other settings, StoreError where anything but a run would be replaced,
         and StoreExistsError where another process has replaced it meanwhile.
         """
         path = resolve(path)
@@ -338,7 +338,7 @@ class RunStore:
 
     @property
     def identity(self) -> dict[str, Any]:
-        """What decides the run's numbers."""
+        """The settings that decide the run's numbers."""
         return current_identity(self.attributes["identity"])
 
     @property
@@ -348,12 +348,12 @@ class RunStore:
 
     @property
     def budget(self) -> int:
-        """Most episodes the run has room for."""
+        """The largest number of episodes of the run."""
         return int(self.attributes["budget"])
 
     @property
     def gradient_cost(self) -> float | None:
-        """What an episode with gradient costs, in episodes without; None until it is measured."""
+        """The cost of an episode with gradient, in episodes without; None until it is measured."""
         cost: float | None = self.attributes["gradient_cost"]
         return cost
 
@@ -370,18 +370,18 @@ class RunStore:
 
     @property
     def error(self) -> str:
-        """What the first episode that raised said; empty where none did."""
+        """The message of the first episode that raised; empty where none did."""
         return str(self.attributes.get(ERROR, ""))
 
     def state(self) -> dict[str, Any] | None:
         """Return the optimiser's state after `told` rows, None before the first.
 
-        Raises StoreError where the file holds none.
+        Raises StoreError where the file has none.
         """
         try:
             found: dict[str, Any] | None = decode(self._state) if self._state else None
         except Exception as error:  # whatever is read instead of arrays
-            raise damage_error((self.path or Path()) / STATE, f"it holds no state ({error})") from None
+            raise damage_error((self.path or Path()) / STATE, f"it contains no state ({error})") from None
         return found
 
     def dataset(self) -> xr.Dataset:
@@ -398,14 +398,14 @@ class RunStore:
         return xr.Dataset(columns, names, plain_attributes(self.attributes))
 
     def read(self) -> Run:
-        """Return the run as one works with it, with the episodes that are there."""
+        """Return the run for users, with its present episodes."""
         return Run(self.dataset(), self.path.parent if self.path else None)
 
     @contextlib.contextmanager
     def lock(self) -> Iterator[None]:
-        """Hold the run against every other process that would fill it, and drop what the journal does not know.
+        """Lock the run against every other process that would fill it, and drop rows that the journal does not count.
 
-        Raises StoreError where another process holds it, and where it was replaced or removed.
+        Raises StoreError where another process has the lock, and where the run was replaced or removed.
         """
         if self.path is None:
             yield
@@ -424,18 +424,18 @@ class RunStore:
             os.close(folder)
 
     def set_gradient_cost(self, gradient_cost: float) -> None:
-        """Keep what an episode with gradient costs, in episodes without."""
+        """Store the cost of an episode with gradient, in episodes without."""
         self.attributes["gradient_cost"] = gradient_cost
         self._write_journal()
         self._set(gradient_cost=gradient_cost)
 
     def keep_remark(self, remark: str) -> None:
-        """Keep what the method has to say of its search."""
+        """Store the method's remark on its search."""
         if remark != self.attributes.get(REMARK, ""):
             self._set(**{REMARK: remark})
 
     def extend(self, budget: int) -> None:
-        """Make room for so many episodes, if there is less."""
+        """Make room for this many episodes, if there is less."""
         if budget <= self.budget:
             return
         if self.path:
@@ -461,10 +461,10 @@ class RunStore:
         seconds: float,
         state: Callable[[], dict[str, Any]] | None = None,
     ) -> None:
-        """Add the points of a proposal, which took so many seconds, and write them if that is due.
+        """Add the points of a proposal and their time in seconds, and write them if that is due.
 
-        `state` returns the optimiser once it has been told of them; without it they are rows that it does not know.
-        Raises ValueError where they are more than the budget has left.
+        `state` returns the optimiser after it has been told of them; without it, it has not been told of these rows.
+        Raises ValueError for more points than the remaining budget.
         """
         rows = slice(self.count, self.count + len(x))
         if rows.stop > self.budget:
@@ -479,11 +479,11 @@ class RunStore:
             self.save(state)
 
     def stage(self, state: Callable[[], dict[str, Any]]) -> None:
-        """Take in the optimiser as it is once it has been told every row, to be written with the next `save`."""
+        """Take the state of the optimiser after it has been told every row, to be written with the next `save`."""
         self._state, self.told = encode(state()), self.count
 
     def save(self, state: Callable[[], dict[str, Any]] | None = None) -> None:
-        """Write what is not written yet, rows first; without a state the one held before stays."""
+        """Write everything that is not written yet, rows first; without a state the previous one stays."""
         began = time.monotonic()
         if state:
             self.stage(state)
@@ -524,7 +524,7 @@ class RunStore:
         self._written = self.count
 
     def _write_journal(self) -> None:
-        """Write which rows count, and the optimiser."""
+        """Write the counts and the optimiser."""
         if self.path is None:
             return
         whole = self._sums[: min(self._written, self.count) // CHUNK]
@@ -533,11 +533,11 @@ class RunStore:
         Journal(self.count, self.told, self.gradient_cost, about, self._sums, self._state or b"").write(self.path)
 
     def _load(self, path: Path) -> None:
-        """Read the rows that the state counts, and refuse what is not as it was written."""
+        """Read the rows that the state counts, and refuse rows that were changed."""
         journal, group = Journal.read(path), open_group(path)
         attributes = group.attrs.asdict()
         if digest_of(attributes) != journal.about or not isinstance(attributes.get("budget"), int):
-            raise damage_error(path / "zarr.json", "what the run says of itself is not what was written")
+            raise damage_error(path / "zarr.json", "the run's attributes differ from what was written")
         self.attributes = attributes | {"gradient_cost": journal.gradient_cost}
         self.count = self._written = 0
         self._columns = empty(CHUNK, self.dim)
@@ -546,7 +546,7 @@ class RunStore:
             values[: journal.rows] = read_rows(path, group, name, journal.rows, self.dim)
         self._sums = checksums(self._columns, journal.rows, [])
         if wrong := find_damage(self._sums, journal):
-            raise damage_error(path, f"rows {wrong[0] + 1} to {wrong[-1] + 1} are not what was written")
+            raise damage_error(path, f"rows {wrong[0] + 1} to {wrong[-1] + 1} differ from what was written")
         self.count = self._written = journal.rows
         self.told, self._state = journal.told, journal.state or None
 
@@ -583,9 +583,9 @@ class RunStore:
 
 
 def check_replaceable(path: Path) -> None:
-    """Raise ValueError unless a folder is a run's, its root damaged or not, and everything in it is of that."""
+    """Raise ValueError unless a folder is a run, its root damaged or not, with no other files in it."""
     if not is_run(path) and not lost_root(path, FILES):
-        raise StoreError(f"{path} is no run, so it is not replaced; move it away or write elsewhere")
+        raise StoreError(f"{path} is not a run and is not replaced; move it away or choose another folder")
     check_ours(path, FILES, "a run")
 
 

@@ -3,7 +3,7 @@
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"
 
 if TYPE_CHECKING:
     from . import testing
@@ -73,7 +73,7 @@ def __getattr__(name: str) -> Any:
     if name in _MODULES:
         return import_module(f".{name}", __name__)
     if name in _FORMER:
-        raise AttributeError(f"gradscape.{name} is gradscape.{_FORMER[name]} today")
+        raise AttributeError(f"gradscape.{name} is now gradscape.{_FORMER[name]}")
     if name not in _HOME_OF:
         raise AttributeError(f"module 'gradscape' has no attribute {name!r}; it has {', '.join(__all__)}")
     return getattr(import_module(f".{_HOME_OF[name]}", __name__), name)

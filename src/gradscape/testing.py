@@ -1,4 +1,4 @@
-"""What tests assert of a simulator: `gradscape.testing.assert_gradients(f)`."""
+"""Assertions about a simulator for your own tests: `gradscape.testing.assert_gradients(f)`."""
 
 from .api.testing import assert_gradients
 

@@ -35,7 +35,7 @@ def test_a_slice_and_its_folder_have_the_same_report_which_is_read_again(tmp_pat
     before = (tmp_path / "told/report.json").stat().st_mtime_ns
     assert gs.report(tmp_path / "cut", points_per_axis=2, out=tmp_path / "told") == told
     assert (tmp_path / "told/report.json").stat().st_mtime_ns == before
-    with pytest.raises(ValueError, match="in memory alone"):
+    with pytest.raises(ValueError, match="only in memory"):
         gs.report(gs.Slice(cut.data))
 
 

@@ -70,11 +70,11 @@ def test_a_point_without_a_loss_has_failed(cut: gs.Slice, tmp_path: Path) -> Non
     [
         ({"a": [1.0], "loss": [1.0]}, "has no column"),
         ({0: [1.0], 1: [1.0]}, "has no column 'loss'"),
-        ({0: ["failed"], 1: [1.0], "loss": [1.0]}, "the column 'x0' of table holds no numbers: row 0 has 'failed'"),
-        ({0: [1.0, 2.0], 1: [1.0, 2.0], "loss": ["low", "high"]}, "holds no numbers: row 0 has 'low'"),
+        ({0: ["failed"], 1: [1.0], "loss": [1.0]}, "the column 'x0' of table contains no numbers: row 0 has 'failed'"),
+        ({0: [1.0, 2.0], 1: [1.0, 2.0], "loss": ["low", "high"]}, "contains no numbers: row 0 has 'low'"),
         ({0: [1.0, None], 1: [None, 2.0], "loss": [1.0, 2.0]}, "each of its 2 rows lacks a number in column x0, x1"),
-        ({0: [], 1: [], "loss": []}, "holds no point: below its heading there is no row of numbers"),
-        ({0: ["m"], 1: ["m"], "loss": ["J"]}, "holds no point: below its heading there is no row of numbers"),
+        ({0: [], 1: [], "loss": []}, "has no point: there is no row of numbers below its heading"),
+        ({0: ["m"], 1: ["m"], "loss": ["J"]}, "has no point: there is no row of numbers below its heading"),
         ({0: [1.0], 1: [1.0], "params_x0": [1.0], "loss": [1.0]}, "'x0' .column 1. and 'params_x0' .column 3."),
     ],
 )
@@ -94,7 +94,7 @@ def test_files_that_are_no_tables_are_refused(cut: gs.Slice, name: str, tmp_path
     (tmp_path / name).write_bytes(b"\xff\x00\x01")
     with pytest.raises(ValueError, match=r"cannot be read as a table|has no column"):
         gs.overlay(cut, tmp_path / name)
-    with pytest.raises(ValueError, match="what is laid over a slice are runs"):
+    with pytest.raises(ValueError, match="overlay takes runs"):
         gs.overlay(cut, 3)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="--plane takes pca"):
         gs.overlay(cut, tmp_path / name, plane="tsne")  # type: ignore[arg-type]
@@ -125,9 +125,9 @@ def test_a_study_of_optuna_is_laid_over_a_slice(cut: gs.Slice, tmp_path: Path) -
         again = gs.overlay(cut, given, out=tmp_path / "again")
         for name in ("x", "loss", "status"):
             np.testing.assert_array_equal(again.runs[0][name], laid.runs[0][name])
-    with pytest.raises(ValueError, match="has the directions MINIMIZE, MAXIMIZE; a loss is one value"):
+    with pytest.raises(ValueError, match="has the directions MINIMIZE, MAXIMIZE; a loss is a single value"):
         gs.overlay(cut, optuna.create_study(directions=["minimize", "maximize"]))
-    with pytest.raises(ValueError, match="study 'none' holds no trial yet"):
+    with pytest.raises(ValueError, match="study 'none' has no trial yet"):
         gs.overlay(cut, optuna.create_study(study_name="none"))
 
 
@@ -159,11 +159,11 @@ def test_a_table_as_a_spreadsheet_writes_it_is_read(cut: gs.Slice, tmp_path: Pat
     np.testing.assert_array_equal(table["x"], [[1.5, 2.25], [-0.5, 1.0]])
     np.testing.assert_array_equal(table["loss"], [3.5, np.nan])
     assert told.lines == [
-        "sheet: row 2 holds units ([m], [m], [J]) and is no point",
+        "sheet: row 2 contains units ([m], [m], [J]) and is skipped",
         "sheet: 2 of 4 rows skipped: no number in column x1",
     ]
     laid = gs.overlay(cut, path, out=tmp_path / "over")
-    assert "2 points: 0 beyond the map, 1 failed, 2 rows skipped" in repr(laid)
+    assert "2 points: 0 outside the map, 1 failed, 2 rows skipped" in repr(laid)
     path.write_text("x0,x1,loss\n1,2,3,4\n")
     with pytest.raises(ValueError, match="row 2 has 4 cells, the heading 3"):
         gs.overlay(cut, path)
@@ -212,5 +212,5 @@ def test_an_experiment_of_ax_and_its_client_are_laid_over_a_slice(cut: gs.Slice,
     assert laid.runs[0].attrs["label"] == "ax-of-branin (negated)"
     np.testing.assert_array_equal(laid.runs[0]["best"], [-4.0, -4.0, -4.0, -8.0])
     experiment.trials.clear()
-    with pytest.raises(ValueError, match="Ax's experiment 'of branin' holds no trial that has ended"):
+    with pytest.raises(ValueError, match="Ax's experiment 'of branin' has no ended trial"):
         gs.overlay(cut, experiment)

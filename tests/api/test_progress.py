@@ -28,12 +28,14 @@ def follow(clock: Clock, *, said: float, each: float, resumed: int = 0) -> list[
             clock.sleep(each)
     with bars.busy("drawing"):
         pass
-    return [line for line in shown.getvalue().splitlines() if line.startswith("takes longer")]
+    return [line for line in shown.getvalue().splitlines() if line.startswith("slower than")]
 
 
 def test_a_job_that_outruns_its_announcement_says_so_once_with_how_long_it_will_take(clock: Clock) -> None:
-    assert follow(clock, said=8.0, each=0.4) == ["takes longer than announced: 8.0 s said, now about 40 s"]
-    assert follow(clock, said=8.0, each=0.4, resumed=50) == ["takes longer than announced: 8.0 s said, now about 20 s"]
+    assert follow(clock, said=8.0, each=0.4) == ["slower than estimated: the estimate was 8.0 s, it is now about 40 s"]
+    assert follow(clock, said=8.0, each=0.4, resumed=50) == [
+        "slower than estimated: the estimate was 8.0 s, it is now about 20 s"
+    ]
 
 
 @pytest.mark.parametrize(("said", "each"), [(30.0, 0.4), (0.1, 0.04)])
@@ -48,5 +50,5 @@ def test_where_nothing_is_counted_the_time_gone_is_said(clock: Clock) -> None:
     for _ in range(3):
         with bars.busy("checking"):
             clock.sleep(10.0)
-    assert shown.getvalue().count("takes longer") == 1
-    assert "takes longer than announced: 8.0 s said, 20 s gone" in shown.getvalue()
+    assert shown.getvalue().count("slower than") == 1
+    assert "slower than estimated: the estimate was 8.0 s, 20 s have passed" in shown.getvalue()

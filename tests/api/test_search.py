@@ -63,7 +63,7 @@ def test_a_race_tells_pairs_and_running_times(tmp_path: Path) -> None:
     assert times.columns.tolist() == ["random", "cma-es"]
     assert (times.index[0], len(times)) == (0.25, 51)
     assert np.isinf(times.iloc[0]).all()  # less than any point of branin has
-    with pytest.raises(ValueError, match="the best known loss is a finite number; got nan"):
+    with pytest.raises(ValueError, match="--best-known takes a finite number; got nan"):
         gs.race("branin", "random", budget=6, seeds=2, best_known=np.nan, out=tmp_path / "race")
 
 
@@ -71,10 +71,10 @@ def test_a_race_tells_pairs_and_running_times(tmp_path: Path) -> None:
     ("verb", "wrong", "said"),
     [
         (gs.optimize, {"method": "random", "budget": 0}, "optimize takes budget >= 1; got 0"),
-        (gs.optimize, {"method": "random", "budget": 2.5}, "optimize takes a whole number as budget; got 2.5"),
+        (gs.optimize, {"method": "random", "budget": 2.5}, "optimize takes a whole number for budget; got 2.5"),
         (gs.optimize, {"method": "random", "seed": -1}, "optimize takes seed >= 0; got -1"),
         (gs.race, {"methods": "random", "seeds": 0}, "race takes seeds >= 1; got 0"),
-        (gs.race, {"methods": "random", "workers": 0}, "a number of workers is a whole number of at least 1"),
+        (gs.race, {"methods": "random", "workers": 0}, "--workers takes a whole number of at least 1"),
     ],
 )
 def test_numbers_that_cannot_be_are_refused(

@@ -73,7 +73,7 @@ def test_bounce_passes_at_draft(run: Run, tmp_path: Path) -> None:
     assert checks["corners"]["numbers"]["finite"] == 8
     for name in ("dt 8x", "horizon 8x", "ke 100000", "10% outside the box"):
         assert sum(checks[name]["numbers"][kind] for kind in ("finite", "non-finite", "escaped", "error")) >= 2
-    assert "bounce · draft · cpu · warp · 59 points: some 1576 episodes and" in done.stderr
+    assert "bounce · draft · cpu · warp · 59 points: about 1576 episodes and" in done.stderr
     assert not list(tmp_path.iterdir())
 
 
@@ -100,7 +100,7 @@ def test_slow_environments_keep_their_promises_at_draft(name: str) -> None:
 
 def test_a_time_step_is_checked_once_however_it_is_called(run: Run) -> None:
     done = run("check cartpole --power 50% --device cpu")
-    nearest = "the nearest step that fits into a control step is that of dt 1x"
+    nearest = "the nearest step that fits into a control step is the same as for dt 1x"
     text = " ".join(done.stdout.split())
     assert text.count(nearest) == 3
     assert "pass dt 1x" in text
@@ -120,7 +120,7 @@ def test_anyone_s_environment_is_checked_and_each_check_has_a_line(run: Run, bow
     for shown in (
         "pass      shapes                    loss (8,), grad (8, 2), status (8,)",
         "pass      dt 8x                     2 finite",
-        "horizon 1x to 8x (no setting says how long an episode is)",
+        "horizon 1x to 8x (no setting controls how long an episode is)",
         "relative error, median",
         "passes: ",
     ):
@@ -159,7 +159,7 @@ def test_a_known_exception_is_printed_with_its_reason_until_it_is_none(
     assert excused.stdout.count("known: its gradient points downhill") == 3
     no_longer = run("check bowl")
     assert no_longer.returncode == 1
-    assert "it passes, so this is no longer true: its gradient points downhill" in no_longer.stdout
+    assert "it passes, so this reason no longer applies: its gradient points downhill" in no_longer.stdout
 
 
 def test_known_failures_are_of_fidelities_there_are() -> None:
@@ -175,5 +175,5 @@ def test_an_interrupt_says_that_nothing_is_kept(run: Run, monkeypatch: pytest.Mo
     monkeypatch.setitem(conformance.PROMISES, "determinism", interrupted)
     done = run("check branin")
     assert done.returncode == 130
-    assert "stopped: 4 checks are done, and nothing is kept of them; the same command begins again" in done.stderr
+    assert "stopped: 4 checks were done, but nothing is kept; the same command starts again" in done.stderr
     assert "Traceback" not in done.stderr

@@ -50,7 +50,7 @@ def test_every_simulator_of_a_file_is_named_once(here: Path) -> None:
     assert names_in_file("bounce") == ["bounce"]
     assert names_in_file("several.py:twice") == ["several.py:twice"]
     (here / "empty.py").write_text("x = 1\n")
-    with pytest.raises(ValueError, match=r"empty.py holds no simulator"):
+    with pytest.raises(ValueError, match=r"empty.py has no simulator"):
         names_in_file("empty.py:*")
     with pytest.raises(ValueError, match=r"there is no file elsewhere.py"):
         names_in_file("elsewhere.py:*")
@@ -112,7 +112,7 @@ def test_what_no_scene_has_is_refused_before_any_is_checked(here: Path, run: Run
 def test_a_name_that_a_file_does_not_have_is_said_in_its_line(here: Path, run: Run) -> None:
     done = run("check branin several.py:nothing --power 20%", cwd=here)
     assert done.returncode == 1
-    assert "holds no nothing" in done.stdout
+    assert "has no nothing" in done.stdout
     assert "1 of 2 pass" in done.stdout
 
 

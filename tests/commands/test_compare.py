@@ -52,7 +52,7 @@ def test_an_environment_is_sampled_on_the_slices_own_plane_as_it_would_be_by_its
     given = run.json("compare a b --out both")
     assert done.json["loss"] == given["loss"]
     again = run(*command)
-    assert "all 25 episodes with gradients are there already" in again.stderr
+    assert "all 25 episodes with gradients are done already" in again.stderr
     assert again.json == done.json
 
 
@@ -81,4 +81,4 @@ def test_lines_are_compared_too(run: Run) -> None:
     line = "slice bounce --dims 1 --resolution 8 --device cpu --out a"
     run.ok(line)
     done = run.ok(STANDARD)
-    assert "farthest apart at velocity y [m/s]" in done.stdout
+    assert "largest difference at velocity y [m/s]" in done.stdout

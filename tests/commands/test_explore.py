@@ -6,10 +6,12 @@ import urllib.error
 import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
+from threading import Event
 from typing import Any
 from urllib.parse import urlsplit
 
 import pytest
+import torch
 
 import gradscape as gs
 from gradscape.jobs.explore_page import Explorer
@@ -56,7 +58,7 @@ def test_a_click_plays_the_episode_and_draws_a_descent(page: Any) -> None:
     click_map(page, 0.4, 0.4)
     has_text(page.locator("#descents li"), re.compile(r"^Descent 1 over the two shown: \d+ points, lowest loss .* m²"))
     page.locator("#player video").wait_for()
-    has_text(page.locator("#player figcaption"), re.compile(r"^Episode of the node: .* m²$"))
+    has_text(page.locator("#player figcaption"), re.compile(r"^Episode at this node: .* m²$"))
     assert page.evaluate("SLICE.runs.length") == 1
     page.locator("#descents li").get_by_role("button").click()  # in the plane, which stays, with its descent
     has_text(page.locator("#progress"), COMPLETE)
@@ -69,7 +71,7 @@ def test_a_descent_over_all_parameters_leads_to_another_plane(browser: Any) -> N
     explorer, page = gs.explore(bowl, browser=False), browser.new_page()
     page.goto(explorer.address)
     has_text(page.locator("#progress"), COMPLETE)
-    page.get_by_label("over all parameters").check()
+    page.get_by_label("varies all parameters").check()
     click_map(page, 0.4, 0.4)
     has_text(page.locator("#descents li"), re.compile("^Descent 1 over all parameters: "))
     page.locator("#descents li").get_by_role("button").click()
@@ -102,9 +104,33 @@ def test_a_slider_moves_the_plane_and_another_parameter_turns_it(page: Any) -> N
 
 
 @pytest.mark.e2e
+def test_a_click_waits_for_the_map_of_the_chosen_plane(browser: Any) -> None:
+    gate = Event()
+
+    def bowl(x: torch.Tensor) -> torch.Tensor:
+        assert (x[:, 2] == 0).all() or gate.wait(60)
+        return x.square().sum(dim=1)
+
+    made = gs.from_torch(bowl, gs.ParameterSpace.box(["a", "b", "c"], -1, 1))
+    explorer, page = gs.explore(made, browser=False), browser.new_page()
+    page.goto(explorer.address)
+    has_text(page.locator("#progress"), COMPLETE)
+    page.get_by_role("slider", name="c").fill("0.9")
+    click_map(page, 0.4, 0.4)  # the map is still that of the plane before
+    has_text(page.locator("#progress"), "The plane that you chose is not on the map yet.")
+    gate.set()
+    has_text(page.locator("#progress"), COMPLETE)
+    assert page.locator("#descents li").count() == 0
+    click_map(page, 0.4, 0.4)
+    page.locator("#descents li").wait_for()
+    page.close()
+    explorer.close()
+
+
+@pytest.mark.e2e
 def test_what_is_seen_is_kept_as_a_slice(page: Any, tmp_path: Path) -> None:
     has_text(page.locator("#progress"), COMPLETE)
-    page.get_by_role("button", name="Keep this plane").click()
+    page.get_by_role("button", name="Save this plane").click()
     page.locator("#kept-command").wait_for()
     folder = Path((page.locator("#kept").text_content() or "").partition(":")[0])
     assert folder.parent == Path("out")

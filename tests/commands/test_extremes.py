@@ -98,7 +98,7 @@ def test_shipped_extremes_are_found_where_nothing_of_the_users_own_is(
 
 def test_the_table_says_what_is_beyond(run: Run) -> None:
     said = run(*TURN, "--settings", "dt,box", width=200).stdout
-    assert "stepping: standard on cpu, 4 points, judged by reference (accurate: 10% of the spread)" in said
+    assert "stepping: standard on cpu, 4 points, compared with reference (accurate: within 10% of the spread)" in said
     assert "then NONFINITE" in " ".join(said.split())
 
 

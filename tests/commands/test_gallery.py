@@ -133,11 +133,11 @@ def test_a_slice_of_other_settings_than_now_is_said_to_be_so(
     changed = {one["id"]: one["changed"] for one in json.loads(capsys.readouterr().out)}
     assert changed == {"bounce-y": "", "bounce-x-y": "", "branin": "resolution"}
     assert gallery("list", "--data", str(data)) == 0
-    assert "1 are older: they were sampled with other settings" in capsys.readouterr().out
+    assert "1 out of date: the settings of their fidelity have changed" in capsys.readouterr().out
     assert gallery("build", "--data", str(data), "--out", str(tmp_path / "site")) == 0
     pages = {name: (tmp_path / "site" / name / "index.html").read_text() for name in ("bounce-y", "branin")}
-    assert "resolution 0, now 7. Sampled now it may look different." in pages["branin"]
-    assert "Of an earlier scene" not in pages["bounce-y"]
+    assert "resolution was 0 and is now 7. A new sample may look different." in pages["branin"]
+    assert "Made with an earlier version" not in pages["bounce-y"]
 
 
 def test_build_refuses_an_empty_folder_of_data_and_foreign_files(listed: None, data: Path, tmp_path: Path) -> None:
@@ -242,9 +242,7 @@ def test_a_device_that_is_not_here_is_refused_at_once(
     capsys.readouterr()
     assert gallery("compute", "--device", "cuda", "--data", str(tmp_path / "data")) == 2
     said = capsys.readouterr().err
-    assert said == (
-        "landscape: no CUDA device was found here, so nothing is computed on one; use --device cpu or auto\n"
-    )
+    assert said == ("landscape: --device cuda needs a CUDA device, and none was found; use --device cpu or auto\n")
     assert not list(tmp_path.iterdir())
 
 

@@ -15,7 +15,7 @@ LEAGUE = ["league", "branin", "bounce@draft", "--methods", "random,cma-es", "--b
 
 def test_it_prints_ranks_and_the_papers_claims(run: Run) -> None:
     done = run.ok("league branin --methods random --budget 6 --seeds 1 --claims")
-    for shown in ("mean ranks", "branin (exact)", "all scenes", "branin: least loss", "compares no optimisers"):
+    for shown in ("mean ranks", "branin (exact)", "all scenes", "branin: lowest loss", "compares no optimisers"):
         assert shown in done.stdout
 
 

@@ -41,7 +41,7 @@ def test_a_race_is_laid_over_a_slice(run: Run, tmp_path: Path) -> None:
     assert (tmp_path / "over/overlay.png").read_bytes().startswith(b"\x89PNG")
     tables = [RunStore.open(path / "run.zarr").dataset() for path in sorted(Path("race").iterdir())]
     away = max(float(laid["distance"].max()) for laid in overlay(open_slice("cut/slice.zarr"), tables))
-    assert f"2 runs, 40 points: 0 beyond the map, 0 failed; the farthest is {away:.2g} half-widths" in done.stderr
+    assert f"2 runs, 40 points: 0 outside the map, 0 failed; the farthest point is {away:.2g} half" in done.stderr
     run.ok("overlay cut race")
     assert len(list(Path("out").glob("overlay-bounce-*"))) == 1
 
@@ -60,7 +60,7 @@ def test_a_slice_cut_through_the_best_point_shows_its_loss(run: Run) -> None:
     there = env.evaluate(plane.lift(plane.project(x))[None], grad=False)
     np.testing.assert_allclose(there.loss, loss, rtol=1e-5)
     again = run("overlay cut race --through best --out over --device cpu")
-    assert "all 36 episodes with gradients are there already" in again.stderr
+    assert "all 36 episodes with gradients are done already" in again.stderr
 
 
 @pytest.mark.parametrize("point", ["random:2", "best:race/descents-0", "race/descents-0"])
@@ -97,4 +97,7 @@ def test_samples_beyond_the_box_are_left_out_of_a_principal_plane(run: Run) -> N
 def test_another_fidelity_is_drawn_with_a_warning(run: Run) -> None:
     run("optimize bounce --method random --budget 4 --fidelity standard --out fine --device cpu")
     done = run.ok("overlay cut fine --out over")
-    assert "(bounce, random, seed 0) are simulated differently (fidelity 'draft' there, 'standard' here)" in done.stderr
+    differently = (
+        "(bounce, random, seed 0) are simulated differently (fidelity 'draft' of the slice, 'standard' of the run)"
+    )
+    assert differently in done.stderr

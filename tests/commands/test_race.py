@@ -37,9 +37,9 @@ def test_more_seeds_methods_and_episodes_go_on_where_the_race_ended(run: Run, tm
     first = run("race branin --methods random --budget 20 --seeds 2")
     assert "40 episodes to compute" in first.stderr
     again = run("race branin --methods random --budget 20 --seeds 2")
-    assert "all 40 episodes are there already" in again.stderr
+    assert "all 40 episodes are done already" in again.stderr
     more = run("race branin --methods random,cma-es --budget 30 --seeds 3 --json")
-    assert "140 episodes to compute, 40 are there already" in more.stderr
+    assert "140 episodes to compute, 40 are done already" in more.stderr
     less = run("race branin --methods random --budget 20 --seeds 2 --json")
     assert less.json["folder"] == more.json["folder"]
     assert len(list(tmp_path.glob("out/race-branin-exact-*/*/run.zarr"))) == 6

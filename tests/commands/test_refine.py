@@ -66,7 +66,7 @@ def test_a_job_that_is_stopped_keeps_what_it_has_and_draws_it(tmp_path: Path) ->
     kept, patient = job("two").kept(), Told()
     rest = job("two").run(patient)
     assert f"{rest.resumed} of 1089 points are kept" in kept
-    assert f"up to {1089 - rest.resumed} episodes with gradients to compute, {rest.resumed} are there" in "".join(
+    assert f"up to {1089 - rest.resumed} episodes with gradients to compute, {rest.resumed} are done" in "".join(
         patient.lines
     )
     assert rest.resumed > 0

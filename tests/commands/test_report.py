@@ -44,17 +44,17 @@ def test_a_slice_is_reported_in_numbers_and_words(run: Run, cut: Path, tmp_path:
     assert record["profile"]["noise"]["again"] == record["profile"]["noise"]["batch"] == 0
     assert record["paper"] is None
     assert "with gradients: about" in done.stderr
-    assert re.search(r"s, and 1\.0 s to measure 576 samples; [\d.]+ [MG]B of memory\n", done.stderr)
+    assert re.search(r"s, plus 1\.0 s to measure 576 samples; [\d.]+ [MG]B of memory\n", done.stderr)
     named = read_json(tmp_path / "told/measures.json")
     assert named["Local minima deeper than 1 % of the range"] == "3"
     assert (tmp_path / "told/gradient-quality.png").read_bytes().startswith(b"\x89PNG")
     file = tmp_path / "told/report.json"
     write_record(file, {**read_json(file), "device": "cuda"})
     again = run("report cut --points-per-axis 2 --out told")
-    assert "told is there already, measured on cuda" in again.stderr
+    assert "told: the report exists already, measured on cuda" in again.stderr
     assert "smooth with local minima: 3 minima and " in again.stdout
     assert "a loss at every sample\n" in again.stdout
-    run.refuse("report cut --points-per-axis 3 --out told", said="holds another report (points 2 there, 3 here)")
+    run.refuse("report cut --points-per-axis 3 --out told", said="contains another report (points 2 there, 3 now)")
 
 
 def test_a_stopped_report_says_what_is_kept_and_that_the_slice_is_of_another_model(
@@ -68,7 +68,7 @@ def test_a_stopped_report_says_what_is_kept_and_that_the_slice_is_of_another_mod
     done = run("report cut --out told")
     assert done.returncode == 130
     assert "stopped: 0 of 1 reports are kept" in done.stderr
-    assert "warning: cut was sampled otherwise (model_version 1 there, 99 here" in done.stderr
+    assert "warning: cut was sampled differently (model_version 1 then, 99 now" in done.stderr
 
 
 def test_features_over_all_parameters_are_added_to_a_report_that_is_there(run: Run, cut: Path, tmp_path: Path) -> None:
@@ -79,14 +79,14 @@ def test_features_over_all_parameters_are_added_to_a_report_that_is_there(run: R
     assert (planned["gradients"] - without["gradients"], planned["episodes"] - without["episodes"]) == (100, 612)
     done = run.ok(f"{words} --features")
     assert "features over all 2 parameters: 512 episodes and 100 with gradients: about" in done.stderr
-    assert re.search(r"A linear model explains +│ 19 ± 23 %", done.stdout)
+    assert re.search(r"Explained by a linear model +│ 19 ± 23 %", done.stdout)
     kept = read_json(tmp_path / "told/report.json")
     assert kept["profile"] == first["profile"]
     assert kept["features"]["points"] == 100
     assert kept["features"]["exploratory"]["ela_meta"]["quad_w_interact_adj_r2"] == pytest.approx(0.98, abs=0.01)
     again = run.ok(f"{words} --features")
     assert "episodes" not in again.stderr
-    assert "A linear model explains" in again.stdout
+    assert "Explained by a linear model" in again.stdout
 
 
 def test_an_environment_without_figures_is_sampled_first(run: Run, tmp_path: Path) -> None:
@@ -112,7 +112,7 @@ def test_all_makes_a_table_with_the_papers_words(run: Run, tmp_path: Path) -> No
     assert table[2].startswith("| bounce-x |")
     shutil.rmtree(tmp_path / "all/pinball-2-0-1")
     again = run(*command)
-    assert "all/bounce-x is there already" in again.stderr
+    assert "all/bounce-x: the report exists already" in again.stderr
     assert (tmp_path / "all/pinball-2-0-1/report.json").exists()
     assert "pinball-2-0-1" in again.stdout
     measured = environments_markdown([from_json(Report, record) for record in summary["reports"]]).splitlines()
@@ -140,7 +140,7 @@ def test_one_slice_that_fails_does_not_lose_the_others(run: Run, monkeypatch: py
     assert list(summary["failed"]) == ["bounce-x"]
     monkeypatch.setattr(job, "measure", measure)
     again = run.ok(*command)
-    assert "all/bounce-y is there already" in again.stderr
+    assert "all/bounce-y: the report exists already" in again.stderr
     assert "bounce-x" in again.stdout
 
 
@@ -149,7 +149,7 @@ def test_a_report_beside_its_slice_is_copied_unless_it_is_another(run: Run, cut:
     for file in (tmp_path / "told").iterdir():
         shutil.copyfile(file, cut / file.name)
     same = run("report cut --points-per-axis 2 --out same")
-    assert "same is copied from cut" in same.stderr
+    assert "same: the report is copied from cut" in same.stderr
     assert "episodes" not in same.stderr
     for file in (tmp_path / "told").iterdir():
         assert (tmp_path / "same" / file.name).read_bytes() == file.read_bytes()

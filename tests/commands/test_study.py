@@ -34,7 +34,7 @@ def test_the_parts_of_a_model_are_printed_drawn_and_kept(run: Run, tmp_path: Pat
     for file, begins in (("model.png", b"\x89PNG"), ("model-85mm.pdf", b"%PDF")):
         assert (tmp_path / "parts" / file).read_bytes().startswith(begins)
     for said in (
-        "parts that are missing, and what putting each in does",
+        "missing parts, and the effect of adding each",
         "paint, no paint: moves nothing beyond the noise; saves time",
         "wind, no wind: changes the order; costs nothing measurable",
         "tough glass, glass that breaks: fails where the full model does not; costs nothing measurable",
@@ -50,5 +50,5 @@ def test_the_parts_of_a_model_are_printed_drawn_and_kept(run: Run, tmp_path: Pat
 
 @pytest.mark.parametrize(("name", "kind"), [("tradeoff", "fidelity"), ("extremes", "extremes")])
 def test_a_former_function_names_the_present_one(name: str, kind: str) -> None:
-    with pytest.raises(AttributeError, match=f"gradscape.{name} is gradscape.study.'{kind}'"):
+    with pytest.raises(AttributeError, match=f"gradscape.{name} is now gradscape.study.'{kind}'"):
         getattr(gs, name)

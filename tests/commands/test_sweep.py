@@ -72,14 +72,14 @@ def test_nothing_is_computed_twice(run: Run, monkeypatch: pytest.MonkeyPatch) ->
     Path("moved/frames/001.zarr.zip").unlink()
     again = run(f"{SWEEP} --json")
     assert (again.json["episodes"], again.json["resumed"]) == (25, 50)
-    assert "25 episodes with gradients of 3 slices to compute, 50 are there already" in again.stderr
+    assert "25 episodes with gradients of 3 slices to compute, 50 are done already" in again.stderr
     for number, before in enumerate(first):
         xr.testing.assert_equal(open_slice(f"moved/frames/{number:03d}.zarr"), before)
     kind = type(gradscape.make("bounce", device="cpu"))
     evaluate, rows = kind.evaluate, list[int]()
     monkeypatch.setattr(kind, "evaluate", lambda env, x, *, grad: rows.append(len(x)) or evaluate(env, x, grad=grad))
     third = run(SWEEP)
-    assert "all 75 episodes with gradients of 3 slices are there already" in third.stderr
+    assert "all 75 episodes with gradients of 3 slices are done already" in third.stderr
     assert third.returncode == 0
     assert rows == [POINTS] * 3  # those that are verified, of each slice
 
@@ -108,7 +108,7 @@ def test_over_the_horizon_each_frame_is_a_shorter_episode(run: Run) -> None:
     assert float(half["loss"].sel(u=half["u"][1], v=half["v"][2])) == float(env.evaluate(points).loss[0])
     assert not np.allclose(half["loss"], whole["loss"])
     assert "all 32 episodes" in run(sweep).stderr
-    for wrong, said in (("--set horizon=2", "moves that option itself"), ("", "branin has no horizon")):
+    for wrong, said in (("--set horizon=2", "changes this option itself"), ("", "branin has no horizon")):
         run.refuse(
             f"{sweep.replace('bounce', 'branin').replace('example:aim', 'center') if not wrong else sweep} {wrong}",
             said=said,

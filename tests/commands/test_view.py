@@ -29,15 +29,15 @@ def desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.mark.parametrize(
     ("command", "said"),
     [
-        ("view nothing.png", "there is no file nothing.png"),
+        ("view nothing.png", "view found no file or folder nothing.png"),
         ("view empty/a.txt", "view opens .png, .html, .mp4, .gif, .rrd and results folders"),
-        ("view cut/landscape.png", "there is no display here to open cut/landscape.png"),
-        ("view cut/slice.zarr.zip", "there is no display here to open cut/landscape.png"),
-        ("view run", "there is no display here to open run/progress.png"),
-        ("view empty", "empty holds none of index.html, overlay.rrd, race.png"),
-        ("view cut --serve", "--serve shows recordings (.rrd)"),
-        ("view site --serve", "a site is served by: landscape gallery serve --out site"),
-        ("view site", "serve it to a browser: landscape gallery serve --out site"),
+        ("view cut/landscape.png", "this machine has no display to open cut/landscape.png"),
+        ("view cut/slice.zarr.zip", "this machine has no display to open cut/landscape.png"),
+        ("view run", "this machine has no display to open run/progress.png"),
+        ("view empty", "empty contains none of index.html, overlay.rrd, race.png"),
+        ("view cut --serve", "--serve shows only recordings (.rrd)"),
+        ("view site --serve", "view does not serve a site; serve it with: landscape gallery serve --out site"),
+        ("view site", "serve it to a browser with: landscape gallery serve --out site"),
     ],
 )
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems always have a display")
@@ -59,7 +59,7 @@ def test_a_picture_opens_in_the_systems_own_program(
     assert launched == [str((desk / opened).resolve())]
     monkeypatch.setattr("gradscape.api.view.launch", lambda path: False)
     refused = run(command)
-    assert (refused.returncode, "no program of this system opens" in refused.stderr) == (1, True)
+    assert (refused.returncode, "this system has no program that opens" in refused.stderr) == (1, True)
 
 
 def test_a_recording_needs_a_display_or_is_served_until_it_is_stopped(
@@ -67,7 +67,7 @@ def test_a_recording_needs_a_display_or_is_served_until_it_is_stopped(
 ) -> None:
     if sys.platform == "linux":
         said = run("view some.rrd").stderr
-        assert "look at it in a browser: landscape view some.rrd --serve" in said
+        assert "open it in a browser with: landscape view some.rrd --serve" in said
     served: list[str] = []
 
     @contextmanager

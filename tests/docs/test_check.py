@@ -52,8 +52,8 @@ def test_a_sound_site_has_no_fault(site: Path, capsys: pytest.CaptureFixture[str
         ('<a href="#gone">x</a>', "#gone leads to no anchor"),
         ('<a href="sub/gone.html#node=3,4">x</a>', "sub/gone.html#node=3,4 leads nowhere"),
         ('<img src="gone.png" alt="gone away">', "gone.png leads nowhere"),
-        ('<img src="a.png">', "shows a.png without saying what it is"),
-        ('<img src="sub/../a.png" alt="_images/a.png">', "without saying what it is"),
+        ('<img src="a.png">', "shows a.png without an alternative text"),
+        ('<img src="sub/../a.png" alt="_images/a.png">', "without an alternative text"),
     ],
 )
 def test_what_is_planted_is_found(site: Path, planted: str, said: str) -> None:

@@ -127,7 +127,7 @@ def test_pages_hold_every_figure_and_claim_and_say_what_is_not_measured(
 
 @pytest.mark.parametrize(
     ("hits", "misses", "verdict"),
-    [(1, 0, "confirmed"), (0, 2, "not seen here"), (1, 1, "different"), (0, 0, "the paper says nothing of it")],
+    [(1, 0, "confirmed"), (0, 2, "not seen here"), (1, 1, "different"), (0, 0, "not described in the paper")],
 )
 def test_a_slice_is_judged_by_which_of_the_paper_s_words_were_measured(
     tmp_path: Path, hits: int, misses: int, verdict: str

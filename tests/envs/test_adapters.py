@@ -257,10 +257,10 @@ def of_warp(fn: Any, **how: Any) -> Callable[[], Any]:
         (of_numpy(lambda x: (x[:, 0], x[0])), r"gradients of shape \(7, 2\); got shape \(2,\)"),
         (of_numpy(numpy_wave), "own returned losses without gradients.*differences"),
         (of_numpy(lambda x: 1j * x[:, 0]), "the loss of own takes numbers"),
-        (of_numpy(lambda x: ((x**2).sum(1), 2 * x, 3)), r"got 3 values, so drop the others"),
-        (of_jax(lambda x: jnp.sum(x**2, axis=1)), r"It takes one point, of shape \(2,\)"),
-        (of_jax(lambda x: x[:, 0] ** 2), r"It takes one point, of shape \(2,\)"),
-        (of_jax(lambda x: (jnp.sum(x**2), x)), r"must return its loss alone"),
+        (of_numpy(lambda x: ((x**2).sum(1), 2 * x, 3)), r"got 3 values, so drop the rest"),
+        (of_jax(lambda x: jnp.sum(x**2, axis=1)), r"It has to take one point, of shape \(2,\)"),
+        (of_jax(lambda x: x[:, 0] ** 2), r"It has to take one point, of shape \(2,\)"),
+        (of_jax(lambda x: (jnp.sum(x**2), x)), r"must return only its loss"),
         (of_jax(lambda x: x), r"own must return one loss for one point, of shape \(\); got shape \(2,\)"),
         (of_jax(lambda x: 3.0), "own must return a JAX array; got float"),
         (of_jax(lambda x: x[0].astype(int)), "own must return a floating-point loss; got int64"),
@@ -269,22 +269,28 @@ def of_warp(fn: Any, **how: Any) -> Callable[[], Any]:
         (of_jax(power), r"own cannot be differentiated in reverse: .*mode='forward'"),
         (of_warp(lambda x: 3.0), "own must return a Warp array; got float"),
         (of_warp(lambda x: x), r"own must return losses of shape \(7,\); got shape \(7, 2\)"),
-        (of_warp(lambda x: wp.zeros(len(x), dtype=wp.float32)), "losses of float64, as its points are; got float32"),
+        (of_warp(lambda x: wp.zeros(len(x), dtype=wp.float32)), "losses of float64, like its points; got float32"),
         (
             of_warp(lambda x: wp.zeros(len(x), dtype=wp.float64, requires_grad=True)),
             "own launched no kernel.*--no-gradients",
         ),
         (
             of_warp(lambda x: wp.clone(warp_of(_wave)(x), requires_grad=False)),
-            "carry no gradient; make them with requires_grad=True",
+            "without a gradient; make them with requires_grad=True",
         ),
         (
             of_warp(lambda x: warp_of(_wave)(wp.clone(x, requires_grad=False))),
             "launched no kernel that reads its points",
         ),
         (of_warp(warp_of(_root), precision="float32"), r"pass precision='float64' to from_warp"),
-        (of_warp(overwritten_later, check_overwrites=True), "writes to what it has read, .* in kernel _square"),
-        (of_warp(overwritten_in_place, check_overwrites=True), "writes to what it has read, .* in kernel _square"),
+        (
+            of_warp(overwritten_later, check_overwrites=True),
+            "overwrites an array that it .* in kernel _square",
+        ),
+        (
+            of_warp(overwritten_in_place, check_overwrites=True),
+            "overwrites an array that it .* in kernel _square",
+        ),
     ],
 )
 def test_a_wrong_function_is_told_what_and_what_to_do(make: Callable[[], Any], said: str) -> None:
@@ -389,10 +395,10 @@ def test_a_horizon_is_a_number_of_steps_and_another_step_keeps_the_time() -> Non
     [
         ({"options": {"mass": 1.0}}, "takes no keyword argument mass; it takes stiffness, dt, steps"),
         ({"options": {"stiffness": [1.0]}}, "needs a number, a text or a truth value as default"),
-        ({"options": {"dt": 0.1}, "fidelities": {"a": {"dt": 0.1}}}, "dt in options and in fidelities"),
+        ({"options": {"dt": 0.1}, "fidelities": {"a": {"dt": 0.1}}}, "dt in both options and fidelities"),
         ({"fidelities": {"a": {"dt": 0.1}, "b": {"steps": 2}}}, "fidelity a lacks steps"),
-        ({"horizon": "length"}, "horizon is one of its options or fidelities' settings; got 'length'"),
-        ({"seeds": 4}, "seeds=4 averages over random numbers, and spring takes no key or seed"),
+        ({"horizon": "length"}, "horizon must be one of its options or fidelity settings; got 'length'"),
+        ({"seeds": 4}, "seeds=4 averages over random numbers, but spring takes no key or seed"),
     ],
 )
 def test_settings_that_do_not_go_together_are_refused(said: dict[str, Any], wanted: str) -> None:
@@ -493,7 +499,7 @@ def test_an_interrupt_is_not_swallowed(left: type[BaseException]) -> None:
 @pytest.mark.parametrize("error", [StopIteration(), OSError(), ValueError(), TypeError(), RuntimeError("mine")])
 def test_what_always_raises_is_refused_with_what_it_said(error: Exception) -> None:
     for adapt in (gs.from_numpy, gs.from_torch):
-        where = f"fn raised wherever it was tried, at 16 points: {type(error).__name__}.*; the first was x = "
+        where = f"fn raised at all 16 points where it was tried: {type(error).__name__}.*; the first was x = "
         with pytest.raises(ValueError, match=where) as said:
             adapt(raising(error), SPACE).evaluate(X, grad=False)
         assert str(said.value).endswith(f"x = {X[0].tolist()}")
@@ -504,7 +510,7 @@ def test_an_engine_that_breaks_on_the_way_is_no_landscape_of_errors() -> None:
     env = gs.from_numpy(raising(RuntimeError("the device is lost"), after=2), SPACE)
     env.evaluate(X, grad=False)
     env.evaluate(X, grad=False)
-    with pytest.raises(ValueError, match=r"fn raised wherever it was tried.*the device is lost"):
+    with pytest.raises(ValueError, match=r"fn raised at all .* points where it was tried.*the device is lost"):
         env.evaluate(X, grad=False)
 
 
@@ -548,5 +554,5 @@ def test_losses_of_float32_are_seen() -> None:
 def test_an_object_without_what_it_takes_is_told_so() -> None:
     with pytest.raises(ValueError, match="is no simulator: it has no space and no evaluate"):
         gs.check(object())
-    with pytest.raises(ValueError, match="wave is a function, and nothing says what its parameters are"):
+    with pytest.raises(ValueError, match="wave is a function without a parameter space"):
         gs.check(wave)

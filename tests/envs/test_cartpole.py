@@ -99,7 +99,7 @@ def test_the_example_swings_the_tip_up_to_the_target(fidelity):
 
 def test_a_step_that_does_not_divide_the_time_of_a_control_is_refused():
     for dt in (0.03, 0.015, 0.04):
-        with pytest.raises(ValueError, match=f"cartpole holds a control for 0.02 s.*got dt {dt} s"):
+        with pytest.raises(ValueError, match=f"cartpole keeps each control for 0.02 s.*got dt {dt} s"):
             exact(dt)
 
 

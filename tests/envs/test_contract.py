@@ -212,7 +212,7 @@ def test_points_that_are_not_finite_are_refused(env, points):
         x = points.clone()
         x[3, -1] = bad
         message = refusal(lambda x=x: env.evaluate(x))
-        assert message.startswith(f"{env.name} takes finite parameters; row 3 of x holds [")
+        assert message.startswith(f"{env.name} takes finite parameters; row 3 of x is [")
         assert str(bad) in message
 
 

@@ -28,7 +28,7 @@ def test_segments_are_held_over_equal_shares_of_the_steps():
 
 
 def test_steps_that_segments_cannot_share_are_refused():
-    with pytest.raises(ValueError, match="21 control steps cannot be shared equally by 5 segments"):
+    with pytest.raises(ValueError, match="21 control steps cannot be divided equally into 5 segments"):
         hold(velocities(3, 5, 2), 21)
 
 

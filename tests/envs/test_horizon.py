@@ -140,5 +140,5 @@ def test_other_horizons_are_refused(wrong):
 def test_decisions_are_those_of_horizon_1():
     fluid, bounce = made("fluid", horizon=0.5), made("bounce", horizon=0.5)
     said = refusal(lambda: fluid.observe(points(fluid), 0))
-    assert said == "fluid is decided step by step at horizon 1 only; got horizon 0.5"
+    assert said == "fluid takes decisions at horizon 1 only; got horizon 0.5"
     assert bounce.observe(points(bounce), 0).shape == (2, 1)

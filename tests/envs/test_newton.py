@@ -179,7 +179,7 @@ def test_a_step_that_is_too_long_ends_in_a_status():
 def test_what_newton_does_not_have_is_refused_in_a_line():
     with pytest.raises(ValueError, match=r"newton-cloth option solver takes .*got 'featherstone'"):
         gs.make("newton-cloth", solver="featherstone")
-    with pytest.raises(ValueError, match="newton-flight is simulated by Newton, which computes in float32 only; got"):
+    with pytest.raises(ValueError, match="newton-flight runs on Newton, which computes in float32 only; got"):
         gs.make("newton-flight", fidelity=gs.Fidelity("double", dt=0.01, precision="float64"))
 
 

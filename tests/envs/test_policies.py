@@ -105,7 +105,7 @@ def test_without_weights_every_decision_is_the_middle_of_its_box() -> None:
 
 @pytest.mark.parametrize("policy", ["mlp:", "mlp:0", "mlp:3x", "mlp:03", "cnn:3", "mlp", f"mlp:{'9' * 5000}"])
 def test_what_is_no_policy_is_refused(policy: str) -> None:
-    with pytest.raises(ValueError, match="--policy takes mlp and the sizes of its hidden layers, as mlp:32x32; got"):
+    with pytest.raises(ValueError, match="takes mlp and the sizes of its hidden layers, such as mlp:32x32; got"):
         with_policy(Cart(), policy)
 
 
@@ -121,7 +121,7 @@ def test_what_decides_once_and_what_is_too_large_is_refused() -> None:
 def test_where_what_is_seen_is_not_differentiated_losses_are_all_there_is() -> None:
     hidden = with_policy(Hidden(), "mlp:2")
     x = hidden.space.uniform(2, seed=0)
-    with pytest.raises(ValueError, match="has no gradients, as what a policy sees there is not differentiated"):
+    with pytest.raises(ValueError, match="has no gradients, because its observations are not differentiated"):
         hidden.evaluate(x)
     assert torch.equal(hidden.evaluate(x, grad=False).loss, with_policy(Cart(), "mlp:2").evaluate(x, grad=False).loss)
     assert "grad" not in gs.slice(Hidden(), policy="mlp:2", along="random:0", resolution=3).data
@@ -135,7 +135,7 @@ def test_a_slice_over_weights_goes_on_and_is_none_of_the_scenes_own(run, tmp_pat
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)["gradients"]
     again = run(*line, "--out", "cut", cwd=tmp_path)
-    assert "all 9 episodes with gradients are there already" in again.stderr
+    assert "all 9 episodes with gradients are done already" in again.stderr
     other = run(*line[:3], "mlp:3", *line[4:], "--out", "cut", cwd=tmp_path)
     assert other.returncode == 2
     assert "policy" in other.stderr

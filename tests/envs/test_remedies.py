@@ -189,15 +189,15 @@ def test_wider_smoothing_flattens() -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("polish:1", "no remedy 'polish'; there are smooth:WIDTH"),
+        ("polish:1", "no remedy 'polish'; the remedies are smooth:WIDTH"),
         ("smooth", "spelt smooth:WIDTH"),
         ("smooth:0", "width above 0"),
         ("smooth:2%:second", "first, zeroth, mixed"),
-        ("smooth:2%:mixed:4", "from 6 where it is mixed"),
+        ("smooth:2%:mixed:4", "at least 6 if mixed"),
         ("clip:-1", "norm above 0"),
         ("average", "no replicas"),
         ("rescale:log10", "2 scales"),
-        ("shorten:50%", "how long an episode is"),
+        ("shorten:50%", "for the length of an episode"),
         ("soften:10%", "no contact stiffness"),
     ],
 )

@@ -45,8 +45,8 @@ def test_figures_are_chosen_by_id_and_by_environment() -> None:
     [
         ("", "needs figures"),
         ('[[figure]]\nid = "a"\nenv = "fluid"', "lacks .'dims'"),
-        ('[[figure]]\nid = "a"\nenv = "fluid"\ndims = [0, 1]\ndim = 3', "unknown .'dim'"),
-        ('[[figure]]\nid = "a"\nenv = "fluid"\ndims = [0, 1]\nsays = "It is smooth."', "unknown .'says'"),
+        ('[[figure]]\nid = "a"\nenv = "fluid"\ndims = [0, 1]\ndim = 3', "unknown keys .'dim'"),
+        ('[[figure]]\nid = "a"\nenv = "fluid"\ndims = [0, 1]\nsays = "It is smooth."', "unknown keys .'says'"),
         ('[[figure]]\nid = "a"\nenv = "fluid"\ndims = [0, 1, 2]', "needs one dimension or two"),
         (2 * '[[figure]]\nid = "a"\nenv = "fluid"\ndims = [0, 1]\n', "repeated: a"),
     ],

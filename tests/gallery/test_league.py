@@ -99,7 +99,7 @@ def test_its_races_are_those_of_the_verb_and_neither_repeats_the_other(
         )
     theirs = json.loads(capsys.readouterr().out)["scenes"][0]
     assert compute(small, "--only", "branin") == 0
-    assert "all 72 episodes are there already" in capsys.readouterr().err
+    assert "all 72 episodes are done already" in capsys.readouterr().err
     ours = to_json(read_standings(small / "league/branin.json"))
     assert {**ours, "command": ""} == {**theirs, "command": ""}
     assert ours["command"].startswith("landscape league branin@exact --methods random,descents --budget 12 --seeds 3")
@@ -177,7 +177,7 @@ def test_the_best_point_of_the_gallery_is_known_to_slices(
     small: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     env = make("branin", device="cpu")
-    with pytest.raises(ValueError, match="no run of branin with these options is known"):
+    with pytest.raises(ValueError, match="there is no run of branin with these options"):
         point_of(env, "best")
     LeaguePart(FIGURES[0], small, "cpu").make(Watch())
     found = read_standings(small / "league/branin.json").best

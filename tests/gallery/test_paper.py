@@ -32,7 +32,7 @@ def test_claims_are_about_methods_and_environments_that_exist() -> None:
 def test_of_an_environment_there_are_claims_or_a_reason_why_there_are_none() -> None:
     assert WHOLE.claims.keys().isdisjoint(WHOLE.silences)
     assert set(WHOLE.words) == set(WHOLE.claims) | set(WHOLE.silences)
-    assert "limitations" in str(WHOLE.claims_about("flip").silence)
+    assert "limitation" in str(WHOLE.claims_about("flip").silence)
     assert WHOLE.claims_about("branin") == Claims((), ABSENT)
     assert WHOLE.claims_about("fluid").silence is None
 

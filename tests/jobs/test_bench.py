@@ -237,7 +237,7 @@ def test_launches_are_timed_within_the_block_only():
     [
         ("taichi", None, "bounce has engine warp; got engine 'taichi'"),
         ("warp", "taichi", "bounce has engine warp; got engine 'taichi'"),
-        ("warp", "warp", "two engines are compared; got warp against warp"),
+        ("warp", "warp", "bench compares two different engines; got warp twice"),
     ],
 )
 def test_an_engine_that_is_not_there_is_refused_before_anything_runs(engine, against, said):

@@ -47,7 +47,7 @@ def test_a_check_that_is_stopped_leaves_no_file_and_says_that_nothing_is_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def interrupted(self: CheckJob, watch: Watch) -> None:
-        raise Stopped("3 checks are done, and nothing is kept of them", kept=False)
+        raise Stopped("3 checks were done, but nothing is kept", kept=False)
 
     monkeypatch.setattr(CheckJob, "run", interrupted)
     with pytest.raises(Stopped, match="nothing is kept") as stopped:

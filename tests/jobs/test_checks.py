@@ -35,7 +35,7 @@ class Interrupted(Watch):
 @pytest.mark.e2e
 def test_an_interrupt_ends_the_processes_and_says_that_nothing_is_kept() -> None:
     specs = [SceneSpec(name) for name in ("branin", "ackley", "rope", "fluid", "writer")]
-    with pytest.raises(Stopped, match=r"^1 of 5 environments are checked, and nothing is kept of them$") as stopped:
+    with pytest.raises(Stopped, match=r"^1 of 5 environments were checked, but nothing is kept$") as stopped:
         ChecksJob(specs, 0.2, 0, 2).run(Interrupted())
     assert not stopped.value.kept
     assert multiprocessing.active_children() == []

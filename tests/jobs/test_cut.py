@@ -155,23 +155,23 @@ def test_through_several_points_there_is_a_slice_for_each(run, tmp_path):
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        ([], "--dims, one or two parameters, or --along, directions; give one of them"),
+        ([], "a slice takes either --dims (one or two parameters) or --along (directions); give one of them"),
         (["--dims", "0", "--along", "hessian"], "give one of them"),
         (
             ["--along", "downhill"],
             "--along takes random:SEED, filters:SEED, gradient, hessian, pca:RUN, training:FOLDER, A:B or A:B:C; got",
         ),
-        (["--along", "training:nowhere"], "takes the folder of a training's checkpoints; got 'nowhere'"),
+        (["--along", "training:nowhere"], "takes a folder with checkpoints of a training; got 'nowhere'"),
         (["--along", "filters:0"], "bounce does not say which of its 3 parameters are the weights of one neuron"),
-        (["--along", "center:random:1", "--through", "random:2"], "says where it goes; leave out --through"),
-        (["--along", "center:center"], "not zero and not parallel"),
+        (["--along", "center:random:1", "--through", "random:2"], "fixes the plane; leave out --through"),
+        (["--along", "center:center"], "neither zero nor parallel"),
         (["--along", "pca:nothing"], "nothing"),
         (["--along", "pca"], "--along pca:RUN takes the folder of a run"),
         (["--dims", "0", "--through", "best:"], "best:RUN takes the folder of a run"),
         (["--dims", "0", "--through", "random:x"], "got 'random:x', which is none of these"),
         (
             ["--along", "hessian", "--through", "best"],
-            "no run of bounce with these options is known under out/; `landscape optimize",
+            "there is no run of bounce with these options in out/; `landscape optimize",
         ),
     ],
 )

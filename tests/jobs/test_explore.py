@@ -114,8 +114,8 @@ def test_an_error_of_the_simulator_is_said_and_another_look_goes_on(tmp_path: Pa
 @pytest.mark.parametrize(
     ("look", "said"),
     [
-        (Look((0, 0), (0.5,) * 3), "two different parameters vary"),
-        (Look((0, 3), (0.5,) * 3), "two different parameters vary, of 3"),
+        (Look((0, 0), (0.5,) * 3), "explore varies two different parameters"),
+        (Look((0, 3), (0.5,) * 3), "two different parameters of 3"),
         (Look((0, 1), (0.5,) * 2), "a point has 3 numbers from 0 to 1"),
         (Look((0, 1), (0.5, 0.5, float("nan"))), "a point has 3 numbers from 0 to 1"),
     ],
@@ -127,5 +127,5 @@ def test_what_is_no_place_is_refused(exploration: Exploration, look: Look, said:
 
 def test_a_function_of_one_parameter_is_refused(tmp_path: Path) -> None:
     one = gs.from_torch(lambda x: x[:, 0], gs.ParameterSpace({"a": (0, 1)}))
-    with pytest.raises(ValueError, match="takes two parameters and more"):
+    with pytest.raises(ValueError, match="takes an environment with at least two parameters"):
         Exploration(one, (0,), "", tmp_path)

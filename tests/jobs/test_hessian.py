@@ -108,7 +108,7 @@ def test_what_cannot_be_told_has_no_sign_and_no_condition(tmp_path: Path) -> Non
     assert np.isnan(found.condition.value)
     assert found.condition.low > 1
     assert found.negative.high == found.undecided == pytest.approx(2 / 3)
-    assert "2 of 3 eigenvalues cannot be told from 0" in found.warnings[0]
+    assert "2 of 3 eigenvalues are not distinguishable from 0" in found.warnings[0]
 
 
 def test_a_stopped_one_goes_on_with_what_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

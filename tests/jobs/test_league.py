@@ -109,8 +109,8 @@ def test_a_league_that_is_stopped_goes_on_scene_by_scene(tmp_path: Path) -> None
     assert [scene["env"] for scene in read_json(tmp_path / "stopped/league.json")["scenes"]] == ["branin"]
     watch = Notes()
     again = job(tmp_path / "stopped", "branin", "beale").run(watch)
-    assert watch.said[0].startswith("branin@exact · cpu: 72 of 72 episodes are there")
-    assert watch.said[1].startswith("beale@exact · cpu: 0 of 72 episodes are there, the others take ")
+    assert watch.said[0].startswith("branin@exact · cpu: 72 of 72 episodes are done")
+    assert watch.said[1].startswith("beale@exact · cpu: 0 of 72 episodes are done, the rest takes ")
     assert "2 of 2 scenes, 3 methods, 2 seeds, 12 episodes each" in watch.said[2]
     assert rows(again) == rows(whole)
 
@@ -121,7 +121,7 @@ def test_more_methods_seeds_and_episodes_go_on_and_finished_runs_are_not_touched
     before = RunStore.open(run).dataset()["loss"].to_numpy()
     watch = Notes()
     more = job(tmp_path, "branin", methods=("random", "cma-es"), budget=20, seeds=3).run(watch)
-    assert "24 of 120 episodes are there" in watch.said[0]
+    assert "24 of 120 episodes are done" in watch.said[0]
     np.testing.assert_array_equal(RunStore.open(run).dataset()["loss"].to_numpy()[:12], before)
     assert (more.scenes[0].seeds, more.scenes[0].budget, sorted(more.methods)) == (3, 20, ["cma-es", "random"])
 
@@ -150,8 +150,8 @@ def test_a_method_that_cannot_search_a_scene_is_left_out_there_with_the_reason()
     [
         (["nothing"], {}, "no environment is called 'nothing'"),
         (["branin@draft"], {}, "branin has fidelities exact; got 'draft'"),
-        (["branin", "branin@exact"], {}, "each once; got branin"),
-        ([], {}, "a league has scenes, each once; got none"),
+        (["branin", "branin@exact"], {}, "each only once; got branin more than once"),
+        ([], {}, "league takes at least one scene, and each only once; got none"),
         (["branin"], {"methods": ("magic",)}, "no method is called 'magic'"),
         (["branin"], {"budget": 0}, "a budget is a whole number of at least 1; got 0"),
     ],

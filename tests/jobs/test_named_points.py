@@ -45,9 +45,9 @@ def test_what_names_no_row_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="4 rows and no column 'loss'; say which one"):
         named_point(BOWL, str(path))
     for row in ("0", "1", "6"):
-        with pytest.raises(ValueError, match=rf"has points in its rows 2 to 5 \(1 is the heading\); got row {row}"):
+        with pytest.raises(ValueError, match=rf"has points in rows 2 to 5 \(1 is the heading\); got row {row}"):
             named_point(BOWL, f"{path}:{row}")
-    with pytest.raises(ValueError, match="has points in its rows 1 to 4; got row 5"):
+    with pytest.raises(ValueError, match="has points in rows 1 to 4; got row 5"):
         named_point(BOWL, f"{table(tmp_path / 'points.parquet')}:5")
     with pytest.raises(ValueError, match=r"no row of .* has a loss"):
         named_point(BOWL, str(table(tmp_path / "lost.csv", loss=[None] * 4)))

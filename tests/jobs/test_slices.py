@@ -136,7 +136,7 @@ def test_a_condition_chooses_rows_and_a_wrong_one_is_refused(many: Path) -> None
     assert len(gs.slices(many, "0")) == 0
     assert lowest(many, "1) or (1") == lowest(many)
     for wrong in ("jumps > 0.1", "lowest >", "1; DROP TABLE slices", "lowest > \0"):
-        with pytest.raises(ValueError, match=r"takes a condition of SQLite over folder, env, .*; got"):
+        with pytest.raises(ValueError, match=r"takes an SQLite condition over folder, env, .*; got"):
             gs.slices(many, wrong)
     with pytest.raises(ValueError, match="there is no folder"):
         gs.slices(many / "nowhere")

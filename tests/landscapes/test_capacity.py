@@ -22,9 +22,9 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.usefixtures("small")
 def test_what_does_not_fit_is_refused_with_what_would(tmp_path: Path) -> None:
     require("points", 1000, lambda count: Need(memory=1000.0 * count))
-    with pytest.raises(TooLargeError, match=r"points 1234 takes about 1 MB of memory, .* points 1000 would fit"):
+    with pytest.raises(TooLargeError, match=r"points 1234 needs about 1 MB of memory, .* points 1000 would fit"):
         require("points", 1234, lambda count: Need(memory=1000.0 * count))
-    with pytest.raises(TooLargeError, match="of disk, and 2 MB are free here; files 20 would fit"):
+    with pytest.raises(TooLargeError, match="of disk, but only 2 MB are free here; files 20 would fit"):
         require("files", 10**30, lambda count: Need(disk=1e5 * count), tmp_path)
     require("files", 10**30, lambda count: Need(disk=1e5 * count))  # nothing is written
     with pytest.raises(TooLargeError, match="not even seeds 1 would fit"):
@@ -35,10 +35,10 @@ def test_what_does_not_fit_is_refused_with_what_would(tmp_path: Path) -> None:
 def test_a_slice_beyond_the_machine_is_refused_before_it_is_made(tmp_path: Path) -> None:
     space = ParameterSpace.box(["a", "b"], -1.0, 1.0)
     plane = Plane.through(space, space.center, ("a", "b"), resolution=(100, 1000))
-    with pytest.raises(TooLargeError, match="resolution 1000 takes"):
+    with pytest.raises(TooLargeError, match="resolution 1000 needs"):
         SliceStore.create(tmp_path / "slice.zarr", plane, space, identity={"objective": "none"})
     assert not list(tmp_path.iterdir())
-    with pytest.raises(TooLargeError, match="resolution 1000 takes"):
+    with pytest.raises(TooLargeError, match="resolution 1000 needs"):
         SliceStore.in_memory(plane, space)
 
 

@@ -197,7 +197,7 @@ def test_differences_of_losses_where_there_are_no_gradients() -> None:
         (
             gs.from_numpy(lambda x: (x**2).sum(axis=1), gs.ParameterSpace.box([f"p{k}" for k in range(31)], -1.0, 1.0)),
             torch.zeros(31).double(),
-            r"30 parameters at most, and it has 31: give it gradients \(gs.from_torch",
+            r"at most 30 parameters, and it has 31; give it gradients \(gs.from_torch",
         ),
         (
             gs.from_torch(lambda x: half_square(x) + (1e-9 - (x - POINT).norm(dim=1)).sqrt() * 0, SPACE, name="thin"),
@@ -234,7 +234,7 @@ def test_a_point_at_the_bounds_is_moved_inwards_and_one_beyond_refused() -> None
     found = measure_spectrum(curvature, pairs=2, probes=8)
     assert curvature.moved == EDGE
     assert found.values == pytest.approx([6 * (1 - EDGE), 6 * EDGE])
-    with pytest.raises(ValueError, match="beyond its bounds"):
+    with pytest.raises(ValueError, match="outside its bounds"):
         Curvature(f, torch.tensor([0.0, 1.1], dtype=torch.float64))
 
 

@@ -82,22 +82,25 @@ REFUSED: dict[str, tuple[Callable[[], Any], str]] = {
         "the loss of f takes numbers; got a tensor of torch.bool",
     ),
     "complex gradients": (lambda: Evaluation.from_results(X[:, 0], X + 1j), "a gradient takes numbers"),
-    "masked losses": (lambda: from_numpy(lambda x: MASKED[:, 1], SPACE).evaluate(X, grad=False), "masks some"),
-    "masked gradients": (lambda: from_numpy(lambda x: (x[:, 0], MASKED), SPACE).evaluate(X), "masks some"),
+    "masked losses": (lambda: from_numpy(lambda x: MASKED[:, 1], SPACE).evaluate(X, grad=False), "with masked ones"),
+    "masked gradients": (lambda: from_numpy(lambda x: (x[:, 0], MASKED), SPACE).evaluate(X), "with masked ones"),
     "masked gradients of points": (
         lambda: from_numpy(lambda x: (x[0], MASKED[0]), SPACE, vectorized=False).evaluate(X),
         "the gradient of .* masks some",
     ),
-    "masked points": (lambda: BOWL.evaluate(MASKED), "bowl takes numbers; got an array that masks some"),
-    "masked bounds": (lambda: ParameterSpace(["a", "b"], MASKED[0], [9, 9]), "lower takes numbers; .* masks some"),
-    **{f"status {n}": (answered(n), f"a status is one of 0 MISSING, 1 OK, .*; got {n}") for n in (257, -1, 1.5, 7)},
-    "no status yet": (answered(0), "own must say how every point ended"),
+    "masked points": (lambda: BOWL.evaluate(MASKED), "bowl takes numbers; got an array with masked ones"),
+    "masked bounds": (
+        lambda: ParameterSpace(["a", "b"], MASKED[0], [9, 9]),
+        "lower takes numbers; .* masked ones",
+    ),
+    **{f"status {n}": (answered(n), f"status takes 0 MISSING, 1 OK, .*; got {n}") for n in (257, -1, 1.5, 7)},
+    "no status yet": (answered(0), "own must give the final status of every point"),
     "failures coded 257": (lambda: Evaluation.from_results(X[:, 0], None, torch.full((4,), 257)), "got 257"),
     "a tuple": (sampled(lambda x: (x[:, 0], x, 1)), r"own._evaluate must return an Evaluation; got tuple"),
     "nothing": (sampled(lambda x: None), r"own._evaluate must return an Evaluation; got NoneType"),
     "losses that use no x": (
         lambda: from_torch(lambda x: torch.ones(len(x), requires_grad=True) * 2, SPACE, name="f").evaluate(X),
-        "f returned losses that carry no gradient; compute them from x",
+        "f returned losses without a gradient; compute them from x",
     ),
     **{
         f"batch {n}": (lambda n=n: fill(as_environment(BOWL), PLANE, batch=n), "sample's batch is")
@@ -128,7 +131,7 @@ REFUSED: dict[str, tuple[Callable[[], Any], str]] = {
     "a box of infinite bounds": (lambda: ParameterSpace.box(["a"], -INF, INF), "finite lower < upper"),
     "a box of text": (lambda: ParameterSpace.box(["a"], "0", "1"), "takes numbers"),  # type: ignore[arg-type]
     "a plane through infinity": (lambda: Plane.through(SPACE, [INF, INF], [0], resolution=3), "finite origin"),
-    "a direction of zeros": (lambda: Plane.span([0, 0], [[0, 0]], resolution=3), "not zero and not parallel"),
+    "a direction of zeros": (lambda: Plane.span([0, 0], [[0, 0]], resolution=3), "neither zero nor parallel"),
     "principal directions of NaN": (lambda: Plane.principal(X * NAN, resolution=3), "finite points"),
     **{
         f"differences {d}": (differing(differences=d), "from_numpy takes differences from 1e-12 to 1")
@@ -141,7 +144,7 @@ REFUSED: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "parameters no float32 holds": (
         lambda: Single().evaluate([[0, 0], [0, 1e39]]),
-        r"single computes in float32, whose numbers end at 3.4e38; row 1 of x holds \[0.0, 1e\+39\]",
+        r"single computes in float32, whose largest number is 3.4e38; row 1 of x is \[0.0, 1e\+39\]",
     ),
     **{f"{n} points": (lambda n=n: SPACE.uniform(n, seed=0), "a count of points is") for n in (-1, 1.5, "x", 10**30)},
     **{f"seed {n}": (lambda n=n: SPACE.uniform(1, seed=n), "a seed is a whole number") for n in (-1, 1.5, None)},

@@ -70,8 +70,8 @@ def test_a_report_leaves_out_what_it_may_not_ask_for_and_says_how_much(dims):
     assert 0 < probes.cut < probes.asked / 10
     assert free.beyond_the_box == OutsideBounds(probes.asked, 0)
     said = f"{probes.cut} of {probes.asked}"
-    assert strict.measures["Probes beyond the bounds, left out"] == said
-    assert "Probes beyond the bounds, left out" not in free.measures
+    assert strict.measures["Probes outside the bounds, left out"] == said
+    assert "Probes outside the bounds, left out" not in free.measures
     assert strict.verdict.words == free.verdict.words
     known = np.isfinite(strict.quality.smooth["first"])
     assert float(known.mean()) > 0.9
@@ -97,7 +97,7 @@ def test_pairs_checks_and_trade_offs_ask_nothing_beyond(tmp_path):
     assert (measure(Strict(), SPACE.sobol(4, seed=0)).status == Status.OK).all()
     outcomes = {finding.check: finding for finding in check(Strict())}
     assert {finding.outcome for finding in outcomes.values()} <= {"pass", "skip"}
-    assert "it does not invite points beyond its box" in outcomes["10% outside the box"].why
+    assert "it is undefined outside its bounds" in outcomes["10% outside the box"].why
     invited = {finding.check: finding for finding in check(Inviting())}
     assert invited["10% outside the box"].outcome == "pass"
 
@@ -123,7 +123,7 @@ def test_evaluations_of_several_batches_are_joined_in_order():
     assert joined.rows(slice(1, 3)).status.tolist() == whole.status.tolist()[1:]
     assert Evaluation.join(parts, dim=3, grad=False).grad is None
     assert Evaluation.join([], dim=3, grad=True).grad.shape == (0, 3)
-    with pytest.raises(ValueError, match="1 of 3 evaluations to join have no gradients"):
+    with pytest.raises(ValueError, match="cannot join gradients: 1 of 3 evaluations have none"):
         Evaluation.join([*parts, evaluate(Strict(), x, grad=False)], dim=3, grad=True)
 
 

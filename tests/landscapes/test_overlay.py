@@ -124,7 +124,7 @@ def test_runs_of_other_parameters_and_lines_are_refused():
     with pytest.raises(ValueError, match=r"bo-leap-s0 searched 3 parameters \(a, b, c\), the slice has 3 \(speed"):
         overlay(SLICE, [other])
     line = sample(BOWL, Plane.through(SPACE, SPACE.center, ("speed",), resolution=5))
-    with pytest.raises(ValueError, match="laid over planes; got a slice of rank 1"):
+    with pytest.raises(ValueError, match="an overlay needs a plane; got a slice of rank 1"):
         overlay(line, [run(SPREAD, [0] * 30)])
 
 
@@ -198,14 +198,14 @@ def test_points_beyond_the_map_are_hollow_at_its_border_and_counted():
     (hollow,) = drawn(figure.axes[0], "outside")
     np.testing.assert_allclose(hollow.get_offsets(), [[0.625, 1000], [0, 375]])
     assert len(hollow.get_facecolors()) == 0
-    assert "beyond the map: 2 of 3 points" in [text.get_text() for text in figure.legends[0].get_texts()]
+    assert "outside the map: 2 of 3 points" in [text.get_text() for text in figure.legends[0].get_texts()]
 
 
 def test_losses_are_held_against_the_samples_beneath():
     own = next(dots for dots in drawn(AGAINST, "descent") if len(dots.get_offsets()))
     np.testing.assert_array_equal(own.get_offsets(), np.stack([LAID[1]["beneath"], LAID[1]["loss"]], 1))
     assert AGAINST.get_xlim() == AGAINST.get_ylim()
-    assert AGAINST.get_title().startswith("36 of 38 points have a loss")
+    assert AGAINST.get_title().startswith("36 of 38 points: those with both losses")
 
 
 def test_a_run_that_converged_leaves_the_map_its_colours():
@@ -266,4 +266,4 @@ def test_what_was_the_best_so_far_is_joined_in_its_order_and_numbered_where_ther
     boxes = [text.get_window_extent() for text in numbers]
     assert not any(one.overlaps(other) for number, one in enumerate(boxes) for other in boxes[:number])
     assert any("numbers: episodes" in text.get_text() for text in figure.legends[0].get_texts())
-    assert "colour: the loss the point truly had" in figure.legends[0].get_title().get_text().replace("\n", " ")
+    assert "colour: the loss of the point itself" in figure.legends[0].get_title().get_text().replace("\n", " ")

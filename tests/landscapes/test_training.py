@@ -189,13 +189,13 @@ class Trap:
 REFUSED: dict[str, tuple[str, Callable[[Path], object], str]] = {
     "of another shape": (
         "a.pt", lambda path: torch.save(arrays_of(torch.zeros(23), OWN) | {"1.weight": torch.zeros(2, 4)}, path),
-        r"net takes 1.weight of shape \(2, 3\); .*a.pt holds 1.weight of shape \(2, 4\)",
+        r"net takes 1.weight of shape \(2, 3\); .*a.pt has 1.weight of shape \(2, 4\)",
     ),
     "of other arrays": (
         "a.zip", lambda path: agent(path, {"q_net.0.weight": torch.zeros(3, 4)}),
-        r"net takes 4 arrays of 23 numbers \(0.weight \(3, 4\), .*a.zip holds 1 arrays of 12 numbers",
+        r"net takes 4 arrays of 23 numbers \(0.weight \(3, 4\), .*a.zip has 1 arrays of 12 numbers",
     ),
-    "too long a vector": ("a.npy", lambda path: np.save(path, np.zeros(24)), "holds 1 arrays of 24 numbers"),
+    "too long a vector": ("a.npy", lambda path: np.save(path, np.zeros(24)), "has 1 arrays of 24 numbers"),
     "not finite": ("a.npy", lambda path: np.save(path, np.full(23, np.nan)), "23 numbers that are not finite"),
     "no policy": ("a.zip", lambda path: agent(path, {}, "other.pth"), "a zip without policy.pth"),
     "no file of torch": ("a.pt", lambda path: path.write_bytes(b"PK none"), "cannot be read as a checkpoint"),
@@ -221,10 +221,10 @@ def test_too_few_checkpoints_and_those_beyond_the_bounds_are_refused(tmp_path: P
     for number in range(2):
         np.save(tmp_path / f"{number}.npy", np.full(2, 3.0 + number))
     plain = gs.from_torch(rolled, gs.ParameterSpace.box(["a", "b"], -6.0, 6.0), name="plain")
-    with pytest.raises(ValueError, match=r"takes three checkpoints and more .*holds 2"):
+    with pytest.raises(ValueError, match=r"needs at least three checkpoints .*has 2"):
         Training.read(tmp_path, plain)
     np.save(tmp_path / "2.npy", np.array([1.0, -8.0]))
-    with pytest.raises(ValueError, match=r"1 of 3 checkpoints .* beyond the bounds of plain: b is -8, bounds -6 to 6"):
+    with pytest.raises(ValueError, match=r"1 of 3 checkpoints .* outside the bounds of plain: b is -8, bounds -6 to 6"):
         Training.read(tmp_path, plain)
     cut = gs.slice(LQR, along=f"training:{tmp_path}", resolution=3)  # weights mean something beyond their bounds
     assert (cut.data.status == Status.OK).all()

@@ -72,14 +72,14 @@ def test_a_point_without_a_gradient_is_asked_for_none_and_one_that_is_interpolat
 @pytest.mark.parametrize("rise", [1e-300, 1.0, 1e308])
 def test_other_losses_are_refused_of_any_size(rise: float) -> None:
     verify(Slope(rise), [stored(Slope(rise).evaluate(POINTS))])
-    with pytest.raises(StoreMismatchError, match=r"cut holds a slice of slope whose losses are others now: \S+ then"):
+    with pytest.raises(StoreMismatchError, match=r"cut contains a slice of slope whose losses have changed: \S+ then"):
         verify(Slope(-rise), [stored(Slope(rise).evaluate(POINTS))])
 
 
 def test_several_results_are_evaluated_in_one_batch_and_the_one_that_differs_is_named() -> None:
     run = StoredPoints(Path("run"), "run", POINTS, Slope(2.0).evaluate(POINTS), True)
     objective = Slope()
-    with pytest.raises(StoreMismatchError, match=r"run holds a run of slope .*: \S+ then"):
+    with pytest.raises(StoreMismatchError, match=r"run contains a run of slope .*: \S+ then"):
         verify(objective, [stored(Slope().evaluate(POINTS)), run])
     assert len(objective.asked[0][0]) == 6
 

@@ -79,7 +79,7 @@ def test_a_choice_says_no_evidence_and_takes_the_best_single_method(monkeypatch:
     worse = [replace(one, ranks={**one.ranks, "turbo": one.ranks["turbo"] + 0.1}) for one in cases]
     found = chosen(monkeypatch, worse, character(bowl))
     assert (found.method, found.by_cases) == ("l-bfgs-b", False)
-    assert found.reason.startswith("no evidence beyond that one method")
+    assert found.reason.startswith("advice by similar landscapes is not shown to beat one method everywhere")
     told = chosen(monkeypatch, made(6, lambda number: True), character(bowl, agreement=(-0.3, 0.0, 0.1), across=0.0))  # type: ignore[arg-type]
     assert (told.method, told.by_cases) == ("turbo", True)
     assert told.reason.startswith("it was best in 10 of the 10 nearest cases")
@@ -109,7 +109,7 @@ def test_methods_that_cannot_search_are_not_chosen() -> None:
     found = choose(character(bowl), ["random", "cma-es", "bo"])
     assert set(found.expected) == {"random", "cma-es"}
     assert found.method in found.expected
-    with pytest.raises(ValueError, match="there is no evidence on bo; there is on random, cma-es"):
+    with pytest.raises(ValueError, match="there is no evidence on bo; choose from random, cma-es"):
         choose(character(bowl), ["bo"])
 
 

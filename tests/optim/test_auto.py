@@ -48,7 +48,7 @@ def test_what_it_measures_are_the_points_of_the_advice_and_count() -> None:
     found = measure_character(WAVY, evaluations=MEASURED, seed=4)
     np.testing.assert_allclose(run.data["x"][:MEASURED], found.x, atol=1e-12)
     choice = advice.choose(found.character)
-    assert run.remark == f"auto took {choice.method}: {choice.reason}"
+    assert run.remark == f"auto chose {choice.method}: {choice.reason}"
     assert run.remark in repr(run)
 
 
@@ -105,16 +105,16 @@ def test_it_races_with_others_and_says_what_it_took(tmp_path: Path, monkeypatch:
         "branin", ["random", "auto"], budget=200, seeds=2, method_options={"auto": {"evaluations": MEASURED}},
         out=tmp_path / "race",
     )  # fmt: skip
-    assert [run.remark[:10] for run in found.runs["auto"]] == ["auto took "] * 2
+    assert [run.remark[:11] for run in found.runs["auto"]] == ["auto chose "] * 2
     assert not any(run.remark for run in found.runs["random"])
 
 
 def test_a_budget_is_refused_of_which_measures_are_more_than_a_tenth(tmp_path: Path) -> None:
-    said = "auto measures 50 episodes first, a tenth of the budget at most; got a budget of 300"
+    said = "auto first measures 50 episodes, at most a tenth of the budget; got a budget of 300"
     for call in (gs.optimize, lambda *given, **named: gs.race(given[0], [given[1]], **named)):
-        with pytest.raises(ValueError, match=f"{said}: take 500 or more, or --option evaluations=30"):
+        with pytest.raises(ValueError, match=f"{said}: use 500 or more, or --option evaluations=30"):
             call("branin", "auto", budget=300, out=tmp_path / "refused")
-    with pytest.raises(ValueError, match="got a budget of 40: take 500 or more, or name a method"):
+    with pytest.raises(ValueError, match="got a budget of 40: use 500 or more, or name a method"):
         gs.optimize(WAVY, "auto", budget=40)
     assert not (tmp_path / "refused").exists()
 
@@ -124,7 +124,7 @@ def test_where_every_episode_fails_it_still_searches() -> None:
     made = make_optimizer("auto", failing, options={"evaluations": MEASURED})
     run = search(failing, made, budget=30, gradient_cost=1.0).read()
     assert len(run.data["loss"]) == 30
-    assert run.remark.startswith("auto took ")
+    assert run.remark.startswith("auto chose ")
 
 
 def test_one_parameter_is_searched_by_a_method_that_can() -> None:

@@ -79,11 +79,11 @@ def test_a_method_whose_attributes_are_data_is_restored_without_more() -> None:
 def test_what_is_no_data_is_named() -> None:
     optimizer = told([Status.OK], [2.0])
     optimizer.z = slice(3)  # type: ignore[assignment]
-    with pytest.raises(TypeError, match="a state holds numbers, strings and arrays; got a slice"):
+    with pytest.raises(TypeError, match="a state can contain numbers, strings and arrays; got a slice"):
         restored(optimizer, Bowl())
 
 
 def test_a_state_puts_nothing_in_the_place_of_a_method() -> None:
     state = told([Status.OK], [2.0]).state()
-    with pytest.raises(ValueError, match="_ask is no attribute that recorder keeps"):
+    with pytest.raises(ValueError, match="_ask is no attribute in the state of recorder"):
         Recorder.from_state(Bowl(), state | {"own": {"_ask": 3}})

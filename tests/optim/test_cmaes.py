@@ -151,7 +151,7 @@ def test_where_the_library_draws_other_points_it_goes_on_with_those_of_the_run()
         one.tell(proposal.x, Evaluation.from_results(ellipsoid(proposal.x), None))
     state = one.state()
     state["own"]["points"] += 1e-9
-    with pytest.warns(RuntimeWarning, match="continues with the points and losses that the run holds"):
+    with pytest.warns(RuntimeWarning, match="continues with the points and losses of the run"):
         again = CMAES.from_state(objective(ellipsoid), state)
     assert again.strategy.best.f == one.strategy.best.f
     near = 3 * one.strategy.sigma  # not the same mean: points that were folded into the box are unfolded differently

@@ -146,7 +146,7 @@ def test_stopping_after_every_proposal_changes_no_bit(small, objective):
 
 
 def test_before_it_is_attached_there_is_nothing_to_play_in():
-    with pytest.raises(ValueError, match="attach it before the first ask"):
+    with pytest.raises(ValueError, match=r"call attach\(objective\) before the first ask"):
         SAC.on(Bowl()).ask()
 
 

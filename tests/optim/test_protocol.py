@@ -79,7 +79,7 @@ def test_a_seed_decides_every_point_bit_for_bit_through_its_state_too(name):
         ("cma-es", {"population": 2}, "population takes 0 or at least 3; got 2"),
         ("cma-es", {"sigma": 0.0}, "sigma takes numbers from 1e-09 to 1000"),
         ("bo-leap", {"best": 10}, "best takes 1 to 9 of a population of 10; got 10"),
-        ("turbo", {"shortest": 0.9}, "shortest takes less than the length 0.8; got 0.9"),
+        ("turbo", {"shortest": 0.9}, "shortest must be below the length 0.8; got 0.9"),
         ("bo", {"kernel": "cubic"}, "kernel takes rbf or matern; got cubic"),
     ],
 )
@@ -93,7 +93,7 @@ def test_options_that_cannot_work_are_refused(name, options, said):
     [
         ("cma-es", 1, "two parameters or more; this space has 1"),
         ("bo-leap", 1, "two parameters or more; this space has 1"),
-        ("bo-gradient", 50, "bo-gradient models slopes of 49 parameters at most; this space has 50"),
+        ("bo-gradient", 50, "bo-gradient models gradients in at most 49 parameters; this space has 50"),
     ],
 )
 def test_a_space_that_a_method_cannot_search_is_refused(name, dim, said):

@@ -150,7 +150,7 @@ def test_a_missing_row_is_damage_not_data(tmp_path: Path) -> None:
     run.save(lambda: {})
     (tmp_path / "run.zarr/status/c/1").unlink()
     with pytest.raises(
-        StoreError, match=f"rows {CHUNK + 1} to {2 * CHUNK} are not what was written; .* begin the run again"
+        StoreError, match=f"rows {CHUNK + 1} to {2 * CHUNK} differ from what was written; .* start the run again"
     ):
         RunStore.open(tmp_path / "run.zarr")
 
@@ -268,7 +268,7 @@ def test_the_budget_is_the_end_of_the_table(tmp_path: Path) -> None:
 
 def test_other_settings_are_refused_by_name_and_another_budget_is_not(tmp_path: Path) -> None:
     run_at(tmp_path / "run.zarr", budget=7)
-    with pytest.raises(StoreError, match=r"holds a run made by other settings \(seed: wanted 5, found 4\)"):
+    with pytest.raises(StoreError, match=r"contains a run made by other settings \(seed: wanted 5, found 4\)"):
         run_at(tmp_path / "run.zarr", seed=5)
     assert run_at(tmp_path / "run.zarr", budget=70).budget == 7
     wider = ParameterSpace(SPACE.names, SPACE.lower, torch.tensor([1.0, 4.0]), SPACE.units)
@@ -279,10 +279,10 @@ def test_other_settings_are_refused_by_name_and_another_budget_is_not(tmp_path: 
 def test_only_a_run_is_replaced(tmp_path: Path) -> None:
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine/thesis.txt").write_text("precious")
-    with pytest.raises(StoreError, match="is no run, so it is not replaced"):
+    with pytest.raises(StoreError, match="is not a run and is not replaced"):
         RunStore.open_or_create(tmp_path / "mine", SPACE, identity={}, budget=3, overwrite=True)
     assert not is_run(tmp_path / "mine")
-    with pytest.raises(StoreError, match="is no run of format 2"):
+    with pytest.raises(StoreError, match="is not a run of format 2"):
         RunStore.open(tmp_path / "mine")
     with pytest.raises(StoreError, match="make one with `landscape optimize`"):
         RunStore.open(tmp_path / "nothing")
@@ -299,12 +299,12 @@ def test_a_file_of_somebody_elses_in_a_run_is_not_lost_by_force(tmp_path: Path) 
     path = tmp_path / "run.zarr"
     run_at(path)
     (path / "x/thesis.txt").write_text("precious")
-    with pytest.raises(ValueError, match=r"holds files that are not of a run: x/thesis\.txt"):
+    with pytest.raises(ValueError, match=r"has files that do not belong to a run: x/thesis\.txt"):
         RunStore.open_or_create(path, SPACE, identity={}, budget=3, overwrite=True)
     assert (path / "x/thesis.txt").read_text() == "precious"
     (path / "x/thesis.txt").unlink()
     (path / "zarr.json").write_text("{")
-    with pytest.raises(StoreError, match=r"run\.zarr/zarr\.json is damaged: .*begin the run again in another"):
+    with pytest.raises(StoreError, match=r"run\.zarr/zarr\.json is damaged: .*start the run again in another"):
         RunStore.open(path)
     assert RunStore.open_or_create(path, SPACE, identity={}, budget=3, overwrite=True).budget == 3
 

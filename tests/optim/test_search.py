@@ -210,7 +210,7 @@ def test_a_method_is_known_by_its_name_and_not_exchanged(tmp_path: Path) -> None
     search(Pit(), "cma-es", named, budget=20)
     made = filled(tmp_path / "made.zarr", CMAES, budget=20)
     xr.testing.assert_identical(named.dataset().drop_vars("seconds"), made)
-    with pytest.raises(ValueError, match="holds a run of cma-es, not of random"):
+    with pytest.raises(ValueError, match="contains a run of cma-es, not of random"):
         search(Pit(), "random", named, budget=30)
     with pytest.raises(ValueError, match="no method is called 'cmaes'; did you mean cma-es"):
         search(Pit(), "cmaes", budget=3)
@@ -230,5 +230,5 @@ def test_an_optimiser_that_breaks_the_contract_is_named() -> None:
     objective = from_torch(lambda x: (x**2).sum(dim=1), SPACE)
     with pytest.raises(ValueError, match="random proposed no point"):
         search(objective, Idle(SPACE), budget=3)
-    with pytest.raises(ValueError, match="must say needs_grad = True"):
+    with pytest.raises(ValueError, match="must set needs_grad = True"):
         search(objective, Sly(SPACE), budget=3)

@@ -289,11 +289,11 @@ def test_a_record_is_read_as_it_was_written(tmp_path: Path) -> None:
     ("how", "said"),
     [
         ({"settings": ("speed",)}, "spring-of-test has settings dt, k; got speed"),
-        ({"pairs": ("dt",)}, "--pairs takes two settings as dt:box"),
+        ({"pairs": ("dt",)}, "--pairs takes two settings, such as dt:box"),
         ({"precisions": ["half"]}, "--precisions takes float32, float64; got half"),
         ({"width": 0.0}, "--width takes a share between 0 and 1"),
         ({"tolerance": -1.0}, "--tolerance takes a share of the losses' spread"),
-        ({"reference": "exact"}, "has fidelities standard, reference to be judged by; got 'exact'"),
+        ({"reference": "exact"}, "has fidelities standard, reference as its reference; got 'exact'"),
     ],
 )
 def test_what_cannot_be_is_refused(how: dict[str, Any], said: str, tmp_path: Path) -> None:

@@ -184,7 +184,7 @@ def test_what_is_far_slower_than_the_reference_is_given_up_at_its_first_points(
     rows = by_name(done.json)
     assert {name: row["given_up"] for name, row in rows.items() if row["given_up"]} == {"draft-float64": 1}
     assert rows["draft-float64"]["comparison"]["compared"] == 1
-    assert "given up, more than 3 times the reference's time: draft-float64 after 1 of 16 points" in done.stderr
+    assert "abandoned, at more than 3 times the reference's time: draft-float64 after 1 of 16 points" in done.stderr
 
 
 def test_the_reference_is_evaluated_once_for_studies_of_every_kind(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -201,10 +201,10 @@ def test_the_reference_is_evaluated_once_for_studies_of_every_kind(run: Run, mon
     first = run.json("study", "fidelity", *how, "a")
     evaluated.clear()
     done = run.ok("study", "convergence", *how, "b", "--settings", "precision")
-    assert "levels to measure, the reference by what is kept of it at 16 points" in done.stderr
+    assert "levels to measure, the reference from stored results at 16 points" in done.stderr
     assert sum(evaluated) == 2 * POINTS  # what the study is verified by, and what the kept points are
     monkeypatch.setattr(Converging, "_evaluate", lambda *x, grad: _double(simulate(*x, grad=grad)))
-    with pytest.warns(RuntimeWarning, match="losses are others now: .* it is evaluated again"):
+    with pytest.warns(RuntimeWarning, match="losses have changed: .* it is evaluated again"):
         renewed = run.json("study", "fidelity", *how, "c")
     assert renewed["spread"] == pytest.approx(2 * first["spread"])
 
@@ -276,7 +276,7 @@ def test_a_tolerance_takes_the_quickest_fidelity_within_it(run: Run, tmp_path: P
     wanted = min(within, key=lambda row: row["comparison"]["seconds"]["with_gradient"])
     assert len(report["variants"]) > len(within) > 1
     cut = run.ok(*CUT, "--tolerance", "2%", "--out", "cut")
-    assert f"{wanted['name']}: the quickest of" in cut.stderr
+    assert f"{wanted['name']}: the fastest of" in cut.stderr
     assert gradscape.open_slice(tmp_path / "cut").identity["settings"] == wanted["fidelity"]
     searched = run.json("optimize converging --device cpu --tolerance 2% --method random --budget 3")
     assert searched["fidelity"] == wanted["fidelity"]["name"]
@@ -294,7 +294,7 @@ def test_a_tolerance_that_nothing_meets_names_the_best(run: Run, tmp_path: Path)
     write_record(path, report)
     run.refuse(*CUT, "--tolerance", "1e-9", said="the best is standard-dt-x0.5")
     some = run.ok(*CUT, "--tolerance", "50%")
-    assert "warning: measured by converging model 0; this is model 1" in some.stderr
+    assert "warning: the errors were measured by converging model 0; this is model 1" in some.stderr
 
 
 def test_a_name_whose_settings_changed_since_is_not_chosen(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -324,7 +324,7 @@ def test_the_gallerys_variants_of_the_same_problem_are_found_where_nothing_of_th
     assert str(path) in done.stderr
     assert "softer: " not in done.stderr
     write_record(path, {**report, "identity": {**report["identity"], "options": {"ke": 1.0}}})
-    assert "no fidelities of converging with these options are measured" in run(*how).stderr
+    assert "no fidelity of converging with these options is measured" in run(*how).stderr
 
 
 def test_a_slice_at_a_measured_fidelity_can_be_cut_anew(run: Run, tmp_path: Path) -> None:
@@ -377,7 +377,7 @@ def test_seconds_are_those_of_the_device_that_will_run(
     likely = {name for name in within if work[name] <= 2 * min(work[other] for other in within)}
     assert set(timed) == likely
     assert 1 < len(timed) < len(within)  # what is dearer from the outset is not tried
-    assert "one alone on cpu, timed here" in done.stderr
+    assert "one at a time on cpu, timed here" in done.stderr
     timed.clear()
     assert run.json(*how, "--tolerance", "2%")["episodes"] == 0
     assert timed == []

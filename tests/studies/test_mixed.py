@@ -260,7 +260,7 @@ def test_what_cannot_be_is_refused(how: dict[str, Any], said: str, tmp_path: Pat
 
 
 def test_a_scene_without_the_names_is_refused() -> None:
-    with pytest.raises(ValueError, match="draft and standard beside their reference; branin has exact"):
+    with pytest.raises(ValueError, match="draft and standard besides their reference; branin has exact"):
         gs.study("mixed", "branin")
 
 

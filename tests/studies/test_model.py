@@ -88,8 +88,8 @@ def test_missing_parts_stand_apart_and_refused_ones_say_why(found: ModelRecord) 
     assert "gust" not in [part.name for part in found.present]
     why = {refused.name: refused.why for refused in found.refused}
     motor = why.pop("motor")
-    assert "points: RuntimeError: the engine gives up" in motor
-    assert why == {"tank": "parted needs its tank", "as it is": "the full model's options are those of 'wind' already"}
+    assert "points where it was tried: RuntimeError: the engine gives up" in motor
+    assert why == {"tank": "parted needs its tank", "as it is": "the full model already has the options of 'wind'"}
 
 
 def test_a_part_below_the_noise_moves_nothing(tmp_path: Path, found: ModelRecord) -> None:

@@ -122,5 +122,5 @@ def test_missing_parts_are_hollow_and_what_cannot_be_placed_is_on_the_edges() ->
     assert heights == pytest.approx([relative, low, 5 * relative, high])
     assert [float(line.get_xdata()[0]) for line in marks] == pytest.approx([5.0, 10.0, 15.0, 0.0])
     said = [text.get_text() for text in ax.figure.legends[0].get_texts()]
-    assert "hollow: missing, put in by the change" in said
+    assert "hollow: missing, added by the change" in said
     assert any(text.startswith("noise of the full model: ") for text in said)

@@ -63,7 +63,7 @@ def test_a_ripple_of_the_grid_is_the_floor_and_what_is_measured_stays(tmp_path: 
         assert one.cosine_low <= one.cosine.value
     first = "numerical floor 0.87 % of the range; gradients of replicas: cosine 1.000 (95 % intervals "
     assert found.sentences()[0].startswith(first)
-    assert found.sentences()[-1] == "7 of 64 points left out, where the scene or a replica fails"
+    assert found.sentences()[-1] == "7 of 64 points left out, because the scene or a replica fails there"
     assert list(found.table().index) == [one.name for one in found.replicas]
     assert to_json(from_json(SymmetryRecord, read_json(tmp_path / "study/symmetry.json"))) == to_json(found)
     before = Rippled.asked
@@ -79,8 +79,8 @@ def test_the_command_prints_each_replica_and_draws_them(run: Run, tmp_path: Path
     assert done.json["replicas"][1]["cosine"]["value"] == pytest.approx(1)
     assert done.json["replicas"][1]["spearman"]["value"] == pytest.approx(1)
     assert (tmp_path / "found/symmetry.png").read_bytes().startswith(b"\x89PNG")
-    for said in ("half as steep", "numerical floor", "farthest from the scene itself: lifted"):
+    for said in ("half as steep", "numerical floor", "largest difference from the scene itself: lifted"):
         assert said in done.stderr
     refused = run("study", "symmetry", "branin")
-    assert "branin has no replicas, which compute the same physics otherwise" in " ".join(refused.stderr.split())
+    assert "branin has no replicas, which compute the same physics differently" in " ".join(refused.stderr.split())
     assert "a function takes replicas={'other grid': fn}" in " ".join(refused.stderr.split())

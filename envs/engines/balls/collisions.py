@@ -1,7 +1,8 @@
-"""Discs in a plane that strike walls and each other at an instant, in torch: three ways to find when they touch.
+"""Discs in a plane with instantaneous impacts on walls and on each other, in torch: three ways to find touches.
 
-Gradients are autograd's. What they are worth depends on the time of touch: whole steps do not differentiate it at all,
-a correction of places does half of it (Hu et al. 2020, DiffTaichi), and an event found and differentiated does all.
+Gradients are autograd's. Their quality depends on the time of touch. Whole steps do not differentiate it at all, a
+correction of positions does half of it (Hu et al. 2020, DiffTaichi), and an event that is found and differentiated does
+all.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ SLOWEST = 1e-3  # closing speed that a time of touch is divided by [m/s], as Dif
 
 @dataclass(frozen=True)
 class Wall:
-    """A half-plane that discs stay out of: its normal, and how far from the origin it lies along that [m]."""
+    """A half-plane that discs cannot enter: its normal, and its distance from the origin along the normal [m]."""
 
     normal: tuple[float, float]
     offset: float
@@ -33,7 +34,7 @@ class Wall:
 
 @dataclass(frozen=True)
 class Table:
-    """Discs of one radius [m] and one mass among walls; `restitution` is that of every impact, and nothing rubs."""
+    """Discs of one radius [m] and one mass between walls, without friction; `restitution` is that of every impact."""
 
     radius: float
     restitution: float
@@ -43,7 +44,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Contact:
-    """Name the two that touch: a disc and a wall, or two discs of which the second is `other`."""
+    """The two bodies that touch: a disc and a wall, or two discs of which the second is `other`."""
 
     disc: int
     wall: Wall | None
@@ -74,7 +75,7 @@ class Contact:
 
 
 def contacts_of(table: Table) -> list[Contact]:
-    """Return all pairs that may touch."""
+    """Return all pairs that can touch."""
     walls = [Contact(disc, wall) for disc in range(table.discs) for wall in table.walls]
     return walls + [Contact(one, None, two) for one in range(table.discs) for two in range(one + 1, table.discs)]
 
@@ -82,9 +83,9 @@ def contacts_of(table: Table) -> list[Contact]:
 def run(
     table: Table, x: Places, v: Places, pushes: list[tuple[Places, float]], dt: float, contacts: Contacts
 ) -> Places:
-    """Return where discs are after each step, or of touch after each push, shape (frame, batch, disc, 2).
+    """Return the positions of discs after each step, or of touch after each push, shape (frame, batch, disc, 2).
 
-    `pushes` are accelerations [m/s^2], each held for a time [s].
+    `pushes` are accelerations [m/s^2], each with a duration [s].
     """
     frames = [x]
     for push, time in pushes:
@@ -102,7 +103,7 @@ def run(
 
 
 def step(table: Table, x: Places, v: Places, push: Places, dt: float, *, shift: bool) -> tuple[Places, Places]:
-    """Return places and velocities a step later; `shift` moves the places by what the time of touch adds to them."""
+    """Return positions and velocities a step later; `shift` corrects the positions by the time of touch."""
     ahead, kick, moved = x + dt * v, torch.zeros_like(v), torch.zeros_like(x)
     for one in contacts_of(table):
         gap, normal = one.gap(table, ahead)
@@ -122,7 +123,7 @@ def step(table: Table, x: Places, v: Places, push: Places, dt: float, *, shift: 
 
 
 def fly(table: Table, x: Places, v: Places, push: Places, time: float, dt: float) -> tuple[Places, Places]:
-    """Return places and velocities after a time under one acceleration; touches are looked for every `dt`."""
+    """Return positions and velocities after a time under one acceleration; touches are searched for every `dt`."""
     left, steps = x.new_full((len(x),), time), max(1, round(time / dt))
     pairs = contacts_of(table)
     for _ in range(TOUCHES):

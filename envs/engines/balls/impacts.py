@@ -855,7 +855,7 @@ class Flight:
 
 
 class Solver:
-    """Follow up to `capacity` balls for `steps` steps of `dt` [s], and differentiate where they end.
+    """Simulate up to `capacity` balls for `steps` steps of `dt` [s], and differentiate their final states.
 
     `contacts` is impact, as above, or step, as in `overlaps`. Every iteration is kept: it is only a few numbers.
     """

@@ -97,7 +97,7 @@ class Model:
         found = -1 if kind is None else mujoco.mj_name2id(self.host, kind, name)
         if found < 0:
             what = f"no {kind.name[6:].lower()} {name!r}" if kind else "no names"
-            raise ValueError(f"{self.name} has {what} to find {field} by; give a number, or a name that is there")
+            raise ValueError(f"{self.name} has {what} for {field}; give a number, or an existing name")
         return int(getattr(self.host, JOINTED[family])[found]) if family in JOINTED else found
 
     def identify(self, course: Course, *others: object) -> str:
@@ -130,8 +130,8 @@ class Model:
 def no_numbers(name: str, field: str) -> ValueError:
     """Return the error of a parameter that names no field of the model, or one that cannot vary."""
     return ValueError(
-        f"{name} has no numbers {field!r} to vary; MuJoCo's are qpos, qvel, ctrl, and of the model "
-        "body_mass, geom_friction, dof_damping and others"
+        f"{name} has no field {field!r} to vary; MuJoCo's fields are qpos, qvel, ctrl, and those of the model, such "
+        "as body_mass, geom_friction and dof_damping"
     )
 
 
@@ -145,4 +145,4 @@ def load(mjcf: str, name: str) -> Any:
             raise ValueError(f"there is no file {mjcf}")
         return mujoco.MjModel.from_xml_path(mjcf)
     except ValueError as error:
-        raise ValueError(f"{name} has a model that MuJoCo cannot read: {' '.join(str(error).split())}") from error
+        raise ValueError(f"MuJoCo cannot read the model of {name}: {' '.join(str(error).split())}") from error

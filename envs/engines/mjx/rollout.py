@@ -32,7 +32,7 @@ class Rollout:
                 self.model = mjx.put_model(model.host)
                 self.start = mjx.make_data(model.host)
         except NotImplementedError as error:
-            raise ValueError(f"{model.name} holds what MJX cannot simulate: {error}") from error
+            raise ValueError(f"MJX cannot simulate the model {model.name}: {error}") from error
         for place, _ in course.places:
             if place not in (*AT_FIRST, CONTROL) and not hasattr(self.model, place):
                 raise no_numbers(model.name, place)

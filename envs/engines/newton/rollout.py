@@ -1,7 +1,7 @@
-"""Episodes of Newton's models: speeds at first in, places at the end out, differentiated by Warp's tape.
+"""Episodes of Newton's models: initial velocities in, final positions out, differentiated by Warp's tape.
 
-A gradient is what the tape makes of the launches of Newton's own steps, of which nothing is changed. Left out is what
-would do nothing: a cloth's limp triangles, a free body's joint, the search for contacts with a plane.
+A gradient comes from the tape over the launches of Newton's own, unchanged steps. Parts without effect are left out: a
+cloth's limp triangles, a free body's joint, the search for contacts with a plane.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class Sphere:
 
 @dataclass(frozen=True)
 class Particle:
-    """A ball that does not turn: where it starts [m], its radius [m] and mass [kg]."""
+    """A ball that does not turn: its initial position [m], its radius [m] and mass [kg]."""
 
     place: tuple[float, float, float]
     radius: float
@@ -107,10 +107,10 @@ class Cloth:
 
 @dataclass(frozen=True)
 class Ground:
-    """How the plane y = 0, and the plane x = `wall` [m] where there is one, push back and rub.
+    """The contact of the plane y = 0, and of the plane x = `wall` [m] if there is one.
 
-    Stiffness `ke` [N/m], damping `kd` and viscous friction `kf` [N s/m], Coulomb's `mu`; xpbd has `restitution` in the
-    place of the first three.
+    Stiffness `ke` [N/m], damping `kd` and viscous friction `kf` [N s/m], Coulomb's `mu`; xpbd has `restitution` instead
+    of the first three.
     """
 
     ke: float
@@ -135,7 +135,7 @@ class Ground:
 
 @dataclass(frozen=True)
 class Settings:
-    """Say how an episode is simulated: time step [s], how many, gravity [m/s^2], Newton's solver, rows at once."""
+    """The settings of an episode: time step [s], number of steps, gravity [m/s^2], Newton's solver, rows at once."""
 
     dt: float
     steps: int
@@ -169,7 +169,7 @@ def touch(model: Any) -> Any:
 
 
 class Rollout:
-    """Hold a model with a world for each row, the states of an episode, and where its points are at the end."""
+    """A model with a world for each row, the states of an episode, and the final positions of its points."""
 
     def __init__(self, thing: Sphere | Particle | Cloth, ground: Ground | None, settings: Settings) -> None:
         self.settings = settings

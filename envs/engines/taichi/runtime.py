@@ -28,9 +28,9 @@ def start(device: str) -> Any:
     Fields must name their types and kernels cast their literals: a float that does neither is a float64.
     """
     if device not in ("cpu", "cuda"):
-        raise ValueError(f"Taichi runs here on cpu and cuda; got device {device!r}")
+        raise ValueError(f"Taichi runs on cpu and cuda; got device {device!r}")
     if _started and _started != [device]:
-        raise ValueError(f"Taichi runs on {_started[0]} in this process and on nothing else; use another for {device}")
+        raise ValueError(f"Taichi runs only on {_started[0]} in this process; start another process for {device}")
     if not _started:
         _init(device)
         torch.set_flush_denormal(False)  # Taichi sets it for the whole thread, and so for what others compute there

@@ -1,8 +1,8 @@
-"""Causes of wrong gradients: a file each, with the numbers that it is recognised by, what it says and what to try.
+"""Causes of wrong gradients: one file each, with its signature of numbers, its message and its remedy.
 
 A cause explains one kind of finding (`of`): wrong gradients, NaN, gradients that are always 0, slopes that cannot be
-judged, or calls that depend on each other. The first by `order` of which one signature holds is the cause; a signature
-holds where each of its numbers lies in one of the intervals given.
+judged, or calls that depend on each other. The cause is the first by `order` with a matching signature. A signature
+matches if each of its numbers is in one of its intervals.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ Intervals = list[list[float]]
 
 @dataclass(frozen=True)
 class Signature:
-    """Intervals of numbers that a cause is recognised by, how certain it then is, and whether it fails or warns."""
+    """Intervals of numbers that identify a cause, its certainty, and whether it fails or warns."""
 
     certainty: Certainty
     outcome: str
     numbers: Mapping[str, Intervals]
 
     def holds(self, evidence: Mapping[str, float]) -> bool:
-        """Say whether all its numbers are known and lie in their intervals."""
+        """Return whether all its numbers are known and inside their intervals."""
         return all(
             name in evidence and any(low <= evidence[name] <= high for low, high in intervals)
             for name, intervals in self.numbers.items()
@@ -38,7 +38,7 @@ class Signature:
 
 @dataclass(frozen=True)
 class Cause:
-    """A cause as its file has it."""
+    """A cause, as in its file."""
 
     name: str
     of: str
@@ -64,7 +64,7 @@ def causes() -> tuple[Cause, ...]:
 
 
 def recognise(of: str, evidence: Mapping[str, float]) -> tuple[Cause, Signature] | None:
-    """Return the cause of a kind of finding by its numbers, and the signature that holds; None where none does."""
+    """Return the cause of a kind of finding from its numbers, and the matching signature; None without a match."""
     for cause in causes():
         if cause.of == of:
             for signature in cause.signatures:

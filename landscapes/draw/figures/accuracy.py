@@ -1,4 +1,4 @@
-"""Accuracy against time: variants of settings with their Pareto front, and what each part of a model is for."""
+"""Accuracy against time: variants of settings with their Pareto front, and the contribution of each model part."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ Ends = tuple[float, float]
 
 @dataclass(frozen=True, eq=False)
 class _Mark:
-    """A variant or a part of a model: where it stands, which look it has, and the ends of its intervals, if any."""
+    """The mark of a variant or a model part: its position, its look, and the ends of its intervals, if any."""
 
     name: str
     said: str
@@ -50,7 +50,7 @@ class _Mark:
 def _draw_named(
     width: float | None, marks: Sequence[_Mark], draw: Callable[[Axes], None], *, columns: int
 ) -> page.Picture:
-    """Return a picture of one panel, drawn again until each name has room in it or in the legend, by its number."""
+    """Return a picture of one panel, drawn again until each name fits in it or, by number, in the legend."""
     sheet = style.Sheet.of(width, pitch=PITCH)
     keyed: list[_Mark] = []
     while True:
@@ -68,9 +68,9 @@ def _draw_named(
 
 
 def _name(ax: Axes, keyed: Sequence[_Mark], others: Sequence[_Mark]) -> list[_Mark]:
-    """Write the numbers of some marks, then the names of others, and return those that have no room.
+    """Write the numbers of some marks and the names of others, and return the marks whose name does not fit.
 
-    What is written covers no mark, no front and, if that can be, no other line.
+    The texts cover no mark, no front and, if possible, no other line.
     """
     sheet, marks = page.sheet_of(ax), [*keyed, *others]
     labels = [page.Label(str(number), mark.at) for number, mark in enumerate(keyed, start=1)]
@@ -84,7 +84,7 @@ def _name(ax: Axes, keyed: Sequence[_Mark], others: Sequence[_Mark]) -> list[_Ma
 
 
 def _along(ax: Axes, line: Line2D) -> NDArray[np.float64]:
-    """Return the marks of a line, or points along it, as it is drawn: in steps, or across the whole panel [data]."""
+    """Return points along a line as it is drawn, in steps or across the whole panel [data]."""
     points = np.asarray(line.get_xydata(), dtype=float)
     if line.get_linestyle() == "None" or not len(points):
         return points
@@ -95,7 +95,7 @@ def _along(ax: Axes, line: Line2D) -> NDArray[np.float64]:
 
 
 def _draw_marks(ax: Axes, marks: Iterable[_Mark], label: str, gid: str) -> None:
-    """Draw marks that look the same, with their intervals."""
+    """Draw marks with the same look, and their intervals."""
     drawn, sheet = list(marks), page.sheet_of(ax)
     for mark in drawn:
         x, y = mark.at
@@ -108,7 +108,7 @@ def _draw_marks(ax: Axes, marks: Iterable[_Mark], label: str, gid: str) -> None:
 
 
 def _write_head(ax: Axes, record: FidelityRecord | ModelRecord, title: str, y: str) -> None:
-    """Write the title, how the record was made, what stands up the panel's side, and what the thin lines are."""
+    """Write the title, how the record was made, the label of the vertical axis, and the meaning of thin lines."""
     page.interval(ax, [], [])
     page.entitle(page.picture_of(ax), title)
     spread = [] if record.spread is None else [f"spread {style.number(record.spread)} {record.loss_unit}".rstrip()]
@@ -125,7 +125,7 @@ def _percentile(found: Any, record: FidelityRecord | ModelRecord) -> Bootstrap:
 
 
 def _height(found: Bootstrap, low: float, high: float) -> tuple[float, Ends | None]:
-    """Return where a percentile stands between both edges, the upper if it is infinite, and its interval's ends."""
+    """Return the height of a percentile within both edges, the upper one if it is infinite, and its interval."""
     if found.value is None:
         return high, None
     ends = (found.low or low, high if found.high is None else found.high)
@@ -133,7 +133,7 @@ def _height(found: Bootstrap, low: float, high: float) -> tuple[float, Ends | No
 
 
 def mixed_figure(record: MixedRecord, *, width: float | None = None) -> page.Picture:
-    """Draw all variants of a search as `fidelity_figure` does, those of today's names and the chosen ones marked."""
+    """Draw all variants of a search like `fidelity_figure`, with marks for the present and the chosen ones."""
     return fidelity_figure(record.measured, width=width, chosen=record.chosen)
 
 
@@ -142,14 +142,14 @@ def fidelity_figure(
 ) -> page.Picture:
     """Draw the 95th percentile of each variant's loss errors, with its interval, over the time of an episode.
 
-    The reference is a line at its time: its own error is zero by definition. Variants without a finite percentile are
-    on the upper edge and counted in the legend; those without any error are on the lower edge, and those given up
-    nowhere. The mark of a variant says which option was changed, its name from which fidelity and to what. Where there
-    is little room a line leads to the name, or the name is in the legend, by number. Of mixed variants only those on
-    the front have names, and those that are `chosen`, by the names of fidelities that should be theirs: these have a
-    ring.
+    The reference is a line at its time, because its own error is zero by definition. Variants without a finite
+    percentile are on the upper edge and counted in the legend. Those without any error are on the lower edge, and those
+    given up are not drawn. The mark of a variant says which option was changed, and its name says from which fidelity
+    and to what. Where space is short, a line leads to the name, or the legend has it by number. Of mixed variants, only
+    those on the front and the `chosen` ones have names. A chosen variant has a ring; its key in `chosen` is the
+    fidelity that should have its settings.
 
-    Raises ValueError where the page is too narrow or too wide.
+    Raises ValueError if the page is too narrow or too wide.
     """
     chosen, reference = chosen or {}, record.variant(record.reference)
     factor, unit = (1.0, "s") if reference.seconds >= 2.0 else (1e3, "ms")
@@ -182,7 +182,7 @@ def fidelity_figure(
 def _draw_variants(
     ax: Axes, record: FidelityRecord, marks: Mapping[str, _Mark], chosen: Mapping[str, str], end: Ends
 ) -> None:
-    """Draw variants by what was changed, rings around the chosen, and the front, from its least time to its `end`."""
+    """Draw variants by changed option, rings around the chosen ones, and the front from its shortest time to `end`."""
     sheet = page.sheet_of(ax)
     if record.front:  # the least error that is to be had for at most so much time
         x, y = zip(*(marks[name].at for name in record.front), end, strict=True)
@@ -198,7 +198,7 @@ def _draw_variants(
 
 
 def short_name(row: MeasuredVariant) -> str:
-    """Return a variant's name without what its mark says: of standard-dt-x0.5, standard \N{MULTIPLICATION SIGN}0.5."""
+    """Return a variant's name without what its mark shows: standard-dt-x0.5 is standard \N{MULTIPLICATION SIGN}0.5."""
     base, *turned = row.name.replace(" on ", "-").split("-")
     if row.changed in ("named", "mixed") or not turned:
         return row.name
@@ -206,13 +206,13 @@ def short_name(row: MeasuredVariant) -> str:
 
 
 def model_figure(study: ModelRecord, *, width: float | None = None) -> page.Picture:
-    """Draw how far changing each part moves losses, the 95th percentile, over the time of an episode that it saves.
+    """Draw the change of the loss, 95th percentile, against the time saved, for each changed part of a model.
 
-    Both have their intervals. A part that the full model has is a filled mark; one that is missing, which its options
-    put in, a hollow one. What moves no loss is on the lower edge, what fails too often on the upper. Where there is
-    little room a line leads to the name, or the name is in the legend, by number.
+    Both have their intervals. A part of the full model is a filled mark. A missing part, which its options add, is a
+    hollow one. Parts that change no loss are on the lower edge, and those that fail too often are on the upper edge.
+    Where space is short, a line leads to the name, or the legend has it by number.
 
-    Raises ValueError where the page is too narrow or too wide.
+    Raises ValueError if the page is too narrow or too wide.
     """
     found = [_percentile(part.comparison, study) for part in study.parts]
     noise = _noise(study)
@@ -236,24 +236,24 @@ def model_figure(study: ModelRecord, *, width: float | None = None) -> page.Pict
             said = f"noise of the full model: {style.number(noise, '.2g')}{unit}"
             ax.axhline(noise, **sheet.look(style.NOISE_LINE), label=said)
         page.name_axes(ax, "time saved by the change [% of an episode with gradient]")
-        title = f"{study.env} · what each part of the model is for · {study.fidelity}, {study.points} points"
+        title = f"{study.env} · what each part of the model contributes · {study.fidelity}, {study.points} points"
         _write_head(ax, study, title, "change of the loss")
 
     return _draw_named(width, marks, draw, columns=2)
 
 
 def _sign_effects(ax: Axes, study: ModelRecord) -> None:
-    """Put the effects that occur into the legend, in their order."""
+    """Put the effects that occur into the legend, in order."""
     looks = {effect: look for effect, look in style.EFFECTS.items() if any(p.effect == effect for p in study.parts)}
     if study.missing:
         hollow = {"marker": "o", "markeredgecolor": style.INK} | style.MISSING_MARK
-        looks["hollow: missing, put in by the change"] = hollow
+        looks["hollow: missing, added by the change"] = hollow
     for label, look in looks.items():
         ax.plot([], [], **page.sheet_of(ax).look(style.VARIANT_MARK | look), label=label)
 
 
 def _part_mark(part: MeasuredPart, found: Bootstrap, low: float, high: float) -> _Mark:
-    """Return the mark of a part over the time that changing it saves [%]."""
+    """Return the mark of a part at the time that its change saves [%]."""
     ratios = (part.cost.value, part.cost.high, part.cost.low)
     saved, *ends = (np.nan if ratio is None else 100 * (1 - ratio) for ratio in ratios)
     y, up = _height(found, low, high)
@@ -264,7 +264,7 @@ def _part_mark(part: MeasuredPart, found: Bootstrap, low: float, high: float) ->
 
 
 def _noise(study: ModelRecord) -> float | None:
-    """Return the noise of the full model as the errors are measured, None where it fails too often to have one."""
+    """Return the noise of the full model in the unit of the errors, or None if it fails too often."""
     value = _percentile(study.noise.comparison, study).value
     digit = 100 * study.noise.digit / study.spread if study.spread else study.noise.digit
     return None if value is None else max(value, digit)

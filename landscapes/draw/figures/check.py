@@ -1,4 +1,4 @@
-"""How far gradients hold: against what losses do over steps of many lengths, and what kinds of points there are."""
+"""How far gradients predict the loss, over steps of many lengths, and the numbers of points of each kind."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ NAMED = 3  # parameters, at most
 NOTHING = "no slope to compare:\nlosses are flat,\nlost in noise, or failed"
 LABELS = {
     "cosine": "cosine of gradients and differences over the step",
-    "sign": "share of slopes whose sign is right",
+    "sign": "share of slopes with the right sign",
     "smoothed": "mean gradient within the step, as a share of the slope of the smoothed loss (1: unbiased)",
 }
 
@@ -44,10 +44,10 @@ LABELS = {
 def check_figure(found: CheckReport, *, width: float | None = None) -> page.Picture:
     """Draw cosine, signs and bias of gradients over the length of a step, with 95 % intervals, and kinds of points.
 
-    All three are 1 where a gradient foretells what the loss does. Where too few changes are clear of the noise the
-    ground is grey. What optimisers step at first is dotted.
+    All three are 1 where a gradient predicts the change of the loss. The background is grey where too few changes are
+    above the noise. Dotted lines are the first steps of optimisers.
 
-    Raises ValueError where the page is too narrow or too wide.
+    Raises ValueError if the page is too narrow or too wide.
     """
     pair = width is None or width >= NARROWEST_PAIR
     sheet = style.Sheet.of(width, pitch=PITCH)
@@ -70,10 +70,10 @@ def check_figure(found: CheckReport, *, width: float | None = None) -> page.Pict
 
 
 def _verdict(found: CheckReport) -> str:
-    """Say in a sentence what the check says of gradients, with its interval."""
+    """Return the verdict of the check on gradients in a sentence, with its interval."""
     share, ends = found.share, "check passes" if found.passed else "check fails"
     if share is None:
-        return f"{ends}: there is no gradient to compare"
+        return f"{ends}: no gradient to compare"
     if not share.judged:
         return f"{ends}: none of {share.points} points could be judged"
     though = "" if found.passed or share.wrong else ", though"
@@ -82,7 +82,7 @@ def _verdict(found: CheckReport) -> str:
 
 
 def _causes(found: CheckReport) -> str:
-    """Name the causes, by which parameters and where; of a gradient that is right, say what may have been missed."""
+    """Name the causes with their parameters and regions; for right gradients, say what the check may have missed."""
     said = []
     for one in found.diagnoses:
         more = " and others" if len(one.parameters) > NAMED else ""
@@ -95,7 +95,7 @@ def _causes(found: CheckReport) -> str:
 
 
 def _curve(name: str, curve: Sequence[Usefulness]) -> tuple[page.Grid, page.Grid]:
-    """Return steps and the cosine or the sign at each, as `page.ends_of` has them, NaN where none is compared."""
+    """Return steps and the cosine or sign at each, in the form of `page.ends_of`, NaN where none is compared."""
     known = {one.step: getattr(one, name) for one in curve if one.compared}
     steps = sorted({*known, *(step for step in STEPS if SHORTEST <= step <= LONGEST)})
     ends = page.ends_of(known.get(step, UNKNOWN) for step in steps)
@@ -103,7 +103,7 @@ def _curve(name: str, curve: Sequence[Usefulness]) -> tuple[page.Grid, page.Grid
 
 
 def _draw_curves(ax: Axes, curve: Sequence[Usefulness]) -> list[Artist | str]:
-    """Draw all curves; return what else the legend has."""
+    """Draw all curves, and return further entries of the legend."""
     page.dress(ax)
     ax.set_xlim(SHORTEST / REACH, LONGEST * REACH)
     (steps, cosine), (_, sign) = (_curve(name, curve) for name in ("cosine", "sign"))
@@ -132,7 +132,7 @@ def _draw_curves(ax: Axes, curve: Sequence[Usefulness]) -> list[Artist | str]:
 
 
 def _draw_curve(ax: Axes, name: str, steps: page.Grid, ends: page.Grid) -> None:
-    """Draw a curve with its band, which break where nothing could be compared; a point alone has a line."""
+    """Draw a curve with its band; both break where nothing could be compared, and a single point has a bar."""
     look, (value, low, high) = style.CHECKED[name], ends.T
     known = np.isfinite(value)
     if not known.any():
@@ -146,7 +146,7 @@ def _draw_curve(ax: Axes, name: str, steps: page.Grid, ends: page.Grid) -> None:
 
 
 def _draw_smoothed(ax: Axes, steps: Sequence[float], kept: page.Grid) -> None:
-    """Draw what means of gradients have of the smoothed slope; an arrow says that it goes on beyond the panel."""
+    """Draw mean gradients as a share of the smoothed slope; an arrow marks values beyond the panel."""
     look, (low, high) = page.sheet_of(ax).look(style.CHECKED["smoothed"]), ax.get_ylim()
     line = look | {"marker": "", "linestyle": "solid"}
     beyond = []
@@ -166,16 +166,16 @@ def _draw_smoothed(ax: Axes, steps: Sequence[float], kept: page.Grid) -> None:
 
 
 def _draw_gaps(ax: Axes, steps: page.Grid, lost: NDArray[np.bool_]) -> None:
-    """Shade the steps over which too few changes are clear of the noise, halfway to their neighbours."""
+    """Shade the steps with too few changes above the noise, halfway to their neighbours."""
     low, high = ax.get_xlim()
     edges = [low, *np.sqrt(steps[1:] * steps[:-1]), high]
-    label = "too few changes of the loss are clear of its noise"
+    label = "too few changes of the loss above its noise"
     for start, end in np.array(list(pairwise(edges)))[lost]:
         ax.axvspan(start, end, **style.NO_SLOPE, zorder=0, gid="gap", label=label)
 
 
 def _draw_levels(ax: Axes) -> None:
-    """Draw where a gradient is right, and where it says nothing."""
+    """Draw the levels of a right gradient and of one without information."""
     look = page.sheet_of(ax).look(style.REFERENCE_LINE)
     ax.axhline(1.0, **look)
     ax.axhline(0.0, **look | {"linestyle": "solid", "color": style.FAINT})
@@ -185,7 +185,7 @@ def _draw_steps(ax: Axes) -> None:
     sheet = page.sheet_of(ax)
     look = sheet.look(style.STEP_LINE)
     for name, step in OPTIMISER_STEPS.items():
-        ax.axvline(step, **look, gid="optimiser", label="first step of an optimiser (at most, of gradient descent)")
+        ax.axvline(step, **look, gid="optimiser", label="first step of an optimiser (for gradient descent: at most)")
         ax.annotate(
             name, (step, 0.0), (-4 * sheet.type, 4 * sheet.type), xycoords=("data", "axes fraction"),
             textcoords="offset points", rotation=90, size=sheet.small, ha="right", va="bottom", **style.NAME_TEXT,
@@ -193,7 +193,7 @@ def _draw_steps(ax: Axes) -> None:
 
 
 def _draw_kinds(ax: Axes, kinds: Mapping[Kind, int]) -> None:
-    """Draw a bar for each kind of points, with their number."""
+    """Draw a bar for each kind of point, with its number."""
     page.dress(ax)
     sheet, total = page.sheet_of(ax), sum(kinds.values())
     for row, kind in enumerate(Kind):

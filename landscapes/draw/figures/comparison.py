@@ -1,4 +1,4 @@
-"""Two slices of one plane: both losses on one scale, their difference, and how their gradients agree (matplotlib)."""
+"""Two slices of one plane: both losses on one scale, and the differences of losses and gradients (matplotlib)."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ IN_EITHER = " in A or B"
 def comparison_figure(found: SliceComparison, *, width: float | None = None) -> page.Picture:
     """Draw the losses of both slices on one scale, their difference, and the cosine of their gradients.
 
-    Each cell, or point of a line, is a sample of both; nothing is interpolated. The scale of differences is the same
-    to both sides of zero. Where a sample failed in one of the slices, what is drawn of both is hatched. Over a line
-    the gradients themselves are drawn, as their cosine is but a sign.
+    Each cell, or point of a line, is a sample of both slices; nothing is interpolated. The scale of differences is
+    symmetric about zero. Panels of both slices are hatched where a sample failed in one of them. For a line the figure
+    shows the gradients themselves, because their cosine is only a sign.
 
-    Raises ValueError where the page is too narrow or too wide.
+    Raises ValueError if the page is too narrow or too wide.
     """
     draw = _draw_maps if plane_of(found.data[0]).rank == 2 else _draw_lines
     picture = draw(found, width)
@@ -79,7 +79,7 @@ def _difference_map(ax: Axes, found: SliceComparison) -> None:
 
 
 def _in_powers(found: SliceComparison) -> tuple[NDArray[np.float64], str]:
-    """Return the differences of losses, and of which power of ten if they are far from 1."""
+    """Return the differences of losses, with a common power of ten if they are far from 1."""
     values = found.difference.to_numpy()
     most = found.loss.largest.value
     exponent = math.floor(math.log10(most)) if most > 0 else 0
@@ -89,7 +89,7 @@ def _in_powers(found: SliceComparison) -> tuple[NDArray[np.float64], str]:
 
 
 def _name(what: str, power: str, unit: str) -> str:
-    """Return what stands along an axis, with the power of ten and the unit of its numbers."""
+    """Return the label of an axis, with the power of ten and the unit of its numbers."""
     return labelled(what, f"{power} {unit}".strip())
 
 
@@ -105,7 +105,7 @@ def _farthest(ax: Axes, found: SliceComparison) -> None:
         return
     look, apart = page.sheet_of(ax).look(style.FARTHEST), found.parting.b - found.parting.a
     at = ([one] for one in found.parting.place.values())
-    ax.plot(*at, **look, zorder=4, label=f"farthest apart, B \N{MINUS SIGN} A: {style.number(apart)}")
+    ax.plot(*at, **look, zorder=4, label=f"largest difference, B \N{MINUS SIGN} A: {style.number(apart)}")
 
 
 def _draw_lines(found: SliceComparison, width: float | None) -> page.Picture:
@@ -137,14 +137,14 @@ def _curves(ax: Axes, found: SliceComparison, values: list[Any]) -> None:
 
 
 def _where_either_failed(found: SliceComparison) -> xr.Dataset:
-    """Return slice A with the status of B where A has a loss: what is hatched in a panel of both."""
+    """Return slice A with the status of B where A has a loss, for the hatching in a panel of both."""
     ours, theirs = (one["status"] for one in found.data)
     return found.data[0].assign(status=ours.copy(data=np.where(has_loss(ours), theirs, ours)))
 
 
 def _say(found: SliceComparison) -> list[str]:
     if not found.compared:
-        return ["no point has a loss in both"]
+        return ["no point has a loss in both slices"]
     percent = style.number(100 * found.loss.shares["median"].value, ".2g")
     unit = f" {found.loss_unit}" if found.loss_unit else ""
     said = [f"median difference: {style.number(found.loss.median.value)}{unit}, {percent} % of A's range"]

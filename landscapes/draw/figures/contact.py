@@ -1,4 +1,4 @@
-"""An episode's contact sheet: key frames with their times, a scale, and what the episode is (matplotlib)."""
+"""An episode's contact sheet: key frames with their times, a scale, and a caption (matplotlib)."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ CORNER = (0.05, 0.06)  # of the scale's bar, in shares of the frame
 
 @dataclass(frozen=True)
 class Caption:
-    """Say what an episode is: what was simulated, what came out, where its parameters are from and what they are.
+    """The caption of an episode: what was simulated, the outcome, and its parameters with their source.
 
-    `values` maps a parameter's name to its value with its unit; `kept` is where all of them are, for those that have no
-    room.
+    `values` maps a parameter's name to its value with unit. `kept` is a file with all of them, for those that do not
+    fit.
     """
 
     title: str = ""
@@ -38,7 +38,7 @@ class Caption:
     provenance: str = ""
 
     def parameters(self, shown: int) -> str:
-        """Write so many of the parameters, and how many there are."""
+        """Write the first parameters, and the number of all."""
         said = ", ".join(f"{name} = {value}" for name, value in [*self.values.items()][:shown])
         rest = f", …; see {self.kept}" if shown < len(self.values) and self.kept else ", …" * (shown < len(self.values))
         count = f"{len(self.values)} parameter{'' if len(self.values) == 1 else 's'}"
@@ -46,9 +46,9 @@ class Caption:
 
 
 def save_sheet(episode: Episode, path: str | Path, *, caption: Caption | None = None, keys: int = KEYS) -> None:
-    """Write key frames side by side as PNG, PDF or SVG, by the file's ending.
+    """Write key frames side by side as PNG, PDF or SVG, by the ending of the file name.
 
-    Raises ValueError where the episode has no `parts`, or the ending is no picture's.
+    Raises ValueError if the episode has no `parts`, or for any other ending.
     """
     page.save(episode_figure(episode, caption=caption, keys=keys), path)
 
@@ -56,11 +56,11 @@ def save_sheet(episode: Episode, path: str | Path, *, caption: Caption | None = 
 def episode_figure(
     episode: Episode, *, caption: Caption | None = None, keys: int = KEYS, width: float | None = None
 ) -> page.Picture:
-    """Draw evenly spaced frames, first and last among them, each over its time; then a target of particles.
+    """Draw evenly spaced frames, including first and last, each over its time, and then a target of particles.
 
-    The first has a scale. It is right at the middle of the view: what is nearer to the eye is larger.
+    The first frame has a scale. It is exact at the middle of the view; nearer objects look larger.
 
-    Raises ValueError where the episode has no `parts`, or the page is too narrow or too wide.
+    Raises ValueError if the episode has no `parts`, or if the page is too narrow or too wide.
     """
     chosen, caption = replay.pick_frames(episode, keys), caption or Caption()
     shown = [*replay.frames(episode, chosen, marked=False)]
@@ -78,7 +78,7 @@ def episode_figure(
         page.name_axes(ax, text)
     shot = replay.Shot.of(episode.viewpoint(), replay.HEIGHT)
     _draw_scale(picture.axes[0], shot)
-    _write(picture, caption, f"Scale: {style.number(shot.bar)} m at the middle of the view; what is nearer is larger.")
+    _write(picture, caption, f"Scale: {style.number(shot.bar)} m at the middle of the view; nearer parts look larger.")
     page.finish(picture)
     return picture
 
@@ -97,7 +97,7 @@ def _draw_scale(ax: Axes, shot: replay.Shot) -> None:
 
 
 def _write(picture: page.Picture, caption: Caption, scale: str) -> None:
-    """Write title and outcome over the frames; parameters, as many as two lines hold, and provenance under them."""
+    """Write title and outcome over the frames, and under them up to two lines of parameters and the provenance."""
     sheet = picture.sheet
     room = sheet.width - 2 * page.MARGIN
     if over := " · ".join(filter(None, (caption.title, caption.outcome))):
@@ -108,7 +108,7 @@ def _write(picture: page.Picture, caption: Caption, scale: str) -> None:
 
 
 def _fit_parameters(caption: Caption, room: float, size: float) -> str:
-    """Return the parameters, shortened to what two lines hold."""
+    """Return the parameters, shortened to two lines."""
     counts: Sequence[int] = range(len(caption.values), 0, -1)
     said = (caption.parameters(shown) for shown in counts)
     whole = (text for text in said if not page.wrap_text(text, room, size).endswith(page.MORE))

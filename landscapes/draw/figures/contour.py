@@ -35,15 +35,13 @@ def landscape_figure(
     """Draw a slice of rank 2: the loss as colours above, its negated gradients as arrows below, or next to it.
 
     Each cell is one sample, or for a coarse or a refined slice the part of the box nearest to it; nothing is
-    interpolated. All
-    arrows are equally long and point down the steepest slope of the picture as it is seen, its axes scaled to the same
-    length; their colour is the magnitude of the gradient along the plane. Failures are hatched and counted, and
-    among the arrows samples with a loss and no gradient are dotted. Over a slice along a training lies its path.
-    `floor` is the map of the slice's numerical floor,
-    a panel of its own. `width` is that of a page for print [mm]; as for every picture, without it the picture is as
-    large as suits a screen.
+    interpolated. All arrows have the same length and point along steepest descent in the picture as it is seen, with
+    axes scaled to the same length. Their colour is the magnitude of the gradient along the plane. Failures are hatched
+    and counted. In the panel of arrows, samples with a loss and no gradient are dotted. A slice along a training shows
+    its path. `floor` is the map of the slice's numerical floor, in its own panel. `width` is that of a page for print
+    [mm]. Without it, as for every picture, the size suits a screen.
 
-    Raises ValueError where the slice is a line, or the page too narrow or too wide.
+    Raises ValueError if the slice is a line, or if the page is too narrow or too wide.
     """
     plane = plane_of(dataset)
     if plane.rank != 2:
@@ -66,7 +64,7 @@ def landscape_figure(
 
 
 def frame(ax: Axes, dataset: xr.Dataset, plane: Plane, within: str | None = "") -> None:
-    """Give a panel limits, ticks and its failures, which the legend counts, `within` it, unless that is None."""
+    """Give a panel limits, ticks and failures; the legend counts failures with the text `within`, unless it is None."""
     if plane.rank == 2:
         ax.set(xlim=_limits(plane, 0), ylim=_limits(plane, 1), box_aspect=1)
         page.name_axes(ax, y=plane.labels[1])
@@ -78,7 +76,7 @@ def frame(ax: Axes, dataset: xr.Dataset, plane: Plane, within: str | None = "") 
 
 
 def shade(ax: Axes, dataset: xr.Dataset, kind: Status, label: str | None) -> None:
-    """Shade the cells, or over a line the stretches, of the samples that ended in one way."""
+    """Shade the cells, or the stretches of a line, whose samples have one status."""
     where = own_cells(dataset)["status"].to_numpy() == kind
     if not where.any():
         return
@@ -91,7 +89,7 @@ def shade(ax: Axes, dataset: xr.Dataset, kind: Status, label: str | None) -> Non
 
 
 def cells_patch(u: Grid, v: Grid, where: NDArray[np.bool_], **look: Any) -> PathPatch:
-    """Return the outlines of the chosen cells as one patch: hatching it costs as much as hatching one cell."""
+    """Return the outlines of the chosen cells as one patch, which is as cheap to hatch as one cell."""
     corners = [
         [(u[column], v[row]), (u[column + 1], v[row]), (u[column + 1], v[row + 1]), (u[column], v[row + 1])]
         for row, column in np.argwhere(where)
@@ -101,13 +99,13 @@ def cells_patch(u: Grid, v: Grid, where: NDArray[np.bool_], **look: Any) -> Path
 
 
 def loss_panel(ax: Axes, dataset: xr.Dataset, scale: style.Scale | None = None) -> None:
-    """Draw the loss map and its lowest sample, on the slice's own scale unless given."""
+    """Draw the loss map and its lowest sample, by default on the slice's own scale."""
     loss_map(ax, dataset, scale or style.Scale.of_loss(dataset["loss"].to_numpy()))
     lowest_sample(ax, dataset)
 
 
 def lowest_sample(ax: Axes, dataset: xr.Dataset, said: str = "lowest sample") -> None:
-    """Mark the lowest sample on a map or a line, with what is said of it."""
+    """Mark the lowest sample on a map or a line, with a label."""
     loss = dataset["loss"].to_numpy()
     if not np.isfinite(loss).any():
         return
@@ -122,20 +120,20 @@ def lowest_sample(ax: Axes, dataset: xr.Dataset, said: str = "lowest sample") ->
 
 
 def loss_map(ax: Axes, dataset: xr.Dataset, scale: style.Scale) -> None:
-    """Draw every sample's loss as the colour of its cell, with the colour bar; of a refined slice cells differ."""
+    """Draw every sample's loss as the colour of its cell, with a colour bar; a refined slice has unequal cells."""
     mesh = cell_map(ax, dataset, own_cells(dataset)["loss"].to_numpy(), scale, style.LOSS_MAP)
     page.colour_bar(ax, mesh, page.loss_name(dataset), scale)
 
 
 def cell_map(ax: Axes, dataset: xr.Dataset, values: Grid, scale: style.Scale, colours: Colormap) -> QuadMesh:
-    """Draw a value for each sample of a slice, shape (v, u), as the colour of its cell, none where it is not finite."""
+    """Draw a value for each sample, shape (v, u), as the colour of its cell, where it is finite."""
     return ax.pcolormesh(
         *cell_edges(dataset), np.ma.masked_invalid(values), cmap=colours, norm=scale.norm, rasterized=True
     )
 
 
 def floor_panel(ax: Axes, dataset: xr.Dataset, floor: xr.Dataset) -> None:
-    """Draw the standard deviation between replicas at every sample; hatched are those that have none in a replica."""
+    """Draw the standard deviation between replicas at every sample; hatch samples without a loss in a replica."""
     unit = unit_of(dataset["loss"].to_numpy())
     deviation = floor["deviation"].transpose("v", "u").to_numpy() / unit
     scale = style.Scale.of_deviation(deviation)
@@ -149,7 +147,7 @@ def floor_panel(ax: Axes, dataset: xr.Dataset, floor: xr.Dataset) -> None:
 
 
 def arrow_panel(ax: Axes, dataset: xr.Dataset, scale: style.Scale | None = None) -> None:
-    """Draw the negated gradients as arrows, on the slice's own scale unless given."""
+    """Draw the negated gradients as arrows, by default on the slice's own scale."""
     plane, asked = plane_of(dataset), with_gradients(dataset)
     rows, columns = (arrows_along(dataset, name) for name in ("v", "u"))
     slope = slopes(dataset)
@@ -184,7 +182,7 @@ def slopes(dataset: xr.Dataset) -> Grid:
 
 
 def log_magnitude(dataset: xr.Dataset) -> Grid:
-    """Return the decimal logarithm of the gradient's length along the plane; NaN where it is zero or unknown."""
+    """Return the decimal logarithm of the gradient's norm along the plane; NaN where it is zero or unknown."""
     return _log10(magnitude(slopes(dataset), plane_of(dataset), "")[0])
 
 
@@ -204,10 +202,10 @@ def descent(slope: Grid, plane: Plane) -> Grid:
 
 
 def magnitude(slope: Grid, plane: Plane, loss_unit: str) -> tuple[Grid, str]:
-    """Return the length of the gradient along the plane, and its label.
+    """Return the norm of the gradient along the plane, and its label.
 
-    Where both axes have the same unit it is the gradient's projection on the plane. Otherwise lengths along them cannot
-    be added, and it is taken per width of the box instead.
+    If both axes have the same unit, it is that of the gradient's projection on the plane. Otherwise the components
+    cannot be added, and the norm is per width of the box.
     """
     if len(set(plane.coordinate_units)) == 1:
         with np.errstate(over="ignore", invalid="ignore"):
@@ -221,7 +219,7 @@ def magnitude(slope: Grid, plane: Plane, loss_unit: str) -> tuple[Grid, str]:
 
 
 def _lengths(vectors: Grid) -> Grid:
-    """Return the lengths of vectors along the last axis, also where their squares are too large or too small."""
+    """Return the norms of vectors along the last axis, without overflow or underflow of their squares."""
     most = np.abs(vectors).max(axis=-1, keepdims=True)
     with np.errstate(over="ignore", invalid="ignore"):
         plain: Grid = np.linalg.norm(vectors, axis=-1)
@@ -239,14 +237,14 @@ def _sides(plane: Plane) -> Grid:
 
 
 def _length(*positions: Grid) -> float:
-    """Return the length of arrows at these places along each side, in fractions of it, so that few of them touch."""
+    """Return an arrow length, in fractions of the sides, at which few arrows at these positions touch."""
     closest = min(float(np.diff(places).min()) for places in positions)
     densest = max(len(places) for places in positions)
     return min(style.LONGEST_ARROW, max(0.86 * closest, 0.45 / densest))
 
 
 def cell_edges(dataset: xr.Dataset) -> tuple[Grid, Grid]:
-    """Return where the cells of a plane's samples end along u and v, from border to border of the picture."""
+    """Return the edges of the cells along u and v, from border to border of the picture."""
     plane = plane_of(dataset)
     u, v = (_edges(dataset[name].to_numpy(), *_limits(plane, axis)) for axis, name in enumerate("uv"))
     return u, v
@@ -257,14 +255,14 @@ def _edges(centers: Grid, low: float, high: float) -> Grid:
 
 
 def arrows_along(dataset: xr.Dataset, name: str) -> NDArray[np.intp]:
-    """Return at which samples along an axis arrows are drawn, of those that have a gradient."""
+    """Return the samples along an axis that have an arrow, among those with a gradient."""
     refined = bool((dataset["status"] == Status.INTERPOLATED).any()) if "status" in dataset else False
     every = gradient_stride(stored_identity(dataset))
     return every * pick_arrows(-(-dataset.sizes[name] // every), refined=refined)
 
 
 def pick_arrows(points: int, *, refined: bool = False) -> NDArray[np.intp]:
-    """Return which of so many points along an axis keep their arrow: of a refined slice, those of its lattices."""
+    """Return the points along an axis that keep their arrow; in a refined slice, those of its lattices."""
     step = -(-points // style.ARROWS)
     if refined:
         return cast("NDArray[np.intp]", np.arange(0, points, 1 << (step - 1).bit_length()))

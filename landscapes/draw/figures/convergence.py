@@ -1,4 +1,4 @@
-"""Self-convergence: how far losses move from level to level, over the width of the levels (matplotlib)."""
+"""Self-convergence: the change of losses from level to level against the width of the levels (matplotlib)."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ KINDS = {"p95": ("95th percentile", 0.45), "median": ("median over the points", 
 MIN_MOVE = 1e-16  # of the spread: what is drawn on the lower edge of rounding
 WIDTHS = {
     "dt": "time step [s]",
-    "resolution": "width of a cell, against the reference's",
-    "particles": "distance of particles, against the reference's",
-    "joint": "width of a cell, against the reference's; step in proportion",
+    "resolution": "cell width, relative to the reference",
+    "particles": "particle distance, relative to the reference",
+    "joint": "cell width, relative to the reference; step in proportion",
 }
 
 
 def convergence_figure(found: ConvergenceRecord, *, width: float | None = None) -> page.Picture:
-    """Draw a panel for each setting, and one for distributions where there are any.
+    """Draw a panel for each setting, and one for distributions if there are any.
 
-    Marks are the median over the points of how far losses move from a level to the next finer one, and paler the 95th
-    percentile, both with intervals. Dashed is the slope of the designed order, shaded those that the interval of the
-    observed one holds; dotted the floor; grey what the rule allows, a tenth of standard's error. Precision has two
-    levels only and no panel.
+    Marks are the change of the loss from a level to the next finer one: the median over the points and, paler, the 95th
+    percentile, both with intervals. The dashed line is the slope of the designed order, and the shaded area has those
+    within the interval of the observed order. The dotted line is the floor. The grey line is the limit of the rule, a
+    tenth of standard's error. Precision has only two levels and no panel.
 
-    Raises ValueError where the page is too narrow or too wide.
+    Raises ValueError if the page is too narrow or too wide.
     """
     drawn = [one for one in found.settings if one.setting in WIDTHS and one.moves]
     count = len(drawn) + bool(found.distributions)
@@ -68,7 +68,7 @@ def _draw_setting(ax: Axes, one: SettingConvergence, found: ConvergenceRecord) -
     _draw_design(ax, one)
     _draw_levels(ax, one, found)
     page.log_axis(ax.xaxis, ax.yaxis)
-    page.name_axes(ax, WIDTHS[one.setting], "loss moves [share of the spread]" if found.spread else "loss moves")
+    page.name_axes(ax, WIDTHS[one.setting], f"change of the loss{' [share of the spread]' if found.spread else ''}")
     page.caption(ax, _title(one))
 
 
@@ -83,7 +83,7 @@ def _draw_moves(ax: Axes, moves: Sequence[Move], kind: str, look: dict[str, obje
 
 
 def _draw_design(ax: Axes, one: SettingConvergence) -> None:
-    """Draw the slope of the designed order, and those within the interval of the observed one, through the medians."""
+    """Draw the slopes of the designed order and of the observed order's interval, through the medians."""
     known = [(move.width, move.median.value) for move in one.moves if move.median.value]
     if not known:
         return
@@ -100,13 +100,13 @@ def _draw_design(ax: Axes, one: SettingConvergence) -> None:
 
 
 def _draw_levels(ax: Axes, one: SettingConvergence, found: ConvergenceRecord) -> None:
-    """Draw the floor, what the rule allows, and what Richardson's limit leaves at the reference."""
+    """Draw the floor, the limit of the rule, and the reference's distance from Richardson's limit."""
     sheet, off = page.sheet_of(ax), found.rule.off.value
     left = next((one.median.value for one in found.remainders if one.name == found.reference), None)
     lines = {
         "rule": (0.1 * off if off else None, "solid", "a tenth of standard's error"),
         "floor": (one.floor, (0, (1, 1.5)), "floor"),
-        "limit": (left, (0, (6, 1.5, 1, 1.5)), "left at the reference by Richardson, median"),
+        "limit": (left, (0, (6, 1.5, 1, 1.5)), "reference to Richardson's limit, median"),
     }
     for gid, (value, dashes, said) in lines.items():
         low, high = ax.get_ylim()
@@ -125,7 +125,7 @@ def _title(one: SettingConvergence) -> str:
 
 
 def _draw_distributions(ax: Axes, found: ConvergenceRecord) -> None:
-    """Draw Wasserstein's distance of each fidelity's losses over neighbourhoods from the reference's, and the noise."""
+    """Draw the Wasserstein distances of each fidelity's losses from the reference's, and the noise."""
     apart = found.distributions
     assert apart is not None
     page.dress(ax)
@@ -133,10 +133,10 @@ def _draw_distributions(ax: Axes, found: ConvergenceRecord) -> None:
     look = style.VARIANT_MARK | {"color": style.LOSS_LINE, "marker": "o"}
     page.draw_rows(ax, np.where(np.isfinite(ends), ends, ends[:, :1]), look, "", gid="distance")
     if limit := apart.noise_limit["wasserstein"]:
-        said = "noise: the reference twice (95 %)"
+        said = "noise: the reference repeated (95 %)"
         ax.axvspan(0, limit, color=style.BAND[0], zorder=0, gid="noise", label=said)
     ax.set_yticks(range(len(apart.compared)), [one.name.removeprefix("reference-") for one in apart.compared])
     ax.set_xlim(left=0)
     ax.margins(y=0.15)
-    page.name_axes(ax, "Wasserstein's distance from the reference [share of the spread]")
+    page.name_axes(ax, "Wasserstein distance from the reference [share of the spread]")
     page.caption(ax, f"losses over {apart.neighbourhoods} neighbourhoods")

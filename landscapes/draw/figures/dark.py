@@ -1,4 +1,4 @@
-"""Pictures for dark pages: greys are inverted, and colours stay, so that a map agrees with its colour bar."""
+"""Pictures for dark pages: greys are inverted and colours stay, so that a map matches its colour bar."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ NEIGHBOURHOOD = 3  # pixels within which such colours are near the page
 
 
 def darken(picture: Picture) -> None:
-    """Recolour a picture, as it is drawn, for a dark page; arrows have the map that is seen there."""
+    """Recolour a drawn picture for a dark page; arrows get a colour map that is visible there."""
     for artist in picture.findobj(lambda one: not isinstance(one, Figure | Axes)):  # these have their patches' colours
         if isinstance(artist, ScalarMappable) and artist.get_array() is not None:
             if artist.get_cmap() == style.SLOPE_MAP:
@@ -59,9 +59,9 @@ def _darken(artist: Artist) -> None:
 
 
 def invert_greys(colours: Colours) -> Colours:
-    """Return colours, shape (..., 3 or 4), greys among them as light on the dark ground as they were dark on white.
+    """Return colours, shape (..., 3 or 4), with greys as light on the dark page as they were dark on white.
 
-    What tint a pale grey has it keeps.
+    A pale grey keeps its tint.
     """
     rgb, rest = colours[..., :3], colours[..., 3:]
     level, chroma = rgb.mean(axis=-1, keepdims=True), np.ptp(rgb, axis=-1, keepdims=True)
@@ -75,7 +75,7 @@ def invert_greys(colours: Colours) -> Colours:
 
 
 def save_dark(source: Path, target: Path) -> None:
-    """Write a picture that is there as PNG for a dark page: where a colour meets the paper, the paper is taken out."""
+    """Write a PNG picture again for a dark page; where a colour blends with the paper, the paper is removed."""
     light, place = _colours_of(source)
     level, chroma = light.mean(axis=-1), np.ptp(light, axis=-1)
     paper, pale = (level > PAPER) & (chroma < PALE_GREY[0]), (level > PALE) & (chroma > PALE_GREY[0])
@@ -90,7 +90,7 @@ def save_dark(source: Path, target: Path) -> None:
 
 
 def _colours_of(source: Path) -> tuple[Colours, NDArray[np.integer[Any]]]:
-    """Return a picture's colours, shape (colour, 3), far fewer than pixels, and which one each pixel has."""
+    """Return a picture's distinct colours, shape (colour, 3), and the index of the colour of each pixel."""
     with Image.open(source) as picture:
         if picture.mode == "P":
             return np.array(picture.getpalette()).reshape(-1, 3) / 255, np.asarray(picture)
@@ -100,7 +100,7 @@ def _colours_of(source: Path) -> tuple[Colours, NDArray[np.integer[Any]]]:
 
 
 def _keep_ground(few: Image.Image, paper: NDArray[np.bool_], ground: NDArray[np.uint8]) -> None:
-    """Give the paper of a picture of few colours the page's own, of which it may have got a neighbour."""
+    """Give the paper of a picture with few colours the exact colour of the page."""
     palette, places = few.getpalette() or [], np.asarray(few)[paper]
     if places.size:
         most = int(np.bincount(places).argmax())

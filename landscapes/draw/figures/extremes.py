@@ -1,4 +1,4 @@
-"""The extremes of a scene: loss errors over how far settings are changed, and maps of pairs of them (matplotlib)."""
+"""The extremes of a scene: loss errors against changes of settings, and maps of pairs of settings (matplotlib)."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ Grid = NDArray[np.float64]
 
 
 def extremes_figure(found: ExtremesRecord, *, width: float | None = None) -> page.Picture:
-    """Draw for each precision loss errors over the settings, and a map of each pair with its bisected boundary.
+    """Draw for each precision the loss errors against the settings, and a map of each pair with its boundary.
 
-    A cell of a map is one setting, coloured by how it ended; nothing is interpolated. A curve breaks where the scene
-    fails, and a cross says where it first does; errors too large or too small for the axis are on its edges.
+    A cell of a map is one setting, coloured by its outcome; nothing is interpolated. A curve breaks where the scene
+    fails, and a cross marks the first failure. Errors too large or too small for the axis are on its edges.
 
-    Raises ValueError where the page is too narrow or too wide.
+    Raises ValueError if the page is too narrow or too wide.
     """
     rows = [[one for one in found.maps if one.precision == precision] for precision in found.precisions]
     columns = 1 + max(map(len, rows))
@@ -48,17 +48,17 @@ def extremes_figure(found: ExtremesRecord, *, width: float | None = None) -> pag
     for precision, maps in zip(found.precisions, rows, strict=True):
         ax = next(panels)
         _draw_errors(ax, [one for one in found.limits if one.precision == precision], found.tolerance)
-        page.caption(ax, f"{precision}: errors before it fails")
+        page.caption(ax, f"{precision}: errors up to failure")
         for one in maps:
             _draw_map(next(panels), one)
     page.entitle(picture, f"{found.env} · {found.fidelity} · extremes · {found.points} points")
     made = page.made_by(found, "device", "engine", "created")
-    page.finish(picture, columns=4, heading=" · ".join([f"judged by {found.reference}", *made, found.command]))
+    page.finish(picture, columns=4, heading=" · ".join([f"compared with {found.reference}", *made, found.command]))
     return picture
 
 
 def _draw_errors(ax: Axes, limits: Sequence[Limit], tolerance: float) -> None:
-    """Draw the error of each setting's stable values over the factor it is changed by."""
+    """Draw the error of each setting's stable values against the factor of its change."""
     sheet = page.sheet_of(ax)
     page.dress(ax)
     drawn = [limit for limit in limits if _has_factor(limit)]
@@ -83,23 +83,23 @@ def _draw_errors(ax: Axes, limits: Sequence[Limit], tolerance: float) -> None:
     ax.axhline(100 * tolerance, **sheet.look(style.REFERENCE_LINE), label=label)
     ax.axvline(1.0, color=style.FAINT, linewidth=0.8 * sheet.weight, zorder=0)
     ax.set_box_aspect(1)
-    page.name_axes(ax, "times what the scene has", "loss error, 95 % of the points [% of the spread]")
+    page.name_axes(ax, "multiple of the scene's value", "loss error, 95 % of the points [% of the spread]")
 
 
 def _error(cell: Cell) -> float:
-    """Return a stable value's error within the axis [% of the spread], NaN where there is none: the curve breaks."""
+    """Return a stable value's error within the axis [% of the spread], or NaN, where the curve breaks."""
     if not cell.stable or cell.error is None:
         return math.nan
     return float(np.clip(100 * cell.error, LOWEST, HIGHEST))
 
 
 def _has_factor(limit: Limit) -> bool:
-    """Say whether a setting is changed by factors: one that may be zero is not."""
+    """Say whether a setting is changed by factors, which one that may be zero is not."""
     return limit.base > 0 and all(cell.values[0] > 0 for cell in limit.scanned)
 
 
 def _looks(settings: Sequence[str]) -> dict[str, dict[str, object]]:
-    """Return a colour and a marker for each setting: those of the trade-off where it has them."""
+    """Return a colour and a marker for each setting, the same as in the trade-off if it is there."""
     own = [style.VARIANTS[name] for name in ("stiffness", "engine", "particles", "precision", "device")]
     known = {"dt": style.VARIANTS["dt"], "resolution": style.VARIANTS["resolution"]}
     others = iter(own * len(settings))
@@ -107,7 +107,7 @@ def _looks(settings: Sequence[str]) -> dict[str, dict[str, object]]:
 
 
 def _draw_map(ax: Axes, found: StabilityMap) -> None:
-    """Draw how each cell ended, the boundary and the base."""
+    """Draw the outcome of each cell, the boundaries and the base."""
     sheet = page.sheet_of(ax)
     outcomes = np.array([cell.outcome for cell in found.cells]).reshape(len(found.ys), len(found.xs))
     edges = _edges(found.xs), _edges(found.ys)
@@ -121,7 +121,7 @@ def _draw_map(ax: Axes, found: StabilityMap) -> None:
             line = sheet.look(style.BOUNDARIES[ends is found.boundary]) | {"gid": label, "label": label}
             ax.plot(np.sqrt(low * high) if low.min() > 0 else (low + high) / 2, y, **line, clip_on=False)
     star = sheet.look(style.LOWEST_MARK)
-    ax.plot(*([one] for one in found.base), **star, gid="base", zorder=4, label="what the scene has")
+    ax.plot(*([one] for one in found.base), **star, gid="base", zorder=4, label="the scene's values")
     page.dress(ax)
     for axis, limits, values in ((ax.xaxis, edges[0], found.xs), (ax.yaxis, edges[1], found.ys)):
         (ax.set_xlim if axis is ax.xaxis else ax.set_ylim)(float(limits[0]), float(limits[-1]))
@@ -133,7 +133,7 @@ def _draw_map(ax: Axes, found: StabilityMap) -> None:
 
 
 def _edges(values: Sequence[float]) -> Grid:
-    """Return the borders of cells around ascending values: half way between them, by ratio unless one is zero."""
+    """Return the borders of cells around ascending values: geometric means, or arithmetic means if one is zero."""
     ratio = min(values) > 0
     at = np.log(values) if ratio else np.asarray(values, dtype=float)
     half = np.diff(at) / 2 if len(at) > 1 else np.array([0.5])

@@ -24,16 +24,16 @@ BINS = 48  # of the density
 DECADES = 12  # that the axis spans on each side, at most
 NARROWEST = 0.09  # half the linear part, by all decades: its ends have names
 TICKS = 4  # on each side
-WITHIN = "at most so far off"
+WITHIN = "bound on the error"
 REACH = 3.0  # what the axis reaches beyond the marks, as a ratio
 
 
 def hessian_figure(found: Hessian, *, width: float | None = None) -> page.Picture:
-    """Draw eigenvalues by place, with what they may be off by, and, where it was sampled, the density of all.
+    """Draw eigenvalues in order with bounds on their errors, and the density of all of them if it was sampled.
 
-    Hollow marks are eigenvalues whose sign cannot be told. Around zero the axis is linear, up to the dotted lines.
+    Hollow marks are eigenvalues with an undetermined sign. Around zero the axis is linear, up to the dotted lines.
 
-    Raises ValueError where the page is too narrow or too wide.
+    Raises ValueError if the page is too narrow or too wide.
     """
     sheet = style.Sheet.of(width, pitch=PITCH)
     picture = page.Picture(sheet, sheet.width)
@@ -62,14 +62,14 @@ def hessian_figure(found: Hessian, *, width: float | None = None) -> page.Pictur
 
 
 def _drawn(found: Hessian) -> NDArray[np.int64]:
-    """Return the places of the eigenvalues that are known, from 1."""
+    """Return the indices of the known eigenvalues, from 1."""
     known, dim = len(found.values), found.dim
     ends = np.r_[1 : known // 2 + 1, dim - (known - known // 2) + 1 : dim + 1]
     return np.arange(1, dim + 1) if known == dim else ends
 
 
 def _scale(found: Hessian) -> tuple[float, float]:
-    """Return up to where the axis is linear, and where it ends: powers of ten around what can be told."""
+    """Return the ends of the linear part and of the axis: powers of ten around the determined eigenvalues."""
     size, error = np.abs(found.values), found.errors
     most = float((size + np.where(np.isfinite(error), error, 0)).max()) or 1.0
     told = size[size > error]
@@ -113,13 +113,13 @@ def _draw_eigenvalues(ax: Axes, found: Hessian) -> None:
     shown = [row for row in rows if len(rows) <= MOST_ROWS or row % math.ceil(len(rows) / MOST_ROWS) == 0]
     ax.set_yticks(shown, [str(places[row]) for row in shown])
     ax.set_ylim(len(places) - 0.3, -0.7)
-    page.name_axes(ax, "", "place")
+    page.name_axes(ax, "", "index")
     if len(places) < found.dim:
         ax.axhline(len(places) // 2 - 0.5, **page.sheet_of(ax).look(style.STEP_LINE), gid="gap")
 
 
 def _draw_density(ax: Axes, found: Hessian, linear: float, end: float) -> None:
-    """Draw which share of all eigenvalues lies where, in bins as wide as the axis has them."""
+    """Draw the share of all eigenvalues in bins of equal width on the axis."""
     transform = ax.transData + ax.transAxes.inverted()
     low, high = ax.get_xlim()
     shares = np.linspace(0, 1, BINS + 1)
@@ -128,14 +128,14 @@ def _draw_density(ax: Axes, found: Hessian, linear: float, end: float) -> None:
     weights = np.histogram(found.nodes.ravel(), edges, weights=found.weights.ravel())[0] / len(found.nodes)
     ax.bar(edges[:-1], weights, np.diff(edges), align="edge", color=style.LOSS_LINE, linewidth=0, gid="density")
     ax.set_ylim(0, 1.08 * max(weights.max(), 1e-3))
-    page.name_axes(ax, "", "share of all")
+    page.name_axes(ax, "", "share of all eigenvalues")
 
 
 def _remark(found: Hessian) -> str:
-    """Say trace, condition number and share of negative curvature."""
+    """Return trace, condition number and share of negative curvature as text."""
     trace, condition, negative = found.trace, found.condition, found.negative
     bounds = f"trace {trace.value:.3g} ({trace.low:.3g} to {trace.high:.3g})"
-    at_least = f"at least {condition.low:.2g}" if math.isfinite(condition.low) else "cannot be told"
+    at_least = f"at least {condition.low:.2g}" if math.isfinite(condition.low) else "not determined"
     size = "condition " + (f"{condition.value:.4g}" if math.isfinite(condition.value) else at_least)
     said = [bounds, size, f"negative {negative.value:.0%} ({negative.low:.0%} to {negative.high:.0%})"]
     doubt = "" if found.symmetric else f"not symmetric: {found.asymmetry:.2g}"

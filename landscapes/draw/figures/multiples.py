@@ -1,4 +1,4 @@
-"""Small multiples: the slices of a census, a card, a wall, or cuts through other points, side by side (matplotlib)."""
+"""Small multiples: slices of a census, a card, a wall, or through several points, side by side (matplotlib)."""
 
 from __future__ import annotations
 
@@ -36,13 +36,13 @@ PITCH, MIN_PANEL = 3.6, 40.0  # room of a panel: on a screen [inch], and at leas
 
 @dataclass(frozen=True, eq=False)
 class CompanionSlice:
-    """The losses of a cut through a named point, of shape (v, u), or (u) of a line; NaN where an episode failed."""
+    """The losses of a slice through a named point, shape (v, u), or (u,) of a line; NaN where an episode failed."""
 
     through: str
     loss: NDArray[Any]
 
     def title(self) -> str:
-        """Say where it goes through and what its losses range over."""
+        """Return the point that the slice goes through and the range of its losses."""
         finite = self.loss[np.isfinite(self.loss)]
         ends = (
             [f"{end:.3g}".replace("-", "\N{MINUS SIGN}") for end in (finite.min(), finite.max())] if finite.size else []
@@ -51,7 +51,7 @@ class CompanionSlice:
 
 
 def spoken(through: str) -> str:
-    """Say the name of a point as a sentence has it."""
+    """Return the name of a point for use in a sentence."""
     kind, _, name = through.partition(":")
     if kind == "center":
         return "the centre"
@@ -61,9 +61,9 @@ def spoken(through: str) -> str:
 def companions_figure(
     cuts: Sequence[CompanionSlice], dataset: xr.Dataset, *, width: float | None = None
 ) -> page.Picture:
-    """Draw cuts side by side on one scale; the first is the slice `dataset` itself, whose axes all have.
+    """Draw slices side by side on one scale, with common axes; the first is the slice `dataset` itself.
 
-    What failed is grey. Raises ValueError where the page is too narrow or too wide.
+    Failed samples are grey. Raises ValueError if the page is too narrow or too wide.
     """
     sheet = style.Sheet.of(width, pitch=PITCH, columns=len(cuts), least=MIN_PANEL)
     picture, axes = page.panels(sheet, len(cuts), share=True)
@@ -102,12 +102,12 @@ FOOT = 4  # words that the legend has, the most frequent first
 
 
 def census_figure(census: Census, *, width: float | None = None) -> page.Picture:
-    """Draw the losses of slices on one scale, the least rugged first, row by row: of more than 64 every so many.
+    """Draw the losses of slices on one scale, the least rugged first, row by row; more than 64 are thinned.
 
-    Slices are ordered by how often lines turn back along a side. What failed or lies outside the box is grey. The
-    legend says which share of the slices each word fits.
+    Slices are in the order of their turns along a side. Failed samples and those outside the box are grey. The legend
+    gives the share of slices that each word fits.
 
-    Raises ValueError where the page is too narrow or too wide.
+    Raises ValueError if the page is too narrow or too wide.
     """
     sheet = style.Sheet.of(width, pitch=CENSUS_PITCH)
     count = len(census.slices)
@@ -148,7 +148,7 @@ LINE = 25  # letters in a line under a landscape
 
 @dataclass(frozen=True, eq=False)
 class Landscape:
-    """A slice on the wall, what it is of, and what that is like."""
+    """A slice on the wall, with its name and its verdict."""
 
     name: str
     said: str
@@ -156,15 +156,14 @@ class Landscape:
 
 
 def wall_figure(landscapes: Sequence[Landscape], *, width: float | None = None) -> page.Picture:
-    """Draw the losses of slices side by side, each on a scale of its own from its lowest, dark, to its highest, light.
+    """Draw the losses of slices side by side, each on its own scale from its lowest, dark, to its highest, light.
 
-    Under a plane are its axes, and under each its words. What is not OK is grey. A line is drawn as one, its loss
-    upwards.
+    The axes of a plane and the words of each slice are under it. Samples that are not OK are grey. A line is a curve.
 
-    Raises ValueError where there is no slice, or the page is too narrow or too wide.
+    Raises ValueError if there is no slice, or if the page is too narrow or too wide.
     """
     if not landscapes:
-        raise ValueError("a wall needs a landscape at least; got none")
+        raise ValueError("a wall needs at least one landscape; got none")
     sheet = style.Sheet.of(
         width, pitch=WALL_PITCH, columns=min(WALL_ACROSS, len(landscapes)), panels=len(landscapes), least=MIN_LANDSCAPE
     )
@@ -182,7 +181,7 @@ def wall_figure(landscapes: Sequence[Landscape], *, width: float | None = None) 
 
 
 def _draw_alone(ax: Axes, dataset: xr.Dataset, *, linewidth: float) -> AxesImage | None:
-    """Draw the losses of a slice on their own scale, of a plane as a map that is returned, of a line as one."""
+    """Draw the losses of a slice on its own scale: a plane as a map, which is returned, a line as a curve."""
     if plane_of(dataset).rank == 1:
         line = sampled_line(dataset)
         ax.plot(line["u"], line["loss"], color=style.LOSS_LINE, linewidth=linewidth)
@@ -207,12 +206,12 @@ VERDICTS = {  # and the words themselves
 
 
 def card_figure(card: Card, *, width: float | None = None) -> page.Picture:
-    """Draw the losses and the direction of steepest descent by the gradient of every engine, scene by scene.
+    """Draw the losses and the directions of steepest descent of every engine, scene by scene.
 
     Maps of a scene share a colour scale. An arrow is orange where the gradient opposes the slope between neighbouring
-    samples, and white elsewhere; which share of all samples does stands over the map.
+    samples, and white elsewhere. The share of opposing samples is over the map.
 
-    Raises ValueError where the page is too narrow or too wide.
+    Raises ValueError if the page is too narrow or too wide.
     """
     most = max(Counter(one.scene for one in card.grades).values())
     columns = min(CARD_ACROSS, max(MIN_COLUMNS, most))
@@ -229,7 +228,7 @@ def card_figure(card: Card, *, width: float | None = None) -> page.Picture:
 
 
 def card_panel(cut: CardSlice, scale: style.Scale, pixels: int) -> page.Picture:
-    """Draw the map of a slice alone, with its arrows, over the whole of a square picture."""
+    """Draw only the map of a slice with its arrows, over a whole square picture."""
     picture = page.Picture(style.Sheet.of(None, pitch=PANEL), PANEL)
     picture.set_dpi(pixels / PANEL)
     ax = picture.add_axes((0, 0, 1, 1))
@@ -240,7 +239,7 @@ def card_panel(cut: CardSlice, scale: style.Scale, pixels: int) -> page.Picture:
 
 
 def _rows(card: Card, columns: int) -> list[list[int]]:
-    """Return the numbers of the grades in each row of maps; every scene begins one."""
+    """Return the indices of the grades in each row of maps; every scene starts a new row."""
     scenes = [list(group) for _, group in groupby(range(len(card.grades)), key=lambda k: card.grades[k].scene)]
     return [scene[start : start + columns] for scene in scenes for start in range(0, len(scene), columns)]
 
@@ -290,7 +289,7 @@ def _draw_arrows(ax: Axes, cut: CardSlice, opposed: NDArray[np.bool_]) -> None:
 
 
 def opposing(cut: CardSlice) -> tuple[NDArray[np.bool_], float]:
-    """Return where the gradient opposes the slope between neighbouring samples, and the share of those with both."""
+    """Return where the gradient opposes the slope between neighbouring samples, and the share of such samples."""
     between = np.stack(np.gradient(cut.loss)[::-1], axis=-1) * (np.array(cut.loss.shape[::-1]) - 1)
     along = (between * cut.slope).sum(axis=-1)
     known = np.isfinite(along) & (np.linalg.norm(cut.slope, axis=-1) > 0)
@@ -310,7 +309,7 @@ WIDTH, THUMBNAIL_SHAPE = 2.4, 0.75  # of the page [inch]; its height, against it
 
 
 def thumbnail_figure(dataset: xr.Dataset, *, width: float | None = None) -> Picture:
-    """Draw the losses of a slice over the whole of a small page; what is not OK is left grey."""
+    """Draw the losses of a slice over a whole small page; samples that are not OK are grey."""
     sheet = style.Sheet.of(width, pitch=WIDTH)
     picture = Picture(sheet, THUMBNAIL_SHAPE * sheet.width)
     ax = picture.add_axes((0, 0, 1, 1))
@@ -322,7 +321,7 @@ def thumbnail_figure(dataset: xr.Dataset, *, width: float | None = None) -> Pict
 
 
 def _frame(ax: Axes, *, shape: float, color: str = style.QUIET, linewidth: float = 0.4) -> None:
-    """Leave a panel without ticks; `shape` is its height against its width, and what has no loss is grey."""
+    """Remove the ticks of a panel; `shape` is its height over its width, and samples without a loss are grey."""
     ax.set(xticks=[], yticks=[], facecolor=style.UNSAMPLED)
     ax.set_box_aspect(shape)
     ax.spines[:].set(color=color, linewidth=linewidth)
@@ -331,6 +330,6 @@ def _frame(ax: Axes, *, shape: float, color: str = style.QUIET, linewidth: float
 def _map(
     ax: Axes, loss: NDArray[Any], scale: style.Scale, extent: tuple[float, float, float, float] | None = None
 ) -> AxesImage:
-    """Draw losses, shape (v, u), one flat cell for each, with nothing where there is none."""
+    """Draw losses, shape (v, u), as flat cells, with none where a loss is missing."""
     look: dict[str, Any] = {"origin": "lower", "aspect": "auto", "interpolation": "nearest", "extent": extent}
     return ax.imshow(np.ma.masked_invalid(loss), cmap=style.LOSS_MAP, norm=scale.norm, **look)

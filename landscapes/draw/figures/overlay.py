@@ -1,4 +1,4 @@
-"""Runs over a slice: their points on the loss map, and their losses against those of the map (matplotlib)."""
+"""Runs over a slice: their points on the loss map, and their losses against the map's (matplotlib)."""
 
 from __future__ import annotations
 
@@ -24,22 +24,22 @@ from . import contour, page
 
 Runs = Sequence[xr.Dataset]
 PITCH = 5.4  # room of a panel on a screen [inch]
-HEADING = "Marker size: distance from the plane; colour: the loss the point truly had"
+HEADING = "Marker size: distance from the plane; colour: the loss of the point itself"
 MAX_NUMBERED = 24  # most improvements that are numbered, over all runs
 CROWD = 4  # runs from which on the lines that join them are thinner
 
 
 def overlay_figure(dataset: xr.Dataset, runs: Runs, *, width: float | None = None) -> page.Picture:
-    """Draw runs, as `overlay` lays them, over the loss map of their slice, and their losses against the map's.
+    """Draw runs, as projected by `overlay`, over the loss map of their slice, and their losses against the map's.
 
-    The colour of a marker is the loss that the point truly had, on the map's own scale: where it differs from the
-    colour around it, the plane does not show the point. Markers get smaller, and descents fainter, with the distance
-    from the plane. A white line joins the improvements of a run, up to the star at its best point; numbers say in which
-    episodes they came, where there is room. Points beyond the map are hollow and at its border; failed episodes are
-    crosses. The panel on the right, or below on a narrow page, compares each point with the sample beneath it: points
-    on the diagonal have the loss that the map shows.
+    The colour of a marker is the loss of the point itself on the map's scale. Where it differs from the colour around
+    it, the plane does not show that loss. Markers get smaller, and descents fainter, with the distance from the plane.
+    A white line joins the improvements of a run up to the star at its best point. Numbers give the episodes of the
+    improvements where they fit. Points outside the map are hollow and at its border. Failed episodes are crosses. The
+    panel on the right, or below on a narrow page, compares each point with the sample beneath it: points on the
+    diagonal have the loss that the map shows.
 
-    Raises ValueError where the page is too narrow or too wide.
+    Raises ValueError if the page is too narrow or too wide.
     """
     plane, reach = plane_of(dataset), farthest_distance(runs)
     sheet = style.Sheet.of(width, pitch=PITCH, columns=2)
@@ -59,11 +59,11 @@ def overlay_figure(dataset: xr.Dataset, runs: Runs, *, width: float | None = Non
 
 
 def joint_scale(dataset: xr.Dataset, runs: Runs) -> style.Scale:
-    """Return the scale of the losses of a slice and of the runs over it.
+    """Return the common scale of the losses of a slice and of the runs over it.
 
-    The slice rules it, so that the map keeps its colours: it ends with the slice's own at the upper end, and at the
-    lower reaches down to the runs' best losses by no more than a decade, or by the slice's range where losses are not
-    positive. What is beyond has the colour of the end, which the colour bar shows open.
+    The map keeps its colours, because the upper end is that of the slice. The lower end extends to the runs' best
+    losses by at most a decade, or by the slice's range if losses are not positive. Losses beyond an end have the colour
+    of the end, and the colour bar is open there.
     """
     own = dataset["loss"].to_numpy().ravel()
     values = np.concatenate([own, *(run["loss"].to_numpy() for run in runs)])
@@ -75,7 +75,7 @@ def joint_scale(dataset: xr.Dataset, runs: Runs) -> style.Scale:
 
 
 def farthest_distance(runs: Runs) -> float:
-    """Return the greatest distance of any point from the plane [half-widths of the box], 0 where it is rounding."""
+    """Return the largest distance of any point from the plane [half-widths of the box], 0 if it is rounding."""
     most = max((float(run["distance"].max()) for run in runs if run.sizes["evaluation"]), default=0.0)
     return most if most > 1e-9 else 0.0
 
@@ -108,14 +108,14 @@ def _draw_run(ax: Axes, run: xr.Dataset, plane: Plane, scale: style.Scale, reach
 
 
 def _places(run: xr.Dataset, plane: Plane) -> NDArray[np.float64]:
-    """Return where a run's points are drawn, shape (point, 2): those beyond the map at its border."""
+    """Return the drawn positions of a run's points, shape (point, 2), those outside the map at its border."""
     low, high = (side.numpy() for side in plane.cell_bounds())
     found: NDArray[np.float64] = np.clip(np.stack([run["u"], run["v"]], axis=1), low, high)
     return found
 
 
 def by_kind(run: xr.Dataset) -> list[tuple[str, NDArray[np.bool_]]]:
-    """Return, for each kind of point a run has, its name and which rows are of it."""
+    """Return the name of each kind of point in a run, and its rows."""
     about, kind = run["kind"].attrs, run["kind"].to_numpy()
     pairs = zip(about["flag_values"], str(about["flag_meanings"]).split(), strict=True)
     return [(name, kind == code) for code, name in pairs if (kind == code).any()]
@@ -140,7 +140,7 @@ def _join_improvements(ax: Axes, run: xr.Dataset, plane: Plane, runs: int) -> No
 
 
 def _number_improvements(ax: Axes, runs: Runs, plane: Plane) -> None:
-    """Write the episodes of improvements next to them, the last of each run first, while there is room."""
+    """Write episode numbers next to improvements where they fit, the last of each run first."""
     places = [_places(run, plane) for run in runs]
     rows = [improvements(run)[::-1] for run in runs]
     turns = range(max(map(len, rows), default=0))
@@ -153,12 +153,12 @@ def _number_improvements(ax: Axes, runs: Runs, plane: Plane) -> None:
 
 
 def _episode(run: xr.Dataset, row: int) -> int:
-    """Return which episode of its run a row is: where only improvements are laid, not the next after the last."""
+    """Return the episode of a row, which is not consecutive if the run has only its improvements."""
     return int(run["episodes"][row]) if "episodes" in run else row + 1
 
 
 def _draw_against(ax: Axes, dataset: xr.Dataset, runs: Runs, reach: float) -> None:
-    """Draw the loss of every point against that of the sample beneath it."""
+    """Draw the loss of every point against the loss of the sample beneath it."""
     page.dress(ax)
     ax.set_box_aspect(1)
     sheet = page.sheet_of(ax)
@@ -175,7 +175,7 @@ def _draw_against(ax: Axes, dataset: xr.Dataset, runs: Runs, reach: float) -> No
     unit = page.loss_unit(dataset)
     page.name_axes(ax, *(labelled(f"loss of the {what}", unit) for what in ("sample beneath", "point itself")))
     off = int(((values < low) | (values > high)).sum())
-    said = f"{len(values) // 2} of {_count(runs)} points have a loss, and so has the sample beneath"
+    said = f"{len(values) // 2} of {_count(runs)} points: those with both losses"
     page.remark(ax, said + (f"; {off} values off scale" if off else ""))
 
 
@@ -194,7 +194,7 @@ def _square(ax: Axes, scale: style.Scale) -> tuple[float, float]:
 
 
 def _signs(sheet: style.Sheet, runs: Runs, reach: float) -> list[Artist | str]:
-    """Say what stands for methods, each with its best run, improvements, kinds of points, distances and failures."""
+    """Return the legend: methods with their best runs, improvements, kinds of points, distances and failures."""
     signs: list[Artist | str] = []
     for method in dict.fromkeys(str(run.attrs["method"]) for run in runs):
         own = [run for run in runs if run.attrs["method"] == method]
@@ -215,7 +215,7 @@ def _signs(sheet: style.Sheet, runs: Runs, reach: float) -> list[Artist | str]:
     total = _count(runs)
     outside = sum(int(run["outside"].sum()) for run in runs)
     lost = sum(int(failed(run["status"]).sum()) for run in runs)
-    for marker, name, count in (("o", "beyond the map", outside), ("x", "failed episode", lost)):
+    for marker, name, count in (("o", "outside the map", outside), ("x", "failed episode", lost)):
         if count:
             look = plain | {"marker": marker, "markerfacecolor": "none"}
             signs.append(page.sign(sheet, f"{name}: {count} of {total} points", look))

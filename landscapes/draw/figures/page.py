@@ -60,7 +60,7 @@ _settings = threading.Lock()  # matplotlib's, which are of the whole process
 
 
 def head(picture: Picture, ax: Axes, dataset: xr.Dataset, name: str | None = None) -> None:
-    """Write the title, a slice's unless named, over the figure and its provenance, small, over the uppermost panel."""
+    """Write the title, by default the slice's, over the figure, and its provenance over the uppermost panel."""
     entitle(picture, name or title(dataset))
     if line := provenance(dataset):
         remark(ax, line)
@@ -74,33 +74,33 @@ def entitle(picture: Picture, text: str) -> None:
 
 
 def remark(ax: Axes, text: str) -> None:
-    """Write something small and quiet over a panel."""
+    """Write a small grey remark over a panel."""
     write_over(ax, text, size=sheet_of(ax).small, color=style.QUIET)
 
 
 def write_over(ax: Axes, text: str, *, size: float, color: str) -> None:
-    """Write over a panel, each line in two at most."""
+    """Write a text over a panel, and break each of its lines once at most."""
     title = ax.set_title(text, size=size, color=color, parse_math=False)
     picture_of(ax).fitted[title] = text, lambda: title_room(ax)
 
 
 def picture_of(ax: Axes) -> Picture:
-    """Return the picture that a panel is in."""
+    """Return the picture of a panel."""
     return cast("Picture", ax.get_figure(root=True))
 
 
 def sheet_of(ax: Axes) -> style.Sheet:
-    """Return the sheet of the picture that a panel is in."""
+    """Return the sheet of a panel's picture."""
     return picture_of(ax).sheet
 
 
 def evaluated(dataset: xr.Dataset) -> int:
-    """Return how many points of a slice are not interpolated."""
+    """Return the number of points of a slice that are not interpolated."""
     return int((dataset["status"] != Status.INTERPOLATED).sum()) if "status" in dataset else dataset["loss"].size
 
 
 def title(dataset: xr.Dataset) -> str:
-    """Return objective, fidelity and resolution, and how much of it is sampled if not all."""
+    """Return objective, fidelity and resolution, and the progress of an unfinished slice."""
     identity = stored_identity(dataset)
     points = " \N{MULTIPLICATION SIGN} ".join(str(dataset.sizes[name]) for name in dataset["loss"].dims[::-1])
     said = simulator_parts(identity)
@@ -113,7 +113,7 @@ def title(dataset: xr.Dataset) -> str:
 
 
 def provenance(dataset: xr.Dataset) -> str:
-    """Return version, device, date and command, if they are known."""
+    """Return version, device, date and command, as far as they are known."""
     known = {**stored_provenance(dataset), **stored_identity(dataset)}
     version = known.get(VERSIONS, {}).get(PACKAGE)
     said = [f"{PACKAGE} {version}"] if version else []
@@ -122,29 +122,29 @@ def provenance(dataset: xr.Dataset) -> str:
 
 
 def made_by(record: Any, *keys: str) -> list[str]:
-    """Return what is known of how a study was made: device, date and command unless other `keys` are asked for."""
+    """Return how a study was made, as far as known: device, date and command, or other `keys`."""
     known = {**record.provenance, **record.identity}
     return [str(known[key]) for key in keys or ("device", "created", "command") if known.get(key)]
 
 
 def loss_name(dataset: xr.Dataset) -> str:
-    """Return what stands along an axis of losses: the word, and their unit if they have one."""
+    """Return the label of an axis of losses, with their unit if they have one."""
     return labelled("loss", loss_unit(dataset))
 
 
 def loss_unit(dataset: xr.Dataset) -> str:
-    """Return the unit of losses, empty where they have none."""
+    """Return the unit of losses, empty if they have none."""
     return str(dataset["loss"].attrs.get("units", ""))
 
 
 def lost_samples(dataset: xr.Dataset, kind: Status, within: str = "") -> str:
-    """Return what the legend says of samples that ended in one way: what that is, and how many did."""
+    """Return the legend's text for the samples with a status, and their number."""
     count = int((dataset["status"] == kind).sum())
     return f"{style.ENDED[kind]}{within}: {count} of {evaluated(dataset)}"
 
 
 def sampling_key(dataset: xr.Dataset) -> list[str]:
-    """Return what the legend says of how exact a refined slice is, what samples hide, and of the numerical floor."""
+    """Return the legend's texts on the error of a refined slice, undersampled cells, and the numerical floor."""
     refined, between, floor = Refined.of(dataset), Undersampled.of(dataset), floor_of(dataset)
     said = []
     if refined and refined.error is not None:
@@ -154,24 +154,24 @@ def sampling_key(dataset: xr.Dataset) -> list[str]:
 
 
 def sign(sheet: style.Sheet, label: str, look: Mapping[str, Any]) -> Line2D:
-    """Return the legend's entry of lines or marks that have this look."""
+    """Return a legend entry for lines or marks with a look."""
     return Line2D([], [], **sheet.look(look), label=label)
 
 
 def interval(ax: Axes, x: ArrayLike, y: ArrayLike, label: str | None = "95 % interval") -> None:
-    """Draw an interval, from one end to the other; the legend says what it is if it has a `label`."""
+    """Draw an interval from one end to the other, with a legend entry if it has a `label`."""
     ax.plot(x, y, **sheet_of(ax).look(style.INTERVAL_LINE), gid="interval", label=label)
 
 
 def ends_of(estimates: Iterable[Estimate | Bootstrap]) -> Grid:
-    """Return values and both ends of their intervals, shape (estimate, 3), NaN where one is unknown."""
+    """Return values and both ends of their intervals, shape (estimate, 3), NaN where unknown."""
     return np.array([(one.value, one.low, one.high) for one in estimates], dtype=float).reshape(-1, 3)
 
 
 def draw_rows(
     ax: Axes, ends: Grid, look: Mapping[str, Any], label: str, *, gid: str, within: str = "95 % interval"
 ) -> None:
-    """Draw in each row an estimate that is known, with its interval, as `ends_of` has them."""
+    """Draw each known estimate in its row with its interval, from `ends_of`."""
     for row in np.flatnonzero(np.isfinite(ends[:, 0])):
         ax.plot(ends[row, :1], [row], **sheet_of(ax).look(look), gid=gid, label=label)
         interval(ax, ends[row, 1:], [row, row], within)
@@ -185,10 +185,10 @@ def finish(
     heading: str = "",
     like: Picture | None = None,
 ) -> None:
-    """Put the legend under the panels, with a small quiet `heading` if it has one, and fit the page's height.
+    """Put the legend under the panels, with a small grey `heading` if given, and fit the page's height.
 
-    The legend has everything in the panels that has a label, once, and what is `more`: a text stands without a sign. A
-    picture `like` another, of a film, has its height, and all in the same places.
+    The legend has an entry for each label in the panels and each of `more`; a text in `more` has no sign. A picture
+    `like` another one, for a film, has the same height and layout.
     """
     drawn = [pair for ax in picture.axes for pair in zip(*ax.get_legend_handles_labels()[::-1], strict=True)]
     signs = [Patch(visible=False, label=one) if isinstance(one, str) else one for one in more]
@@ -209,7 +209,7 @@ def finish(
 
 
 def _key(picture: Picture, entries: Mapping[str, Artist], columns: int, heading: str) -> None:
-    """Put a legend under the panels, in fewer columns where it would be wider than the page."""
+    """Put a legend under the panels, in fewer columns if it would be wider than the page."""
     sheet, room = picture.sheet, picture.sheet.width - 2 * MARGIN
     wide = room - HANDLE * sheet.tick / 72
     labels = [wrap_text(label, wide, sheet.tick, lines=3) for label in entries]
@@ -228,9 +228,9 @@ def _key(picture: Picture, entries: Mapping[str, Artist], columns: int, heading:
 
 
 def save(figure: Figure, path: str | Path) -> None:
-    """Write a figure as PNG, PDF or SVG, by the file's ending, whole or not at all.
+    """Write a figure as PNG, PDF or SVG, by the ending of the file name, whole or not at all.
 
-    Raises ValueError where the ending is another.
+    Raises ValueError for any other ending.
     """
     path = Path(path)
     kind = path.suffix.lower().removeprefix(".")
@@ -242,11 +242,11 @@ def save(figure: Figure, path: str | Path) -> None:
 
 
 def save_prints(draw: Callable[[float], Figure], path: Path, widths: Sequence[float]) -> list[str]:
-    """Write what `draw` draws for a page of so many millimetres as PDF and SVG next to `path`; return their names.
+    """Draw for pages of some `widths` [mm], write PDF and SVG next to `path`, and return their names.
 
-    Those that are there from before are drawn again, so that none is of something else.
+    Existing ones for other widths are drawn again, so that none is out of date.
 
-    Raises ValueError where a width is no page's.
+    Raises ValueError if a width is not that of a page.
     """
     before = {width for file in visible_files(path.parent) if (width := print_width(file.name, path.name))}
     names = []
@@ -263,7 +263,7 @@ DECADES = 3, 6  # ticks of a logarithmic axis, about, in a narrow panel and in a
 
 
 def panels(sheet: style.Sheet, count: int, *, share: bool = False) -> tuple[Picture, list[Axes]]:
-    """Return a picture of so many panels, in as many columns as the sheet has; they may share their window."""
+    """Return a picture with `count` panels in the columns of the sheet; the panels may share their axes."""
     columns = min(count, sheet.columns)
     rows = -(-count // columns)
     picture = Picture(sheet, rows * sheet.pitch)
@@ -274,7 +274,7 @@ def panels(sheet: style.Sheet, count: int, *, share: bool = False) -> tuple[Pict
 
 
 def panel(sheet: style.Sheet, shape: float) -> tuple[Picture, Axes]:
-    """Return a picture of one panel, `shape` times as high as it is wide, with its ticks and frame."""
+    """Return a picture of one panel with ticks and frame, `shape` times as high as wide."""
     picture, (ax,) = panels(sheet, 1)
     dress(ax)
     ax.set_box_aspect(shape)
@@ -286,7 +286,7 @@ FLATTEST = 0.55  # of these panels, against those on a screen: narrow ones are d
 
 
 def stack(sheet: style.Sheet, heights: Sequence[float]) -> tuple[Picture, list[Axes]]:
-    """Return panels of some heights [inch] one below the other, which share their upright lines."""
+    """Return panels of some heights [inch] one below the other, which share the horizontal axis."""
     picture = Picture(sheet, sum(heights) + 1.6)
     axes = list(picture.subplots(len(heights), 1, sharex=True, squeeze=False, height_ratios=heights)[:, 0])
     for ax, height in zip(axes, heights, strict=True):
@@ -297,7 +297,7 @@ def stack(sheet: style.Sheet, heights: Sequence[float]) -> tuple[Picture, list[A
 def dress(ax: Axes, plane: Plane | None = None) -> None:
     """Give a panel its ticks and frame.
 
-    Over a plane, or a line, whose limits the panel already has, logarithmic parameters have decades.
+    With a `plane`, whose limits the panel must already have, logarithmic parameters have ticks at decades.
     """
     sheet = sheet_of(ax)
     ax.tick_params(which="both", **_ticks(sheet))
@@ -311,7 +311,7 @@ def dress(ax: Axes, plane: Plane | None = None) -> None:
 
 
 def log_axis(*axes: Axis) -> None:
-    """Make axes logarithmic, with round values for what is drawn already, the fewer the less room a panel has."""
+    """Make axes logarithmic, with round values for the data drawn so far, and fewer of them in a small panel."""
     for axis in axes:
         (axis.axes.set_xscale if axis is axis.axes.xaxis else axis.axes.set_yscale)("log")
         low, high = np.log10(sorted(axis.get_view_interval()))
@@ -329,7 +329,7 @@ def name_axes(ax: Axes, x: str | None = None, y: str | None = None) -> None:
 
 
 def name_outer(ax: Axes, x: str, y: str) -> None:
-    """Label the axes of one of several panels over the same plane, once for a row and once for a column."""
+    """Label the axes of one of several panels over the same plane, once for each row and column."""
     spec = ax.get_subplotspec()
     assert spec is not None  # as `grid` made it
     others = [other for panel in picture_of(ax).axes if (other := panel.get_subplotspec()) is not None]
@@ -345,7 +345,7 @@ def _name(ax: Axes, axis: Axis, said: str, room: Callable[[], float]) -> None:
 
 
 def caption(ax: Axes, text: str) -> None:
-    """Write what a panel shows over it."""
+    """Write the caption of a panel over it."""
     write_over(ax, text, size=sheet_of(ax).label, color=style.INK)
 
 
@@ -358,7 +358,7 @@ def colour_bar(
     beside: Sequence[Axes] = (),
     **how: Any,
 ) -> Colorbar:
-    """Put a colour bar next to a panel, or several, with plain numbers where the scale is logarithmic."""
+    """Put a colour bar next to one or several panels, with plain numbers on a logarithmic scale."""
     sheet = sheet_of(ax)
     place: dict[str, Any] = {
         "fraction": 0.05, "pad": 0.02, "extend": scale.extend if scale else "neither",
@@ -393,9 +393,9 @@ NEARLY, TURNS = 0.02, 8  # as high as it has to be [inch]; most attempts at it
 
 
 def settle(picture: Picture) -> None:
-    """Make the page as high as what stands on it, panels as wide as they may be in their proportions; then keep it.
+    """Fit the page's height to its contents, with panels as wide as possible in their proportions, and fix the layout.
 
-    Meanwhile panels fill the room they have: the layout takes what a panel leaves of it for its margins'.
+    Meanwhile panels fill their whole space, because the layout takes any space that a panel leaves for margins.
     """
     shapes = {ax: shape for ax in picture.axes if (shape := ax.get_box_aspect()) and ax.get_subplotspec()}
     for ax in shapes:  # a colour bar has no place in the grid: it goes with its panel
@@ -414,15 +414,15 @@ def settle(picture: Picture) -> None:
 
 
 def _set_height(picture: Picture, height: float) -> None:
-    """Set the height of the page to whole pixels of a screen [inch]."""
+    """Set the height of the page [inch], rounded to whole pixels of a screen."""
     picture.set_figheight(round(height * style.DPI) / style.DPI)
 
 
 def _lay_out(picture: Picture) -> None:
-    """Place the panels, by matplotlib's constrained layout.
+    """Place the panels by matplotlib's constrained layout.
 
-    It measures a panel, most of its work, several times in one place, a shared colour bar once for each of its panels;
-    each time it asks either axis for its ticks and their boxes up to eight times.
+    The layout spends most of its time on measuring panels, several times at one position, and a shared colour bar once
+    for each of its panels. Each time it computes the ticks and their boxes of both axes up to eight times.
     """
     with ExitStack() as kept:
         for ax in picture.axes:
@@ -433,7 +433,7 @@ def _lay_out(picture: Picture) -> None:
 
 
 def _ask_once(artist: Artist, name: str, ax: Axes, kept: ExitStack) -> None:
-    """Let a method of a panel, or of its axis, run again only where the panel has moved, until `kept` is closed."""
+    """Cache a method of a panel or its axis until the panel moves or `kept` is closed."""
     ask: Callable[..., Any] | None = getattr(artist, name, None)
     if ask is None:  # a matplotlib that has no such method is only slower
         return
@@ -450,7 +450,7 @@ def _ask_once(artist: Artist, name: str, ax: Axes, kept: ExitStack) -> None:
 
 
 def _missing_height(picture: Picture, shapes: Mapping[Axes, float]) -> float:
-    """Return how much higher the page should be for its panels to have their shapes, height against width [inch]."""
+    """Return the height [inch] that the page lacks for its panels to have their shapes, height over width."""
     width, height = picture.get_size_inches()
     rows: dict[int, float] = {}
     for ax, shape in shapes.items():
@@ -468,7 +468,7 @@ def _wrap(picture: Picture) -> None:
 
 
 def title_room(ax: Axes) -> float:
-    """Return how wide what is written about a panel's middle may be, for the columns it has of the page [inch]."""
+    """Return the space [inch] for a text centred over a panel, from its columns of the page."""
     spec, box, (width, _) = ax.get_subplotspec(), ax.get_position(), _page_size(ax)
     if spec is None:
         return width
@@ -479,7 +479,7 @@ def title_room(ax: Axes) -> float:
 
 
 def side_room(ax: Axes) -> float:
-    """Return how long what is written up a panel's side may be [inch]."""
+    """Return the space [inch] for a text along a panel's side."""
     return float(BESIDE * ax.get_position().height * _page_size(ax)[1])
 
 
@@ -492,7 +492,7 @@ def _page_size(ax: Axes) -> tuple[float, float]:
 
 @lru_cache(1024)  # a page is laid out several times, with the same texts
 def wrap_text(text: str, width: float, size: float, *, lines: int = 2) -> str:
-    """Break a text in a type size [pt] into so many lines of a width [inch] at most, about equally long."""
+    """Break a text in a type size [pt] into at most `lines` about equal lines of a width [inch]."""
     broken, fits = [text], len(text)
     while fits > MIN_LINE and (most := max(text_width(line, size) for line in broken)) > width:
         fits = min(fits - 1, int(1.1 * fits * width / most))
@@ -510,7 +510,7 @@ def _break_lines(text: str, fits: int, lines: int) -> list[str]:
 
 @lru_cache(4096)
 def text_width(text: str, size: float) -> float:
-    """Return how much room type of a size [pt] takes at most [inch], on a screen or on paper."""
+    """Return an upper bound on the width [inch] of a text in a type size [pt], on screen and paper."""
     width, _, _ = text_to_path.get_text_width_height_descent(text, FontProperties(size=size), ismath=False)
     return HINTED * float(width) / 72
 
@@ -526,7 +526,7 @@ ROOM = 1.15  # of a line, in the size of its type
 
 @dataclass(frozen=True)
 class Label:
-    """A text, and the place in a panel that it names [data]."""
+    """A text, and the position in a panel that it names [data]."""
 
     text: str
     at: tuple[float, float]
@@ -542,12 +542,12 @@ def place_labels(
     gaps: Sequence[float],
     gid: str = "name",
 ) -> list[int]:
-    """Write names next to their places, the first of them first, and return the numbers of those with no room.
+    """Write names next to their positions, in order, and return the indices of those that do not fit.
 
-    A name stands in the panel, `gaps` [pt] away from its place, the first that will do, and covers neither another name
-    nor any of the points to keep `clear` of, shape (point, 2) [data], nor, if that can be, those to keep clear of
-    `rather`. It is nearer to its place than to another's; from the second gap on a line leads there instead. The panel
-    must have its final place on the page.
+    A name is inside the panel, at the first of `gaps` [pt] that works. It covers no other name and none of the points
+    `clear`, shape (point, 2) [data], and if possible none of the points `rather`. It is nearer to its own position than
+    to any other; from the second gap on, a line leads to the position instead. The panel must have its final position
+    on the page.
     """
     dot = ax.figure.dpi / 72
     origins = ax.transData.transform(np.array([name.at for name in names]).reshape(-1, 2))
@@ -574,7 +574,7 @@ def place_labels(
 
 
 class _Crowd:
-    """What is taken of a panel [pixel]: places that are named, boxes of names, and points along lines to them."""
+    """The occupied parts of a panel [pixel]: named positions, boxes of names, and points along lines to them."""
 
     def __init__(self, frame: Bbox, origins: Grid) -> None:
         self.frame, self.origins = frame, origins
@@ -582,7 +582,7 @@ class _Crowd:
         self.lines = NOTHING
 
     def takes(self, number: int, shift: Grid, half: Grid, points: Grid, *, led: bool) -> bool:
-        """Take a box for a place, and the line that leads there, if neither points nor anything else is in its way."""
+        """Occupy a box for a position, and the line that leads there, if nothing is in the way."""
         own, others = self.origins[number], np.delete(self.origins, number, axis=0)
         box = Bbox([own + shift - half, own + shift + half])
         inside = np.all(box.min >= self.frame.min) and np.all(box.max <= self.frame.max)

@@ -1,4 +1,4 @@
-"""The path of a training over the slice that was cut along it: its checkpoints in order (matplotlib)."""
+"""The path of a training over the slice along it: its checkpoints in order (matplotlib)."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from . import page
 
 
 def path_scale(dataset: xr.Dataset) -> style.Scale:
-    """Return the scale of a slice's losses, open at the ends beyond which checkpoints of its training are."""
+    """Return the scale of a slice's losses, open at an end if checkpoints of its training are beyond it."""
     scale, path = style.Scale.of_loss(dataset["loss"].to_numpy()), TrainingPath.of(dataset)
     return scale.over(np.array([one.loss for one in path.checkpoints])) if path else scale
 
 
 def draw_path(ax: Axes, dataset: xr.Dataset, scale: style.Scale) -> list[Artist | str]:
-    """Draw the checkpoints of a slice's training over its loss map, and return what the legend says of them.
+    """Draw the checkpoints of a slice's training over its loss map, and return their legend.
 
-    A white line joins them in order. The colour of a marker is the loss that the checkpoint truly has, and its size
-    falls with the distance from the plane; the last one is a square. Checkpoints without a loss are crosses.
+    A white line joins them in order. The colour of a marker is the loss of the checkpoint itself, and its size falls
+    with the distance from the plane. The last one is a square. Checkpoints without a loss are crosses.
     """
     path, sheet = TrainingPath.of(dataset), page.sheet_of(ax)
     if path is None:
@@ -48,7 +48,7 @@ def draw_path(ax: Axes, dataset: xr.Dataset, scale: style.Scale) -> list[Artist 
 
 
 def _signs(sheet: style.Sheet, path: TrainingPath, loss: Any) -> list[Artist | str]:
-    """Say what the markers are, how much of the training the plane shows, and how many checkpoints have failed."""
+    """Return the legend: markers, the share of the training in the plane, and the number of failed checkpoints."""
     said = {path.sentence(): {"marker": "o", "markersize": 5.5}}
     if np.isfinite(loss[-1]):
         said[f"the last of them: {style.number(loss[-1])}"] = {"marker": "s", "markersize": 6.5}

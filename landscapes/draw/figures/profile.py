@@ -1,4 +1,4 @@
-"""A line through a landscape as a profile: loss, gradient, and where events change (matplotlib)."""
+"""A line through a landscape as a profile: loss, gradient, and changes of events (matplotlib)."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ def profile_figure(
     floor: xr.Dataset | None = None,
     width: float | None = None,
 ) -> page.Picture:
-    """Draw a slice of rank 1: the loss above, its derivative along the line below with central differences behind it.
+    """Draw a slice of rank 1: the loss above, and below it the derivative along the line with central differences.
 
-    `events` maps a name to a whole number per point (how many bounces, say): each is a strip on top, labelled where
-    there is room, and a thin line through the panels wherever it changes. Failures are hatched and counted. `floor` is
-    the map of the slice's numerical floor: a panel of its own, between both.
+    `events` maps a name to a whole number per point, for example the number of bounces. Each is a strip on top,
+    labelled where labels fit, with a thin line through the panels wherever it changes. Failures are hatched and
+    counted. `floor` is the map of the slice's numerical floor, in its own panel between the two.
 
-    Raises ValueError where the slice is a plane, or the page too narrow or too wide.
+    Raises ValueError if the slice is a plane, or if the page is too narrow or too wide.
     """
     plane = plane_of(dataset)
     if plane.rank != 1:
@@ -84,7 +84,7 @@ def _draw_loss(ax: Axes, dataset: xr.Dataset) -> None:
 
 
 def _draw_floor(ax: Axes, dataset: xr.Dataset, deviation: NDArray[np.float64]) -> None:
-    """Draw the standard deviation between replicas at every sample, from 0 on."""
+    """Draw the standard deviation between replicas at every sample, on an axis from 0."""
     u = dataset["u"].to_numpy()
     ax.plot(u, deviation, color=style.INK, **page.sheet_of(ax).look(style.stroke(len(u))))
     most = np.nanmax(deviation, initial=0.0)
@@ -112,7 +112,7 @@ def _draw_slope(ax: Axes, dataset: xr.Dataset, plane: Plane) -> None:
 
 
 def _differences(u: NDArray[np.float64], loss: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the slope of the parabola through every three samples, which may be unevenly apart; NaN at the ends."""
+    """Return the slope of the parabola through each three samples, evenly spaced or not; NaN at the ends."""
     found = np.full_like(u, np.nan)
     before, after = np.diff(u)[:-1], np.diff(u)[1:]
     with np.errstate(over="ignore"):
@@ -129,7 +129,7 @@ def _slope_label(plane: Plane, loss_unit: str) -> str:
 
 
 def _draw_strip(strip: Axes, panels: list[Axes], u: NDArray[np.float64], name: str, counts: NDArray[np.int64]) -> None:
-    """Shade the stretches of equal count, label those that have room, and mark where they meet."""
+    """Shade stretches of equal count, label them where the label fits, and mark their borders."""
     sheet = page.sheet_of(strip)
     meets = np.flatnonzero(np.diff(counts)) + 1
     edges = [u[0], *((u[meets] + u[meets - 1]) / 2).tolist(), u[-1]]

@@ -29,10 +29,10 @@ LINE, SCALES, ORDERS = "line", "scales", ("narrow", "wide")
 def quality_figure(dataset: xr.Dataset, quality: GradientQuality, *, width: float | None = None) -> page.Picture:
     """Draw gradient quality: first over the slice's own samples, then by scale and under smoothing.
 
-    Panels that show the same by the same colours share a colour bar, next to the last of them. Six panels one below the
-    other would be higher than a printed page: on a narrow one they are in pairs.
+    Panels with the same quantity and colours share a colour bar, next to the last of them. On a narrow page the panels
+    are in pairs, because six of them in a column would be higher than a printed page.
 
-    Raises ValueError where the page is too narrow or too wide.
+    Raises ValueError if the page is too narrow or too wide.
     """
     plane, samples = plane_of(dataset), quality.samples
     sheet = style.Sheet.of(width, pitch=PITCH, columns=3, least=MIN_PANEL)
@@ -54,7 +54,7 @@ def quality_figure(dataset: xr.Dataset, quality: GradientQuality, *, width: floa
     for kind in (maps, ORDERS):
         _share_names(axes, rows, kind)
     page.entitle(picture, f"{page.title(dataset)}: gradient quality")
-    more: list[Artist] = [page.sign(sheet, "first order is biased beyond chance (p < 0.001)", style.BIASED)]
+    more: list[Artist] = [page.sign(sheet, "first order is significantly biased (p < 0.001)", style.BIASED)]
     if plane.rank == 2:
         more.append(Patch(**style.NO_SLOPE, label="no slope above the noise, or too close to the border"))
     page.finish(picture, more, columns=3, heading=page.provenance(dataset))
@@ -62,13 +62,13 @@ def quality_figure(dataset: xr.Dataset, quality: GradientQuality, *, width: floa
 
 
 def _rows(names: Sequence[str], columns: int) -> list[list[str]]:
-    """Lay panels in rows, nothing where there is none left."""
+    """Arrange panels in rows, with blanks after the last one."""
     padded = [*names, *["."] * (-len(names) % columns)]
     return [list(padded[start : start + columns]) for start in range(0, len(padded), columns)]
 
 
 def _share_names(axes: dict[str, Axes], rows: Sequence[Sequence[str]], kind: Sequence[str]) -> None:
-    """Leave the upright axis its name and numbers once, where panels of a kind stand side by side."""
+    """Keep the label and numbers of the vertical axis once for panels of a kind side by side."""
     for row in rows:
         for left, name in pairwise(row):
             if left in kind and name in kind and axes[left].get_ylim() == axes[name].get_ylim():
@@ -77,7 +77,7 @@ def _share_names(axes: dict[str, Axes], rows: Sequence[Sequence[str]], kind: Seq
 
 
 def _cosine_map(ax: Axes, dataset: xr.Dataset, found: xr.Dataset, *, last: bool) -> None:
-    """Draw the cosines with differences over one scale, each as wide as those that have a gradient are apart."""
+    """Draw the cosines with differences over one scale, in cells as wide as the spacing of gradients."""
     plane, some, every = plane_of(dataset), with_gradients(dataset), gradient_stride(stored_identity(dataset))
     cosine = found["cosine"].to_numpy()[::every, ::every]
     ax.set_facecolor(style.NO_SLOPE["facecolor"])
@@ -92,7 +92,7 @@ def _cosine_map(ax: Axes, dataset: xr.Dataset, found: xr.Dataset, *, last: bool)
 
 
 def _bar(ax: Axes, drawn: ScalarMappable, label: str) -> None:
-    """Put a colour bar next to a panel, or under it where there is little room."""
+    """Put a colour bar next to a panel, or under it if space is short."""
     below: dict[str, Any] = {"location": "bottom", "fraction": 0.06, "pad": 0.04}
     page.colour_bar(ax, drawn, label, **(below if page.sheet_of(ax).pitch < BELOW else {}))
 
@@ -112,7 +112,7 @@ def _slope_lines(ax: Axes, dataset: xr.Dataset) -> None:
 
 
 def _scales(ax: Axes, steps: xr.Dataset, samples: xr.Dataset) -> None:
-    """Draw mean cosine and share of uphill gradients over the scale of the difference."""
+    """Draw the mean cosine and the share of uphill gradients against the scale of the difference."""
     sheet = page.sheet_of(ax)
     for found, where in ((steps, "new evaluations"), (samples, "the slice's samples")):
         rows = [row for row in scale_table(found) if row.points]

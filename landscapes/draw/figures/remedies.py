@@ -1,4 +1,4 @@
-"""What remedies do: the loss that descents reach with each, and the landscape before and after on one scale."""
+"""The effect of remedies: the loss that descents reach with each, and the landscape without and with one."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ MAPS = 0.3  # height of the maps, by the width
 def plot_remedies(found: RemedyStudy, *, width: float | None = None) -> page.Picture:
     """Draw the median loss of descents with every remedy, and maps without and with the best one.
 
-    Filled marks are remedies that get farther beyond chance, hollow ones are not told from none. Raises ValueError
-    where the page is too narrow or too wide.
+    Filled marks are remedies with a significant difference from none, and none itself. Hollow marks are not
+    distinguishable from none. Raises ValueError if the page is too narrow or too wide.
     """
     sheet = style.Sheet.of(width, pitch=PITCH)
     picture = page.Picture(sheet, sheet.width)
@@ -49,7 +49,7 @@ def plot_remedies(found: RemedyStudy, *, width: float | None = None) -> page.Pic
             panel.plot(np.linspace(0, 1, len(losses)), losses, color=style.INK, linewidth=1)
             panel.set_ylim(low, high)
         panel.set_xlim(0, 1)
-        page.name_axes(panel, f"{found.dims[0]}, of the box", f"{found.dims[1]}, of the box" if flat else "loss")
+        page.name_axes(panel, f"{found.dims[0]}, share of box", f"{found.dims[1]}, share of box" if flat else "loss")
         panel.set_title("without a remedy" if not column else name, size=sheet.small, parse_math=False)
     page.entitle(picture, f"{found.env} · {found.fidelity} · remedies, {found.starts} descents each")
     page.finish(picture, [], columns=2, heading=" · ".join(page.made_by(found)))
@@ -57,7 +57,7 @@ def plot_remedies(found: RemedyStudy, *, width: float | None = None) -> page.Pic
 
 
 def _shown(found: RemedyStudy) -> list[str]:
-    """Return what the maps are of: none, and of the remedies that change the losses that with the lowest median."""
+    """Return the names for the maps: no remedy, and the best one among those that change the losses."""
     plain = found.plain.remedy
     changed = [row for row in found.rows if not np.array_equal(found.maps[row.remedy], found.maps[plain])]
     return [plain, *(row.remedy for row in sorted(changed, key=lambda row: row.reached.value)[:1])]

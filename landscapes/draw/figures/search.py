@@ -24,7 +24,7 @@ WIDE = 30.0  # ratio of losses from which the axis is logarithmic
 
 
 def run_figure(table: xr.Dataset, *, width: float | None = None) -> page.Picture:
-    """Draw a run's losses, by what each point was evaluated for, and the best so far; failures are marked below."""
+    """Draw a run's losses by the purpose of each point, and the best so far; failures are marked below."""
     picture, ax = page.panel(style.Sheet.of(width, pitch=PITCH), SHAPE)
     loss = table["loss"].to_numpy()
     _scale(ax, loss)
@@ -47,7 +47,7 @@ def _title(table: xr.Dataset) -> str:
 
 
 def _scale(ax: Axes, loss: NDArray[np.float64]) -> None:
-    """Show the best and the bulk, without the farthest outliers above."""
+    """Fit the axis to the best and most other losses, without the largest outliers."""
     finite = loss[np.isfinite(loss)]
     if not finite.size:
         ax.set_yticks([])
@@ -70,7 +70,7 @@ def _draw_points(ax: Axes, table: xr.Dataset) -> None:
         if not here.any():
             continue
         above = int((loss[here] > top).sum())
-        label = f"{name} points" + (f" ({above} above the picture)" if above else "")
+        label = f"{name} points" + (f" ({above} above the plot)" if above else "")
         look = style.POINT_MARKS[name] | {"markersize": 3.0, "markeredgewidth": 0.0, "alpha": 0.55, "linestyle": "none"}
         ax.plot(episodes[here], loss[here], **page.sheet_of(ax).look(look), label=label, gid=name)
 
@@ -99,12 +99,12 @@ MARK_SPACING = 0.3  # between two markers of a line, as a share of the panel's d
 def race_figure(dataset: xr.Dataset, *, width: float | None = None) -> page.Picture:
     """Draw a race: mean best loss with its interval over seeds on the left, the ECDF over targets on the right.
 
-    `dataset` holds step functions, one row per method and NaN past its end: `episodes`, `mean`, `low`, `high`, shape
-    (method, step), and `hit`, shape (method, pair), the episodes after which each pair of seed and target was reached,
-    NaN where never. `unsuccessful`, shape (method,), counts the seeds without a successful episode; their methods have
-    no mean. Attributes: `title`, `budget`, `seeds`, `loss_unit`, `spacing` (log or linear), `targets` (count, hardest,
-    easiest), `lead` (who is first, in words), `identity`, `provenance`. A linear loss axis ends as far above the
-    easiest target as the hardest is below it, so that a few bad first losses do not flatten the rest.
+    `dataset` contains step functions, one row per method and NaN past its end: `episodes`, `mean`, `low`, `high`, shape
+    (method, step), and `hit`, shape (method, pair): the episodes after which each pair of seed and target was reached,
+    NaN for never. `unsuccessful`, shape (method,), counts the seeds without a successful episode; a method with such a
+    seed has no mean. Attributes: `title`, `budget`, `seeds`, `loss_unit`, `spacing` (log or linear), `targets` (count,
+    hardest, easiest), `lead` (the first method, as text), `identity`, `provenance`. A linear loss axis ends as far
+    above the easiest target as the hardest is below it, so that a few bad first losses do not flatten the rest.
     """
     sheet = style.Sheet.of(width, pitch=RACE_PITCH, columns=2)
     picture, (losses, shares) = page.panels(sheet, 2)
@@ -187,11 +187,10 @@ SHORT = 8  # letters of a method's name that stands in one line
 def league_figure(dataset: xr.Dataset, *, width: float | None = None) -> page.Picture:
     """Draw a league: the mean rank of each method in each scene, with its interval, and over all scenes last.
 
-    `dataset` holds `rank`, `rank_low` and `rank_high`, shape (scene, method), NaN where a method did not run or there
-    is no interval; `first` says where a method is ahead of every other after the correction for all pairs, which is
-    written in bold. The last scene stands for all. Attributes: `title`, `seeds` and `command`, as text. Columns stand
-    in the order of the methods. In a picture for print that is too narrow for them, intervals are left out, which the
-    legend says.
+    `dataset` contains `rank`, `rank_low` and `rank_high`, shape (scene, method), NaN where a method did not run or has
+    no interval. `first` says where a method is ahead of every other one after the correction for all pairs; these ranks
+    are bold. The last row is over all scenes. Attributes: `title`, `seeds` and `command`, as text. Columns are in the
+    order of the methods. A printed picture that is too narrow for intervals leaves them out, and the legend says so.
     """
     scenes, methods = dataset.sizes["scene"], dataset.sizes["method"]
     sheet = style.Sheet.of(width, pitch=LABELS + CELL * methods)
@@ -214,7 +213,7 @@ def league_figure(dataset: xr.Dataset, *, width: float | None = None) -> page.Pi
 
 
 def _write_cells(ax: Axes, dataset: xr.Dataset, most: float, *, told: bool) -> None:
-    """Write each rank into its cell, and its interval under it; hatch the cells that have none."""
+    """Write each rank into its cell with its interval under it; hatch cells without a rank."""
     sheet = page.sheet_of(ax)
     parts = [dataset[name].to_numpy() for name in ("rank", "rank_low", "rank_high")]
     for row, column in np.ndindex(*parts[0].shape):
@@ -251,9 +250,9 @@ def _frame(ax: Axes, dataset: xr.Dataset, *, upright: bool) -> None:
 
 
 def _legend(dataset: xr.Dataset, *, told: bool) -> list[Artist | str]:
-    """Say what stands in the cells."""
+    """Return the legend of the cells."""
     below = (
-        "below it the 95 % bootstrap interval, over seeds, and over scenes in the last row"
+        "below: 95 % bootstrap interval over seeds, and over scenes in the last row"
         if told
         else "intervals are in league.json"
     )
@@ -266,7 +265,7 @@ def _legend(dataset: xr.Dataset, *, told: bool) -> list[Artist | str]:
 
 
 def _in_two(name: str) -> str:
-    """Return a long name in two lines, broken at its last dash."""
+    """Break a long name into two lines at its last dash."""
     first, dash, second = name.rpartition("-")
     return f"{first}{dash}\n{second}" if dash and len(name) > SHORT else name
 

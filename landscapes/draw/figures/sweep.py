@@ -24,9 +24,9 @@ RATES, MIN_SECONDS = (10, 5, 4, 2), 4.0  # frames per second to choose from, so 
 
 @dataclass(frozen=True, eq=False)
 class Sweep:
-    """The same window sampled at growing `values` of what `label` names with its unit; one slice for each value.
+    """The same window sampled at increasing `values` of the quantity `label`, one slice for each value.
 
-    Those of a `logarithmic` one grow by equal ratios.
+    The values of a `logarithmic` sweep increase by equal ratios.
     """
 
     label: str
@@ -40,20 +40,20 @@ class Sweep:
         return self.label.partition(" [")[0]
 
     def write_value(self, value: float) -> str:
-        """Write a value with its unit, and as many decimals for each of them, or digits of a logarithmic one."""
+        """Write a value with its unit, with equal decimals for all values, or equal digits in a logarithmic sweep."""
         span = abs(self.values[-1] - self.values[0])
         decimals = min(9, max(0, 2 - math.floor(math.log10(span))))
         unit = self.label.partition(" [")[2].removesuffix("]")
         return f"{style.number(value, '.3g' if self.logarithmic else f'.{decimals}f')} {unit}".rstrip()
 
     def plot(self, number: int = -1) -> page.Picture:
-        """Draw a frame, by default the last, on the scales that all frames share."""
+        """Draw a frame, by default the last one, on the common scales of all frames."""
         return frame_figure(self, number, Scales.of(self))
 
 
 @dataclass(frozen=True, eq=False)
 class Scales:
-    """The scales that all frames of a sweep share; `slope` is None where there are no gradients."""
+    """The common scales of all frames of a sweep; `slope` is None without gradients."""
 
     loss: style.Scale
     slope: style.Scale | None
@@ -71,7 +71,7 @@ class Scales:
 def frame_figure(
     sweep: Sweep, number: int, scales: Scales, *, width: float | None = None, like: page.Picture | None = None
 ) -> page.Picture:
-    """Draw one frame: loss map, arrows, the value and where in its range it is; all stands where it does in `like`."""
+    """Draw one frame: loss map, arrows, and the value in its range, with the layout of `like`."""
     dataset, panels = sweep.slices[number], ["loss"] if scales.slope is None else ["loss", "slope"]
     plane, sheet = plane_of(dataset), style.Sheet.of(width, pitch=PITCH, columns=len(panels))
     picture = page.Picture(sheet, sheet.width)
@@ -91,7 +91,7 @@ def frame_figure(
 
 
 def save_films(sweep: Sweep, mp4: Path, gif: Path | None, *, dpi: int = DPI, loss: int = 18) -> None:
-    """Write a sweep as an MP4 and as a GIF, one picture for each slice, in a few seconds' length.
+    """Write a sweep as an MP4 and a GIF of a few seconds, one picture for each slice.
 
     `loss` is that of `film.save_film`.
     """
@@ -104,7 +104,7 @@ def save_films(sweep: Sweep, mp4: Path, gif: Path | None, *, dpi: int = DPI, los
 
 
 def _draw_range(ax: Axes, sweep: Sweep, value: float) -> None:
-    """Say the value, and mark it on a bar from the lowest to the highest."""
+    """Write the value, and mark it on a bar from the lowest to the highest."""
     ends, sheet = (sweep.values[0], sweep.values[-1]), page.sheet_of(ax)
     low, high, here = ((math.log10(one) if sweep.logarithmic else one) for one in (*ends, value))
     ax.set_gid("range")

@@ -1,4 +1,4 @@
-"""Symmetry: how far the losses and gradients of each replica are from those of the scene itself (matplotlib)."""
+"""Symmetry: differences of each replica's losses and gradients from those of the scene itself (matplotlib)."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ MARK = style.VARIANT_MARK | {"color": style.LOSS_LINE, "marker": "o"}
 
 
 def symmetry_figure(found: SymmetryRecord, *, width: float | None = None) -> page.Picture:
-    """Draw a row for each replica: how far losses are apart, and the cosines of gradients with the scene's own.
+    """Draw a row for each replica: the difference of losses, and the cosines of gradients with the scene's own.
 
-    Marks are the share of the range and the median cosine, both with 95 % intervals; hollow is the lower quartile of
-    cosines. Shaded is the floor of all replicas together, within its interval.
+    Marks are the share of the range and the median cosine, both with 95 % intervals. Hollow marks are the lower
+    quartile of cosines. The shaded band is the interval of the floor of all replicas together.
 
-    Raises ValueError where the page is too narrow or too wide.
+    Raises ValueError if the page is too narrow or too wide.
     """
     replicas, share = found.replicas, found.floor.share
     picture, axes = page.panels(style.Sheet.of(width, pitch=PITCH, columns=1, panels=2), 2)
@@ -41,7 +41,7 @@ def symmetry_figure(found: SymmetryRecord, *, width: float | None = None) -> pag
         ends = 100 * share.low, 100 * share.high
         axes[0].axvspan(*ends, color=style.BAND[0], zorder=0, gid="floor", label="all replicas together")
     axes[0].set_xlim(left=0)
-    page.name_axes(axes[0], "losses apart [% of the range]")
+    page.name_axes(axes[0], "difference of losses [% of the range]")
     page.name_axes(axes[1], "cosine of gradients with the scene's")
     page.entitle(picture, f"{found.env} · symmetry · {found.fidelity}, {found.points} points")
     page.finish(picture, heading=" · ".join(page.made_by(found)))

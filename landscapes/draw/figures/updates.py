@@ -1,4 +1,4 @@
-"""Updates: how losses are distributed after single updates, and after random steps as long (matplotlib)."""
+"""Updates: the distribution of losses after single updates, and after random steps of equal length (matplotlib)."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ PITCH, SHAPE = 6.2, 0.6  # room of the panel on a screen [inch]; its height by i
 
 
 def updates_figure(found: UpdatesRecord, *, width: float | None = None) -> page.Picture:
-    """Draw which share of steps ends at a loss or below: of updates along the gradient, and of random steps as long.
+    """Draw the cumulative share of steps by loss, for updates along the gradient and random steps of equal length.
 
-    Where the dashed line, the loss before, meets a curve is the share of steps that do not make it worse. Shaded are
-    the losses whose return is in the left tail. A curve ends below one where simulations failed, or losses are far
-    off the axis.
+    The dashed line is the loss before. It meets a curve at the share of steps that do not increase the loss. The losses
+    whose return is in the left tail are shaded. A curve ends below one if simulations failed, or if losses are far off
+    the axis.
 
-    Raises ValueError where the page is too narrow or too wide.
+    Raises ValueError if the page is too narrow or too wide.
     """
     picture, ax = page.panel(style.Sheet.of(width, pitch=PITCH), SHAPE)
     sheet = picture.sheet
@@ -47,6 +47,6 @@ def updates_figure(found: UpdatesRecord, *, width: float | None = None) -> page.
     if scale.logarithmic:
         page.log_axis(ax.xaxis)
     page.name_axes(ax, labelled("loss after one update", found.loss_unit), "share of steps")
-    page.entitle(picture, f"{found.env} · updates from {found.through} · {found.points} of them")
+    page.entitle(picture, f"{found.env} · {found.points} updates from {found.through}")
     page.finish(picture, heading=" · ".join(page.made_by(found)))
     return picture

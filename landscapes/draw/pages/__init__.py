@@ -1,1 +1,1 @@
-"""Pages that need no network: their templates and scripts, and what they are filled with."""
+"""Pages that need no network: templates, scripts, and the functions that fill them."""

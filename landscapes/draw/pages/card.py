@@ -1,4 +1,4 @@
-"""The report card as a page: a table of engines in scenes, with a panel of each slice, and nothing outside of it."""
+"""The report card as one self-contained page: a table of engines in scenes, with a panel for each slice."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ STOPS = 9  # of the gradient that stands for the colour map
 
 @dataclass(frozen=True)
 class CardRow:
-    """A grade with its panel: the picture as a link that holds it, the two axes, and where gradients oppose slopes."""
+    """A grade with its panel: the picture as a data link, the two axes, and the share of opposing gradients."""
 
     grade: Grade
     panel: str
@@ -38,7 +38,7 @@ class CardRow:
 
 @dataclass(frozen=True)
 class CardScene:
-    """The rows of a scene, which share a scale of losses: what its ends are, and its unit."""
+    """The rows of a scene, which share a loss scale, with the ends and the unit of that scale."""
 
     name: str
     rows: Sequence[CardRow]
@@ -49,19 +49,19 @@ class CardScene:
 
 
 def card_scenes(card: Card) -> list[CardScene]:
-    """Return what the table shows, scene by scene, with its panels drawn."""
+    """Return the contents of the table scene by scene, with drawn panels."""
     return [_scene(card, name, places) for name, places in card.scenes()]
 
 
 def card_page(card: Card) -> str:
-    """Return a page that holds all it shows, light and dark."""
+    """Return a self-contained page, for light and dark screens."""
     pages = templates()
     pages.filters |= FILTERS
     return pages.get_template("card.html").render(card=card, scenes=card_scenes(card), colours=colour_stops())
 
 
 def colour_stops() -> str:
-    """Return the colours of the losses, from the least to the largest, as CSS has them."""
+    """Return the colours of the losses in CSS, from the lowest to the highest."""
     colours = (255 * style.LOSS_MAP(np.linspace(0, 1, STOPS))[:, :3]).round().astype(int)
     return ", ".join(f"rgb({red} {green} {blue})" for red, green, blue in colours.tolist())
 

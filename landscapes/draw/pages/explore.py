@@ -1,4 +1,4 @@
-"""The page of the explorer: the map of a slice's page, with what moves the slice."""
+"""The page of the explorer: the map of a slice's page, with controls that move the slice."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ SCRIPT = "explore.js"
 def explore_page(
     space: ParameterSpace, nodes: Mapping[str, Any], *, title: str, about: str, look: Mapping[str, Any], gradients: bool
 ) -> str:
-    """Return the page: it begins with the picture `nodes` of the plane where somebody looks, and asks for finer ones.
+    """Return the page: it begins with the samples `nodes` of the first plane, and asks the server for finer ones.
 
-    `about` says how the objective is evaluated. The page holds its own scripts and its style.
+    `about` says how the objective is evaluated. The page contains its own scripts and style.
     """
     values = [space.to_values(end).tolist() for end in (space.lower, space.upper)]
     parameters = [

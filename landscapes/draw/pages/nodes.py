@@ -1,4 +1,4 @@
-"""What the map of a slice's page draws and says of its nodes, and the runs that are laid over it."""
+"""The data of the map on a slice's page: its nodes, and the runs that are drawn over it."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ Column = Sequence[float | None]  # of numbers, None for what is not finite
 
 @dataclass(frozen=True)
 class EpisodeShown:
-    """A node whose episode is shown, `at` which parameters it lies, and where its film and its picture are."""
+    """A node whose episode is shown, the parameters it is `at`, and its film and picture."""
 
     row: int
     column: int
@@ -44,15 +44,15 @@ class EpisodeShown:
 
     @property
     def files(self) -> list[str]:
-        """The files that there are of it."""
+        """The files of the episode that exist."""
         return [name for name in (self.mp4, self.webp) if name]
 
 
 @dataclass(frozen=True)
 class Search:
-    """A run that is laid over a slice: how it was made, and what became of it.
+    """A run that is drawn over a slice: how it was made, and how it ended.
 
-    `outside` counts the episodes beyond the map, `distance` is from the slice, the least and the most.
+    `outside` counts the episodes outside the map. `distance` is the smallest and the largest distance from the slice.
     """
 
     method: str
@@ -71,11 +71,11 @@ class Search:
 
 @dataclass(frozen=True)
 class Trajectory(Search):
-    """A run with its points, in the order of evaluation, for the map alone.
+    """A run with its points in the order of evaluation, which only the map needs.
 
-    Of every point: where it falls, its own loss, and how large its mark is [pixels] (the smaller, the farther off the
-    slice). `path` holds the points that were the best so far, `hidden` those beyond the map, `far` those that are more
-    than half a box off the slice, to which no line leads.
+    Each point has its position on the map, its own loss, and the size of its mark [pixels], which falls with the
+    distance from the slice. `path` lists the points that were the best so far, `hidden` those outside the map, and
+    `far` those more than half a box off the slice, which no line joins.
     """
 
     u: Column
@@ -87,7 +87,7 @@ class Trajectory(Search):
     far: Sequence[int]
 
     def search(self) -> Search:
-        """Return it without its points."""
+        """Return the run without its points."""
         return Search(**{one.name: getattr(self, one.name) for one in fields(Search)})
 
 
@@ -99,15 +99,15 @@ def read_off_nodes(
     *,
     growing: bool = False,
 ) -> dict[str, Any]:
-    """Read off a slice what the map draws and says of its nodes, as JSON for its script.
+    """Return the data of a slice's map as JSON for its script.
 
-    Nodes go row by row from the lowest v; arrays are packed, see `pack`. `loss` [unit] is float32, NaN where there is
-    none, and `status` uint8, by the numbers of `statuses`. `cells` and `looks` are the same as they are drawn,
-    where a refined slice, or one that is still `growing`, was not sampled everywhere. `slope` is the gradient along
-    the axes, `gradient` its length in all dimensions, float32 both. `finer` are flags of the cells between four
-    samples whose gradients contradict their losses. `floor` is the numerical floor at every node [loss unit], where
-    it was mapped. `scales` are those that the map can have, by name, `scale` that which it begins with. `azimuth`
-    is where the surface is seen from at first [degrees].
+    Nodes go row by row from the lowest v. Arrays are packed, see `pack`. `loss` [unit] is float32, NaN where there is
+    none. `status` is uint8, with the numbers of `statuses`. `cells` and `looks` are the same as they are drawn, where a
+    refined slice, or one that is still `growing`, was not sampled everywhere. `slope` is the gradient along the axes
+    and `gradient` its norm over all parameters, both float32. `finer` flags the cells between four samples whose
+    gradients contradict their losses. `floor` is the numerical floor at every node [loss unit], if it was mapped.
+    `scales` are the possible scales of the map by name, and `scale` the first one. `azimuth` is the first viewing
+    direction of the surface [degrees].
     """
     plane, loss = plane_of(dataset), dataset["loss"].to_numpy()
     own, flat = Scale.of_loss(loss), plane.rank == 2
@@ -138,12 +138,12 @@ def read_off_nodes(
 
 
 def pack(values: np.ndarray[Any, Any], kind: str = "f4") -> str:
-    """Return an array, in its own order, as little-endian numbers in base64: a browser decodes it once."""
+    """Return an array in its own order as little-endian numbers in base64, which a browser decodes once."""
     return base64.b64encode(values.astype(f"<{kind}").tobytes()).decode()
 
 
 def _axes(plane: Plane) -> list[dict[str, Any]]:
-    """Return the axes of a map: coordinates of nodes, where they are labelled, both logarithms on a logarithmic one."""
+    """Return the axes of a map: node coordinates and labels, as logarithms on a logarithmic axis."""
     found = []
     for label, places, scale in zip(plane.labels, (axis.tolist() for axis in plane.axes()), plane.scales, strict=True):
         ticks = (decades if scale == LOG10 else round_values)(places[0], places[-1])
@@ -152,9 +152,9 @@ def _axes(plane: Plane) -> list[dict[str, Any]]:
 
 
 def _scales(loss: np.ndarray[Any, Any], below: Sequence[float]) -> dict[str, dict[str, Any]]:
-    """Return the scales that a map's colours can have, or a line's height, which goes down to what lies below.
+    """Return the possible scales of a map's colours, or of a line's height, which includes the losses `below` it.
 
-    A logarithmic one is there where all losses are positive.
+    There is a logarithmic scale if all losses are positive.
     """
     scale, finite = Scale.of_loss(loss), loss[np.isfinite(loss)]
     low, high = scale.ends
@@ -173,12 +173,12 @@ def _scales(loss: np.ndarray[Any, Any], below: Sequence[float]) -> dict[str, dic
 
 
 def round_off(values: np.ndarray[Any, Any]) -> list[float | None]:
-    """Return numbers to six digits, None for what is not finite."""
+    """Return numbers with six digits, None for those that are not finite."""
     return [float(f"{value:.6g}") if np.isfinite(value) else None for value in values.tolist()]
 
 
 def lay_runs(dataset: xr.Dataset, tables: Sequence[xr.Dataset]) -> list[Trajectory]:
-    """Lay runs over a slice, the least loss first. Raises ValueError where one searched other parameters."""
+    """Project runs onto a slice, the lowest loss first. Raises ValueError if one searched other parameters."""
     runs = [lay(dataset, table, f"{table.attrs['method']}, seed {table.attrs['seed']}") for table in tables]
     reach = farthest_distance(runs)
     points = sum(run.sizes["evaluation"] for run in runs)

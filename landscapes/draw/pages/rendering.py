@@ -1,4 +1,4 @@
-"""The templates of pages, and how numbers stand in them."""
+"""The templates of pages, and the format of their numbers."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ OF_PLANES = ("profile", "surface")  # which a line does without
 
 
 def templates(*more: Path) -> jinja2.Environment:
-    """Return the templates here, after those of `more` folders, with the filters that all of them use."""
+    """Return these templates, after those in `more` folders, with the filters that all of them use."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
     pages = Environment(
@@ -30,10 +30,10 @@ def templates(*more: Path) -> jinja2.Environment:
 
 
 def scripts(rank: int) -> list[str]:
-    """Return the names of the scripts of a slice's page, in their order."""
+    """Return the names of the scripts on a slice's page, in order."""
     return [f"{name}.js" for name in SCRIPTS if rank == 2 or name not in OF_PLANES]
 
 
 def number(value: Any, digits: int = 4) -> str:
-    """Write a number with a minus sign, and anything else as it is."""
+    """Write a number with a proper minus sign, and anything else unchanged."""
     return f"{value:z.{digits}g}".replace("-", "\N{MINUS SIGN}") if isinstance(value, int | float) else str(value)

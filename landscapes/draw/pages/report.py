@@ -1,4 +1,4 @@
-"""One page about a landscape that anyone can open and send: one file, which asks no network."""
+"""A report about a landscape in one file, which anyone can open and send; it needs no network."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ if TYPE_CHECKING:
 MOST_NODES = 90_000  # of the map: with losses and gradients they take 2 MB
 WIDTH, HEIGHT = 400, 220  # of the curve of usefulness [pixels]
 LEFT, RIGHT, TOP, BOTTOM = 34, 26, 10, 38
-WORD_FOR_NONE = "nothing is resolved"
+WORD_FOR_NONE = "no verdict is resolved"
 DOWNLOAD = "download.js"
 
 
 @dataclass(frozen=True)
 class CheckShown:
-    """What a check found: whether all passed, what is wrong, and each finding."""
+    """The results of a check: whether all passed, the diagnoses, and each finding."""
 
     passed: bool
     diagnoses: Sequence[Diagnosis]
@@ -43,7 +43,7 @@ class CheckShown:
 
 @dataclass(frozen=True)
 class Mark:
-    """A point of the curve of usefulness [pixels], and what is said of it."""
+    """A point of the curve of usefulness [pixels], and its text."""
 
     x: float
     y: float
@@ -55,7 +55,7 @@ class Mark:
 
 @dataclass(frozen=True)
 class Curve:
-    """How gradients follow differences, by the width of these: marks, and where the axes have ticks [pixels]."""
+    """How gradients follow differences, by the width of the difference: marks and ticks of the axes [pixels]."""
 
     marks: Sequence[Mark]
     across: Sequence[tuple[float, str]]
@@ -76,11 +76,11 @@ def report_page(
     check: CheckShown | None = None,
     floor: xr.Dataset | None = None,
 ) -> str:
-    """Return a page about a slice and what was measured of it, which holds all that it shows.
+    """Return a self-contained page about a slice and its measures.
 
-    `record` is what the page offers as JSON, `picture` a PNG of the slice for print, `quoted` the words of somebody
-    else, and `where` they stand. `runs` are laid over the map. Films and pictures of `episodes` are links that hold
-    them. Of a slice of more than `MOST_NODES` samples the map has every so many along each axis, and says so.
+    `record` is the JSON that the page offers, and `picture` a PNG of the slice for print. `quoted` is the verdict of
+    somebody else, and `where` its source. `runs` are drawn over the map. Films and pictures of `episodes` are data
+    links. A slice with more than `MOST_NODES` samples is thinned for the map, and the page says so.
     """
     stride = _stride(dataset)
     shown = _every(dataset, stride)
@@ -108,7 +108,7 @@ def shown_of(
     quoted: Sequence[QuotedWord] = (),
     where: str = "",
 ) -> dict[str, Any]:
-    """Return what a page says of a slice, of how it was made, and of what was measured of it, if anything was."""
+    """Return the texts of a page: about the slice, how it was made, and its measures if there are any."""
     provenance = stored_provenance(dataset)
     return {
         "plane": plane_of(dataset).rank == 2,
@@ -130,7 +130,7 @@ def shown_of(
 def _entry(
     dataset: xr.Dataset, title: str, laid: Sequence[Trajectory], episodes: Sequence[EpisodeShown]
 ) -> dict[str, Any]:
-    """Return what the map of a slice's page shows."""
+    """Return the entry that the map of a slice's page shows."""
     identity = stored_identity(dataset)
     return {
         "id": title,
@@ -145,18 +145,18 @@ def _entry(
 
 
 def sentence(profile: Profile) -> str:
-    """Return the verdict as a sentence: the words that were measured, or that none is resolved."""
+    """Return the verdict as a sentence: the measured words, or that none is resolved."""
     said = ", ".join(profile.words) or WORD_FOR_NONE
     return f"{said[0].upper()}{said[1:]}."
 
 
 def data_link(data: bytes, kind: str) -> str:
-    """Return a link that holds a file of a media type."""
+    """Return a data link with a file of a media type."""
     return f"data:{kind};base64,{base64.b64encode(data).decode()}"
 
 
 def held_parameters(dataset: xr.Dataset) -> Iterator[tuple[str, float, str]]:
-    """Yield the parameters that a slice holds: name, value and unit."""
+    """Yield the parameters that a slice does not vary: name, value and unit."""
     plane = plane_of(dataset)
     varied = plane.basis.any(dim=0).tolist()
     for (name, unit), value, varies in zip(parameters_of(dataset), plane.origin.tolist(), varied, strict=True):
@@ -165,7 +165,7 @@ def held_parameters(dataset: xr.Dataset) -> Iterator[tuple[str, float, str]]:
 
 
 def curve_of(rows: Sequence[ScaleRow]) -> Curve | None:
-    """Return the curve of usefulness, None where nothing was compared."""
+    """Return the curve of usefulness, or None if nothing was compared."""
     known = [row for row in rows if math.isfinite(row.cosine.value)]
     if not known:
         return None
@@ -201,13 +201,13 @@ def _or(value: float, other: float) -> float:
 
 
 def _stride(dataset: xr.Dataset) -> int:
-    """Return how many samples lie from one that the map has to the next, along each axis."""
+    """Return the step in samples between neighbours on the map, along each axis."""
     rank, size = dataset["loss"].ndim, dataset["loss"].size
     return math.ceil((size / MOST_NODES) ** (1 / rank)) if size > MOST_NODES else 1
 
 
 def _every(dataset: xr.Dataset, stride: int) -> xr.Dataset:
-    """Return every so many samples of a slice along each axis, as a slice of that resolution."""
+    """Return every `stride`-th sample of a slice along each axis, as a slice of that resolution."""
     if stride == 1:
         return dataset
     plane, identity = plane_of(dataset), stored_identity(dataset)
@@ -220,6 +220,6 @@ def _every(dataset: xr.Dataset, stride: int) -> xr.Dataset:
 
 
 def inert(value: Any) -> str:
-    """Return a value as JSON that no text in it can end the script that it stands in."""
+    """Return a value as JSON in which no text can end the surrounding script."""
     text = json.dumps(to_json(value), separators=(",", ":"))
     return text.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")

@@ -1,4 +1,4 @@
-"""The words of a page: those that were measured, next to those of the paper."""
+"""The verdict on a page: the measured words next to those of the paper."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from ...measures.verdict import WORDS, QuotedWord, Verdict
 
 @dataclass(frozen=True)
 class Word:
-    """A word that was measured, or that the `paper` says; `measured` is None where that is not resolved."""
+    """A word that was measured, or that the `paper` uses; `measured` is None if that is not resolved."""
 
     word: str
     measured: bool | None
@@ -21,12 +21,12 @@ class Word:
     def comparison(self) -> str:
         """How the paper's word compares."""
         if not self.paper:
-            return "says nothing of it"
-        return {True: "agrees", False: "disagrees: it says so", None: "says so"}[self.measured]
+            return "not mentioned"
+        return {True: "agrees", False: "disagrees: claims this", None: "claims this"}[self.measured]
 
 
 def words_of(verdict: Verdict, quoted: Sequence[QuotedWord]) -> list[Word]:
-    """Return every word that was measured or is quoted."""
+    """Return every measured and every quoted word."""
     reasons, paper = verdict.reasons, {one.word: one.measured for one in quoted}
     return [
         Word(word, word in reasons or paper.get(word, False), reasons.get(word, ""), word in paper)

@@ -33,10 +33,10 @@ EXTENT = 2.0  # of the ground, in the view's diagonals
 
 
 def save_episode(episode: Episode, path: str | Path, *, title: str, longest: int = LONGEST) -> None:
-    """Write evenly spaced frames on the timeline `time` [s] as a rerun recording, with the view it opens in.
+    """Write evenly spaced frames on the timeline `time` [s] as a rerun recording, with its first view.
 
-    Solids, sheets and targets are surfaces, lumps their particles, which take a tenth of the room; sheets have no
-    thickness. No clock is recorded, so that equal episodes give equal recordings.
+    Solids, sheets and targets are surfaces. Lumps are particles, which take a tenth of the space. Sheets have no
+    thickness. The recording contains no clock time, so equal episodes give equal recordings.
     """
     view = episode.viewpoint()
     chosen = pick_frames(episode, longest)
@@ -51,7 +51,7 @@ def save_episode(episode: Episode, path: str | Path, *, title: str, longest: int
 
 
 def _log_part(stream: rr.RecordingStream, path: str, part: Part, episode: Episode, chosen: Sequence[int]) -> None:
-    """Log what does not change of a part once, and the rest at each frame, or once too where it rests."""
+    """Log the constant data of a part once, and the rest at each frame, or once if the part does not move."""
     for archetype in _static_parts(part):
         stream.log(path, archetype, static=True, strict=True)
     if is_still(part):
@@ -63,7 +63,7 @@ def _log_part(stream: rr.RecordingStream, path: str, part: Part, episode: Episod
 
 
 def _static_parts(part: Part) -> list[rr.AsComponents]:
-    """Return what is the same in all frames: the surface of a solid at the origin, or the faces of a sheet."""
+    """Return the data common to all frames: the surface of a solid at the origin, or the faces of a sheet."""
     color = _color(part)
     match part.shape:
         case "lump" | "path" | "trail":
@@ -75,7 +75,7 @@ def _static_parts(part: Part) -> list[rr.AsComponents]:
 
 
 def _at(part: Part, frame: int) -> rr.AsComponents:
-    """Return what a frame shows of a part."""
+    """Return the data of a part at a frame."""
     at, color = part.at[frame].numpy(), _color(part)
     match part.shape:
         case "lump" if part.material == "target":

@@ -36,12 +36,12 @@ RADIUS, LINE, DOT = 0.015, 0.003, 0.002  # of points on the plane, of lines, of 
 
 
 def save_stream(dataset: xr.Dataset, runs: Runs, path: str | Path) -> None:
-    """Write a slice and runs laid over it, as `overlay` does, as a rerun recording with the view it opens in.
+    """Write a slice with runs over it, as projected by `overlay`, as a rerun recording with its first view.
 
-    The surface's height and colour are the loss, on one scale for the slice and the runs; a sample that failed is a
-    hole. Every point stands at the loss it truly had, joined to the surface by a line where the two differ, and is
-    smaller the farther it lies off the plane. What is known after so many evaluations is what the timeline
-    `evaluation` shows there; nothing else, no clock, is recorded, so that equal runs give equal recordings.
+    The surface's height and colour are the loss, on one scale for the slice and the runs. A failed sample is a hole.
+    Every point is at the height of its own loss, and a line joins it to the surface where the two differ. Points get
+    smaller with the distance from the plane. The timeline `evaluation` shows what was known after each evaluation. The
+    recording contains no clock time, so equal runs give equal recordings.
     """
     body = Relief.of(dataset, joint_scale(dataset, runs))
     arrays = [dataset["loss"], *(run[name] for run in runs for name in ("x", "loss"))]
@@ -65,7 +65,7 @@ def save_stream(dataset: xr.Dataset, runs: Runs, path: str | Path) -> None:
 
 
 def _places(body: Relief, dataset: xr.Dataset, loss: Grid | None = None) -> Grid:
-    """Return where the points of a slice or of a run are, shape (..., 3); those beyond the window are at its border."""
+    """Return the positions of a slice's or a run's points, shape (..., 3), those outside the window at its border."""
     u, v = dataset["u"].to_numpy(), dataset["v"].to_numpy()
     if loss is None:
         loss = dataset["loss"].to_numpy()
@@ -93,7 +93,7 @@ def _surface(body: Relief, dataset: xr.Dataset) -> rr.Mesh3D:
 
 
 def _descent_arrows(body: Relief, dataset: xr.Dataset, scale: style.Scale | None = None) -> rr.Arrows3D:
-    """Lay the directions of steepest descent on the cells, coloured by the gradient's magnitude."""
+    """Put the directions of steepest descent on the cells, coloured by the gradient's magnitude."""
     rows, columns = (contour.arrows_along(dataset, name) for name in ("v", "u"))
     at = np.ix_(rows, columns)
     logarithm = contour.log_magnitude(dataset)
@@ -124,7 +124,7 @@ def _log_axes(stream: rr.RecordingStream, body: Relief, dataset: xr.Dataset) -> 
 
 
 def _log_key(stream: rr.RecordingStream, body: Relief, runs: Runs) -> None:
-    """Label the colours of points, behind the scene: the labels themselves in one that is read on every ground."""
+    """Label the colours of points behind the scene, in a text colour that is legible on every background."""
     shown = {name: style.POINT_MARKS[name]["color"] for run in runs for name, _ in by_kind(run)}
     if any(run["outside"].any() for run in runs):
         shown["outside"] = style.BEYOND
@@ -155,7 +155,7 @@ def _log_run(stream: rr.RecordingStream, body: Relief, run: xr.Dataset, reach: f
 
 
 def _log_gaps(stream: rr.RecordingStream, body: Relief, run: xr.Dataset, path: str, places: Grid) -> None:
-    """Join each point to the surface below or above it, where its loss is another."""
+    """Join each point to the surface below or above it if the losses differ."""
     feet = places.copy()
     feet[:, 2] = body.height(run["beneath"].to_numpy())
     apart = np.isfinite(run["loss"].to_numpy()) & (np.abs(feet[:, 2] - places[:, 2]) > RADIUS)
@@ -164,7 +164,7 @@ def _log_gaps(stream: rr.RecordingStream, body: Relief, run: xr.Dataset, path: s
 
 
 def _log_best(stream: rr.RecordingStream, body: Relief, run: xr.Dataset) -> None:
-    """Log the least loss so far as a curve and the points that lowered it in the scene."""
+    """Log the best loss so far as a curve, and the points that lowered it in the scene."""
     label, color, best = run.attrs["label"], style.method(run)["color"], run["best"].to_numpy()
     known = np.flatnonzero(np.isfinite(best))
     if not len(known):
@@ -200,7 +200,7 @@ def _log_lines(stream: rr.RecordingStream, path: str, rows: NDArray[np.intp], st
 
 
 def _times(rows: NDArray[np.intp]) -> list[rr.TimeColumn]:
-    """Return when rows became known: after so many evaluations."""
+    """Return the evaluations after which rows are known."""
     return [rr.TimeColumn(TIMELINE, sequence=rows + 1)]
 
 
@@ -234,30 +234,31 @@ def _ends(scale: style.Scale) -> tuple[str, str, str]:
 
 
 def _about(dataset: xr.Dataset, runs: Runs, body: Relief, reach: float) -> str:
-    """Say in Markdown what is to be seen, and where it comes from."""
+    """Describe in Markdown what the recording shows, and how it was made."""
     low, high, kind = _ends(body.scale)
     unit = dataset["loss"].attrs.get("units", "")
     distance = (
-        f"A point on the plane is largest; one {half_widths(reach)} off it has "
+        f"Points on the plane are largest. A point {half_widths(reach)} off it has "
         f"{style.FARTHEST_SHARE**0.5:.0%} of that radius."
         if reach
         else "Every point lies on the plane."
     )
     lines = [
         f"# {page.title(dataset)}",
-        f"Height and colour of the surface: loss from {low} to {high}{f' {unit}' if unit else ''}, {kind}, "
-        f"{HEIGHT:g} high; the window is {SIDE:g} wide. What is beyond the scale is cut off there. Holes are samples "
-        "that failed. Arrows point down the steepest slope; their colour is the gradient's magnitude.",
-        "A point stands at the loss it truly had; a grey line joins it to the surface where the slice shows another. "
-        + distance,
-        "Points are coloured by what they were evaluated for, as the labels over the scene say; failed episodes are on "
-        "the floor, points beyond the window at its border. The large points are each run's best so far.",
+        f"Height and colour of the surface are the loss, from {low} to {high}{f' {unit}' if unit else ''} ({kind}). "
+        f"The surface is {HEIGHT:g} high and the window {SIDE:g} wide. Losses beyond the scale are cut off. Holes are "
+        "failed samples. Arrows point along steepest descent, and their colour is the gradient's magnitude.",
+        "Each point is at the height of its own loss. A grey line joins it to the surface where the slice shows "
+        "another loss. " + distance,
+        "The colour of a point says what it was evaluated for; labels over the scene explain the colours. Failed "
+        "episodes are on the floor, and points outside the window are at its border. The large points are each run's "
+        "best so far.",
         "",
-        "| run | episodes | failed | beyond the window | best loss |",
+        "| run | episodes | failed | outside the window | best loss |",
         "|---|---|---|---|---|",
         *(_row(run) for run in runs),
         "",
-        f"Best losses are plotted as {'their decimal logarithm' if body.scale.logarithmic else 'they are'}.",
+        f"The plot of best losses is {'of their decimal logarithm' if body.scale.logarithmic else 'linear'}.",
         "",
         page.provenance(dataset),
     ]
@@ -272,18 +273,18 @@ def _row(run: xr.Dataset) -> str:
 
 
 def digest(arrays: Iterable[ArrayLike], title: str = "") -> str:
-    """Return a name that equal recordings share."""
+    """Return a name that is equal for equal recordings."""
     content = b"".join(np.ascontiguousarray(array).tobytes() for array in arrays)
     return hashlib.sha256(title.encode() + content).hexdigest()[:16]
 
 
 @contextmanager
 def recording(name: str, path: Path, blueprint: rrb.Blueprint) -> Iterator[rr.RecordingStream]:
-    """Give a stream to log to, and write the recording, with the view it opens in, to `path` at the end.
+    """Yield a stream to log to, and write the recording with its first view to `path` at the end.
 
-    `name` is that of the application too, since a viewer keeps one blueprint for each. No clock is recorded, and none
-    says what is put together into a chunk, so that equal logs give equal recordings. It is gathered in memory: on a
-    full disk rerun's own files end in the middle without an error, and their closing waits for ever.
+    `name` is also that of the application, because a viewer keeps one blueprint for each. The recording contains no
+    clock time, and none decides its chunks, so equal logs give equal recordings. It is collected in memory: on a full
+    disk rerun's own files end in the middle without an error, and closing them waits for ever.
     """
     stream = rr.RecordingStream(
         f"gradscape-{name}", recording_id=name, send_properties=False, batcher_config=rr.ChunkBatcherConfig.NEVER()
@@ -297,7 +298,7 @@ def recording(name: str, path: Path, blueprint: rrb.Blueprint) -> Iterator[rr.Re
 
 
 def save_sweep(sweep: Sweep, path: Path) -> None:
-    """Write the slices as surfaces on a rerun timeline named after what moves, numbered like the frames from 0."""
+    """Write the slices as surfaces on a rerun timeline named after the swept value, with frames from 0."""
     scales, first = Scales.of(sweep), sweep.slices[0]
     body = Relief.of(first, scales.loss)
     arrays = [np.asarray(sweep.values), *(one["loss"].to_numpy() for one in sweep.slices)]
@@ -327,8 +328,9 @@ def _about_sweep(sweep: Sweep, scale: style.Scale) -> str:
     low, high, kind = _ends(scale)
     lines = [
         f"# {page.title(sweep.slices[0])}\n",
-        f"One surface for each value of {sweep.label}, by number on the timeline. Height and colour: loss from {low} "
-        f"to {high}, {kind}, the same in all frames; beyond it the surface is cut off. Holes failed.\n",
+        f"One surface for each value of {sweep.label}, numbered on the timeline. Height and colour are the loss, from "
+        f"{low} to {high} ({kind}), on one scale for all frames. Losses beyond the scale are cut off. Holes are failed "
+        "samples.\n",
         f"| frame | {sweep.name} | lowest loss | failed |",
         "|---|---|---|---|",
         *(_row_sweep(sweep, number) for number in range(len(sweep.slices))),

@@ -1,4 +1,4 @@
-"""Rerun's viewers over a recording: on this machine only, and sending nothing anywhere."""
+"""Rerun's viewers for a recording; they serve this machine only, and send nothing anywhere."""
 
 from __future__ import annotations
 
@@ -37,9 +37,9 @@ POLICY = "default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:"
 
 
 def open_viewer(path: Path, *, wait: float = 2.0) -> None:
-    """Open a recording in rerun's own window, which stays when this process ends; it has to survive `wait` seconds.
+    """Open a recording in rerun's own window, which stays open when this process ends.
 
-    Raises OSError where it does not open, or rerun's program is not installed.
+    Raises OSError if the window does not stay open for `wait` seconds, or if rerun's program is not installed.
     """
     with tempfile.TemporaryFile() as log:
         viewer = _rerun(str(resolve(path)), "--port", "auto", log=log)
@@ -49,14 +49,14 @@ def open_viewer(path: Path, *, wait: float = 2.0) -> None:
             return
         log.seek(0)
         said = log.read().decode(errors="replace").split("\n\n")[0].strip() or f"exit code {code}"
-    raise OSError(f"rerun's viewer could not open a window ({said}); look at the recording in a browser with --serve")
+    raise OSError(f"rerun's viewer could not open a window ({said}); open the recording in a browser with --serve")
 
 
 @contextmanager
 def serve_recording(path: Path) -> Iterator[str]:
-    """Serve a recording with rerun's web viewer on the loopback interface, and give the address to open.
+    """Serve a recording with rerun's web viewer on the loopback interface, and yield the address to open.
 
-    Raises OSError where rerun's own server does not answer, or its program is not installed.
+    Raises OSError if rerun's own server does not answer, or if its program is not installed.
     """
     assets = _assets()
 
@@ -86,7 +86,7 @@ def serve_recording(path: Path) -> Iterator[str]:
 
 
 def _assets() -> dict[str, bytes]:
-    """Take the web viewer's files from rerun, which serves them and does not ship them otherwise."""
+    """Get the web viewer's files from rerun's server, because the package does not contain them as files."""
     port, other = _free_port(), _free_port()
     server = _rerun("--serve-web", "--web-viewer-port", str(port), "--port", str(other), log=subprocess.DEVNULL)
     try:
@@ -97,7 +97,7 @@ def _assets() -> dict[str, bytes]:
 
 
 def _fetch(address: str, server: subprocess.Popen[bytes]) -> bytes:
-    """Return what a server answers, which may be about to come up."""
+    """Return the answer of a server that may still be starting."""
     deadline = time.monotonic() + START_LIMIT
     while True:
         try:
@@ -113,7 +113,7 @@ def _fetch(address: str, server: subprocess.Popen[bytes]) -> bytes:
 def _rerun(*arguments: str, log: int | IO[bytes]) -> subprocess.Popen[bytes]:
     spec = find_spec("rerun_cli")
     if spec is None or not spec.submodule_search_locations:
-        raise OSError("rerun's viewer is not installed beside its library; reinstall rerun-sdk")
+        raise OSError("rerun's viewer is not installed next to its library; reinstall rerun-sdk")
     program = Path(next(iter(spec.submodule_search_locations))) / ("rerun.exe" if os.name == "nt" else "rerun")
     return subprocess.Popen(
         [str(program), "--bind", LOOPBACK, *arguments],

@@ -33,9 +33,9 @@ SIGHT_STEPS = 160  # of a line of sight across the surface
 
 @dataclass(frozen=True, eq=False)
 class Relief:
-    """Say where plane coordinates and losses are: the slice's window is centred, each of its sides SIDE long.
+    """The mapping from plane coordinates and losses to positions: a centred window with sides of length SIDE.
 
-    It is seen from the `azimuth` of the eye [degrees].
+    The eye looks from `azimuth` [degrees].
     """
 
     plane: Plane
@@ -44,7 +44,7 @@ class Relief:
 
     @classmethod
     def of(cls, dataset: xr.Dataset, scale: style.Scale) -> Relief:
-        """Return the relief of a slice, seen from where most of its valley is."""
+        """Return the relief of a slice, seen from the side that shows most of its valley."""
         flat = cls(plane_of(dataset), scale)
         return replace(flat, azimuth=azimuth(flat, dataset))
 
@@ -55,19 +55,19 @@ class Relief:
         return np.concatenate([flat, self.height(loss)[..., None]], axis=-1)
 
     def height(self, loss: Grid) -> Grid:
-        """Return the height of a loss, cut at both ends of the scale; NaN for none."""
+        """Return the height of a loss, clipped at both ends of the scale; NaN without a loss."""
         return HEIGHT * self.shade(loss)
 
     def shade(self, loss: Grid) -> Grid:
-        """Return where a loss is on the scale, 0 to 1; NaN for none."""
+        """Return the position of a loss on the scale, 0 to 1; NaN without a loss."""
         least = self.scale.ends[0] if self.scale.logarithmic else -np.inf
         with np.errstate(invalid="ignore"):
             return np.clip(np.asarray(self.scale.norm(np.maximum(loss, least)), dtype=np.float64), 0.0, 1.0)
 
     def ticks(self, axis: int) -> tuple[Grid, Grid]:
-        """Return round coordinates along u, v or the loss, and where they are along it, 0 to 1.
+        """Return round coordinates along u, v or the loss, and their positions on the axis, 0 to 1.
 
-        Of the loss none is at the foot, where another axis begins.
+        The axis of the loss has no tick at its foot, where another axis begins.
         """
         if axis < 2:
             low, high = (float(side[axis]) for side in self.plane.cell_bounds())
@@ -87,18 +87,18 @@ class Relief:
         return axis < 2 and self.plane.scales[axis] == LOG10
 
     def place(self, turn: float, away: float, up: float) -> tuple[float, float, float]:
-        """Return a place so far from the middle, at an angle from the eye [degrees]."""
+        """Return a position at a distance from the middle and an angle from the eye [degrees]."""
         angle = np.radians(self.azimuth + turn)
         return (float(away * np.cos(angle)), float(away * np.sin(angle)), FOCUS + up)
 
     @property
     def front(self) -> tuple[float, float]:
-        """On which side of the surface the edges in front are, -1 or 1 along u and v."""
+        """The side of the surface with the front edges, -1 or 1 along u and v."""
         x, y, _ = self.place(0.0, 1.0, 0.0)
         return float(np.sign(x)), float(np.sign(y))
 
     def beside(self, axis: int, share: float, away: float) -> tuple[float, float, float]:
-        """Return a place next to an axis: u and v along the edges in front, the loss up the edge at the right."""
+        """Return a position next to an axis: u and v along the front edges, the loss up the right edge."""
         (right, back), half, along = self.front, SIDE / 2, SIDE * (share - 0.5)
         if axis == 0:
             return (along, back * (half + away), 0.0)
@@ -119,9 +119,9 @@ class Relief:
 
 @dataclass(frozen=True)
 class Cells:
-    """Hold the cells of a slice as quadrilaterals: corners and outward normals, shape (face, 4, 3) and (face, 3).
+    """The cells of a slice as quadrilaterals: corners and outward normals, shape (face, 4, 3) and (face, 3).
 
-    `sample` is whose colour each has, a number of the flattened slice.
+    `sample` is the index in the flattened slice of the sample that gives each face its colour.
     """
 
     corners: Grid
@@ -130,16 +130,16 @@ class Cells:
 
     @property
     def triangles(self) -> NDArray[np.intp]:
-        """Return two triangles for each cell, as numbers of the corners one after another."""
+        """Return two triangles for each cell, as indices of the consecutive corners."""
         first = 4 * np.arange(len(self.corners))[:, None]
         return np.concatenate([first + np.array(corners) for corners in TRIANGLES])
 
 
 def cells(relief: Relief, dataset: xr.Dataset) -> Cells:
-    """Return a flat top for every sample, over its cell of the map, and upright walls down to what is next to it.
+    """Return a flat top for every sample over its cell of the map, and upright walls down to its neighbours.
 
-    Nothing is drawn between samples that was not sampled: a wall has the colour of the sample it belongs to, the higher
-    one. A sample that failed has no top, and like the border of the slice is walled down to the ground.
+    Nothing is interpolated: a wall has the colour of the higher of its two samples. A failed sample has no top. The
+    walls around it, and those at the border of the slice, go down to the ground.
     """
     height = relief.height(own_cells(dataset)["loss"].transpose("v", "u").to_numpy())
     rows, columns = np.nonzero(np.isfinite(height))
@@ -163,7 +163,7 @@ def cells(relief: Relief, dataset: xr.Dataset) -> Cells:
 
 
 def azimuth(relief: Relief, dataset: xr.Dataset) -> float:
-    """Return from which of the azimuths [degrees] most of the valley is seen, over what stands in front of it."""
+    """Return the azimuth [degrees] from which most of the valley is visible."""
     height = relief.height(own_cells(dataset)["loss"].transpose("v", "u").to_numpy())
     if not np.isfinite(height).any():
         return AZIMUTHS[0]
@@ -173,7 +173,7 @@ def azimuth(relief: Relief, dataset: xr.Dataset) -> float:
 
 
 def _visible_share(height: Grid, rows: NDArray[np.intp], columns: NDArray[np.intp], angle: float) -> float:
-    """Return which share of the cells the eye sees: on the way to it, nothing is higher than the line of sight."""
+    """Return the share of cells that the eye sees: nothing on the way is higher than the line of sight."""
     way = np.linspace(0.0, 1.5 * SIDE, SIGHT_STEPS)[1:, None]
     size = np.array(height.shape)
     at = np.stack([rows, columns]) + 0.5

@@ -39,9 +39,9 @@ SAMPLES = 40_000  # of the surfaces that throw it
 
 
 def save_replay(episode: Episode, mp4: str | Path, gif: str | Path, *, title: str = "", longest: int = LONGEST) -> int:
-    """Write evenly spaced frames, first and last among them, under a title as MP4 and GIF; return how many.
+    """Write evenly spaced frames, including first and last, under a title as MP4 and GIF; return their number.
 
-    Raises ValueError where the episode has no `parts`, OSError where ffmpeg could not write.
+    Raises ValueError if the episode has no `parts`, OSError if ffmpeg cannot write.
     """
     count = min(longest, len(episode.time))
     pictures = add_title(frames(episode, pick_frames(episode, count)), title)
@@ -50,7 +50,7 @@ def save_replay(episode: Episode, mp4: str | Path, gif: str | Path, *, title: st
 
 
 def add_title(pictures: Iterable[Picture], title: str) -> Iterator[Picture]:
-    """Put a title over pictures, in a strip of its own; none is put where there is no title."""
+    """Put a strip with a title over pictures, or leave them unchanged without a title."""
     strip = None
     for picture in pictures:
         if title and strip is None:
@@ -59,7 +59,7 @@ def add_title(pictures: Iterable[Picture], title: str) -> Iterator[Picture]:
 
 
 def _strip(title: str, width: int) -> Picture:
-    """Return a title on the background of a picture so wide [pixel]."""
+    """Return a strip with a title, as wide as the pictures [pixel]."""
     figure = Figure(figsize=(width / STRIP_DPI, STRIP), facecolor=solids.BACKGROUND)
     FigureCanvasAgg(figure)
     room = width / STRIP_DPI - 2 * page.MARGIN
@@ -71,20 +71,20 @@ def _strip(title: str, width: int) -> Picture:
 
 
 def pick_frames(episode: Episode, count: int) -> list[int]:
-    """Return evenly spaced frames, first and last among them, the fewer the shorter the episode."""
+    """Return evenly spaced frames, including first and last, and fewer of them for a short episode."""
     found: list[int] = np.unique(np.linspace(0, len(episode.time) - 1, count).round().astype(int)).tolist()
     return found
 
 
 def frames(episode: Episode, chosen: Sequence[int], *, height: int = HEIGHT, marked: bool = True) -> Iterator[Picture]:
-    """Yield pictures of the chosen frames, shape (height, width, 3); each has its time and a scale unless not `marked`.
+    """Yield pictures of the chosen frames, shape (height, width, 3), with time and scale if they are `marked`.
 
-    The scale is right at the middle of the view: what is nearer is larger.
+    The scale is exact at the middle of the view; nearer objects look larger.
 
-    Raises ValueError where the episode has no `parts`.
+    Raises ValueError if the episode has no `parts`.
     """
     if not episode.parts:
-        raise ValueError("the episode says not what its parts look like; give Episode its `parts`")
+        raise ValueError("the episode has no `parts` to draw; give Episode its `parts`")
     view = episode.viewpoint()
     shot = Shot.of(view, height)
     with _stage(view, shot) as plotter:
@@ -104,6 +104,7 @@ def frames(episode: Episode, chosen: Sequence[int], *, height: int = HEIGHT, mar
             if marked:
                 said = f"{style.number(float(episode.time[frame]), '.3g')} s"
                 _stamp(plotter, said, "time", solids.INSET)
+                _name_lost(plotter, outside(episode, shot, frame), shot)
             plotter.render()
             picture = np.array(plotter.screenshot(return_img=True))
             if marked:
@@ -113,16 +114,17 @@ def frames(episode: Episode, chosen: Sequence[int], *, height: int = HEIGHT, mar
 
 @dataclass(frozen=True)
 class Shot:
-    """Say how a view is seen: where the eye looks, and from how far away; `size` of the picture is width and height."""
+    """The camera of a view: the point it looks at, its distance, and the `size` of the picture, width and height."""
 
     center: Grid  # [m]
     far: float  # [m]
     half: float  # of what is seen above and below the middle at the front of the view [m]
     size: tuple[int, int]  # [pixel]
+    axes: tuple[Grid, Grid, Grid]  # right, up and towards the eye
 
     @classmethod
     def of(cls, view: View, height: int) -> Shot:
-        """Return how the whole box of a view is seen in a picture so high."""
+        """Return the camera that shows the whole box of a view in a picture of a height [pixel]."""
         low, high = np.array(view.lower), np.array(view.upper)
         right, up, eye = axes(view)
         corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
@@ -131,16 +133,23 @@ class Shot:
         width = round(height * float(np.clip(wide / tall, *LIKELY))) // 2 * 2
         half = 1.06 * max(tall, wide * height / width) / 2
         far = half / np.tan(np.radians(solids.ANGLE) / 2) + np.ptp((corners - center) @ eye) / 2
-        return cls(center, float(far), float(half), (width, height))
+        return cls(center, float(far), float(half), (width, height), (right, up, eye))
+
+    def shows(self, points: Grid, margin: float = 0.0) -> bool:
+        """Say whether the picture shows any of these points [m], shape (point, 3), with a `margin` [m] around them."""
+        across, up, near = ((points - self.center) @ axis for axis in self.axes)
+        reach = (self.far - near) * np.tan(np.radians(solids.ANGLE) / 2)
+        inside = (abs(up) - margin < reach) & (abs(across) - margin < reach * self.size[0] / self.size[1])
+        return bool(inside.any())
 
     @property
     def metre(self) -> float:
-        """How long a metre is at the middle of the view [pixel]."""
+        """The length of a metre at the middle of the view [pixel]."""
         return float(self.size[1] / 2 / (self.far * np.tan(np.radians(solids.ANGLE) / 2)))
 
     @property
     def bar(self) -> float:
-        """A round length that a scale may have [m]."""
+        """A round length for the scale bar [m]."""
         most = BAR * self.size[0] / self.metre
         power = 10.0 ** np.floor(np.log10(most))
         return float(next(step * power for step in (5, 2, 1) if step * power <= most))
@@ -148,7 +157,7 @@ class Shot:
 
 @contextmanager
 def _stage(view: View, shot: Shot) -> Iterator[pv.Plotter]:
-    """Give a plotter with lights and a camera that sees the view's box."""
+    """Yield a plotter with lights and a camera that sees the view's box."""
     center, (_, _, eye) = shot.center, axes(view)
     diagonal = float(np.linalg.norm(np.array(view.upper) - np.array(view.lower)))
     with off_screen(shot.size) as plotter:
@@ -165,21 +174,30 @@ def _stage(view: View, shot: Shot) -> Iterator[pv.Plotter]:
 
 
 def _write_scale(plotter: pv.Plotter, shot: Shot) -> None:
-    """Write how long the scale's bar is, over its place at the lower right; it may be the wider of the two."""
+    """Write the length of the scale bar over it at the lower right; the text may be wider than the bar."""
     right, lift = solids.INSET
     over = (shot.size[0] - right, lift + 2 * solids.THICK)
     _stamp(plotter, f"{style.number(shot.bar)} m", "scale", over).justification_horizontal = "right"
 
 
 def _stamp(plotter: pv.Plotter, said: str, name: str, position: tuple[int, int]) -> pv.TextProperty:
-    """Write on a picture, on a ground that lets little through, and return how it is written."""
+    """Write a text on a nearly opaque background, and return its style."""
     actor = plotter.add_text(said, name=name, position=position, **solids.STAMP)
     actor.prop.background_color, actor.prop.background_opacity = solids.BACKGROUND, solids.VEIL
     return actor.prop
 
 
+def _name_lost(plotter: pv.Plotter, lost: Sequence[str], shot: Shot) -> None:
+    """Write at the upper left which bodies have left the picture, nothing where none has."""
+    plotter.remove_actor("lost", reset_camera=False, render=False)
+    if lost:
+        right, down = solids.INSET
+        over = (right, shot.size[1] - down)
+        _stamp(plotter, f"outside the picture: {', '.join(lost)}", "lost", over).justification_vertical = "top"
+
+
 def _draw_bar(picture: Picture, shot: Shot) -> None:
-    """Draw the scale's bar into a picture, at its lower right."""
+    """Draw the scale bar into a picture at the lower right."""
     right, bottom = (size - inset for size, inset in zip(shot.size, solids.INSET, strict=True))
     color = pv.Color(solids.STAMP["color"]).int_rgb
     picture[bottom - solids.THICK : bottom, right - round(shot.bar * shot.metre) : right] = color
@@ -193,13 +211,22 @@ def axes(view: View) -> tuple[Grid, Grid, Grid]:
     return right, np.cross(eye, right), eye
 
 
+def outside(episode: Episode, shot: Shot, frame: int) -> list[str]:
+    """Name the bodies that a picture of a frame does not show: sheets and lumps, or else balls."""
+    moving = [part for part in episode.parts if part.material not in ("target", "goal") and not is_still(part)]
+    bodies = [part for part in moving if part.shape in ("sheet", "lump")]
+    bodies = bodies or [part for part in moving if part.shape == "sphere"]
+    lost = [part for part in bodies if not shot.shows(part.at[frame].double().numpy(), (part.size or (0.0,))[0])]
+    return list(dict.fromkeys("ball" if part.shape == "sphere" else part.material for part in lost))
+
+
 def goal_parts(episode: Episode) -> list[Part]:
-    """Return the targets that bodies are to become: of them, what is missed is drawn."""
+    """Return the targets that bodies should reach; the parts that they miss are drawn."""
     return [part for part in episode.parts if part.shape == "lump" and part.material == "target"]
 
 
 def missed_surface(goal: pv.PolyData, bodies: Sequence[Part], frame: int) -> pv.PolyData:
-    """Return what of a target's surface bodies do not reach: what is away from their particles."""
+    """Return the part of a target's surface that no particle of a body reaches."""
     pitch = max(part.size[0] for part in bodies)
     every = np.concatenate([part.at[frame].numpy() for part in bodies])
     away, _ = cKDTree(every).query(goal.points, distance_upper_bound=2 * AWAY_DISTANCE * pitch)
@@ -223,14 +250,14 @@ def _place(plotter: pv.Plotter, parts: Sequence[Part], surfaces: Sequence[pv.Pol
 
 
 def is_still(part: Part) -> bool:
-    """Whether a part is the same in all frames."""
+    """Say whether a part is the same in all frames."""
     return part.shape != "trail" and all(
         bool((rows == rows[:1]).all()) for rows in (part.at, part.turn) if rows is not None
     )
 
 
 def _lay_ground(plotter: pv.Plotter, view: View, bodies: Sequence[pv.PolyData]) -> None:
-    """Lay the ground under the view, darker where solids stand in the light, fading into the background."""
+    """Draw the ground under the view, with the shadows of solids, fading into the background."""
     assert view.ground is not None  # the caller asked
     low, high = np.array(view.lower), np.array(view.upper)
     center, half = (low + high) / 2, EXTENT * float(np.linalg.norm(high - low)) / 2
@@ -249,7 +276,7 @@ def _lay_ground(plotter: pv.Plotter, view: View, bodies: Sequence[pv.PolyData]) 
 
 
 def _shadow(bodies: Sequence[pv.PolyData], ground: float, x: Grid, z: Grid) -> Grid:
-    """Return how much of the key light solids take from the ground, shape (x, z), 0 to 1."""
+    """Return the share of the key light that solids block on the ground, shape (x, z), 0 to 1."""
     spots = np.concatenate([_scatter_points(solid) for solid in bodies if solid.n_cells] or [np.zeros((0, 3))])
     lift = spots[:, 1:2] - ground
     shift = np.array(solids.KEY)

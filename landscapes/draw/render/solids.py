@@ -30,7 +30,7 @@ WIRE = 0.006  # radius of a tank's edges, per width
 
 @contextmanager
 def off_screen(size: tuple[int, int]) -> Iterator[pv.Plotter]:
-    """Give an empty, unlit plotter on white, of a size [pixel], that needs no display and closes at the end."""
+    """Yield an empty, unlit plotter on white of a size [pixel]; it needs no display and closes at the end."""
     _import_triton()
     with pv.vtk_verbosity("error"):  # otherwise VTK warns that there is no X server, and renders without
         plotter = pv.Plotter(off_screen=True, window_size=list(size), lighting="none")
@@ -42,9 +42,9 @@ def off_screen(size: tuple[int, int]) -> Iterator[pv.Plotter]:
 
 
 def _import_triton() -> None:
-    """Import triton before Mesa renders, if a CUDA build of torch has brought it.
+    """Import triton before Mesa renders, if a CUDA build of torch has installed it.
 
-    Both carry LLVM. With Mesa's loaded first, whatever imports triton later crashes: torch does so in `torch.func`.
+    Both contain LLVM. If Mesa's is loaded first, a later import of triton crashes, for example in `torch.func`.
     """
     if find_spec("triton"):
         import_module("triton")
@@ -74,7 +74,7 @@ def mesh(part: Part, frame: int) -> pv.PolyData:
 
 
 def lump(x: Grid, pitch: float) -> pv.PolyData:
-    """Return the surface of what particles about `pitch` apart fill; stray ones are drops of their own."""
+    """Return the surface around particles about `pitch` apart; stray ones become separate drops."""
     step = pitch / 2
     low = x.min(axis=0) - 4 * pitch
     shape = np.ceil((x.max(axis=0) + 4 * pitch - low) / step).astype(int)
@@ -93,7 +93,7 @@ def lump(x: Grid, pitch: float) -> pv.PolyData:
 
 
 def tube(points: Grid, radius: float) -> pv.PolyData:
-    """Return a tube through points, shape (point, 3), round at its ends."""
+    """Return a tube through points, shape (point, 3), with round ends."""
     apart = np.linalg.norm(np.diff(points, axis=0, prepend=np.inf), axis=1) > 1e-9
     path = points[apart]
     ball = _revolve(_circle(radius))
@@ -149,11 +149,11 @@ def _solid(part: Part) -> pv.PolyData:
             return _pan(*size)
         case "ladle":
             return _ladle(*size)
-    raise ValueError(f"no solid is called {part.shape!r}")
+    raise ValueError(f"unknown solid {part.shape!r}")
 
 
 def _ladle(radius: float, half: float, height: float) -> pv.PolyData:
-    """Return half a spherical shell below the origin, its handle upright at the left of its rim."""
+    """Return half a spherical shell below the origin, with an upright handle at the left of its rim."""
     outer = _turn(math.pi / 2, radius + half, (0.0, 0.0), ARC)
     rim = _turn(math.pi, half, (radius, 0.0), 8, start=math.pi / 2)
     inner = _turn(math.pi / 2, radius - half, (0.0, 0.0), ARC)[::-1]
@@ -162,14 +162,14 @@ def _ladle(radius: float, half: float, height: float) -> pv.PolyData:
 
 
 def _pan(flat: float, bend: float, sweep: float) -> pv.PolyData:
-    """Return a round bottom whose edge bends up along an arc, a little lower so that what lies in it is seen."""
+    """Return a round bottom whose edge bends up along an arc, a little lower so that its contents are visible."""
     upper = np.concatenate([[[0.0, -DEEP]], _turn(sweep, bend + DEEP, (flat, bend), ARC)])
     lower = np.concatenate([_turn(sweep, bend + DEEP + SHEET, (flat, bend), ARC)[::-1], [[0.0, -DEEP - SHEET]]])
     return _revolve(np.concatenate([upper, lower])[::-1])
 
 
 def _tank(x: float, y: float, z: float) -> pv.PolyData:
-    """Return the edges of a box that stands on the origin."""
+    """Return the edges of a box with its bottom at the origin."""
     a, b = x / 2, z / 2
     low = np.array([[-a, 0, -b], [a, 0, -b], [a, 0, b], [-a, 0, b]])
     high = low + np.array([0, y, 0])
@@ -190,12 +190,12 @@ def _turn(sweep: float, radius: float, center: tuple[float, float], facets: int,
 
 
 def _corners(profile: list[tuple[float, float]]) -> Grid:
-    """Repeat what is between a profile's ends, so that edges stay sharp."""
+    """Repeat the inner points of a profile, so that edges stay sharp."""
     return np.repeat(np.array(profile, dtype=np.float64), 2, axis=0)[1:-1]
 
 
 def _revolve(profile: Grid, around: int = AROUND) -> pv.PolyData:
-    """Turn a profile (out, up), shape (point, 2), about the y axis, the solid being to its left."""
+    """Turn a profile (out, up), shape (point, 2), about the y axis, with the solid on its left."""
     angle = np.linspace(0.0, 2 * math.pi, around + 1)
     out, up = profile.T[:, :, None]
     shell = np.stack([out * np.cos(angle), up + 0 * angle, -out * np.sin(angle)], axis=-1)
@@ -254,7 +254,7 @@ BACK = {"cloth": "#b9cfe2", "dough": "#a86b2d"}  # the other side of sheets
 
 
 def look(part: Part) -> dict[str, Any]:
-    """Return how a part is drawn."""
+    """Return the style of a part."""
     chosen = dict(LOOKS[part.material])
     if part.material == "plasticine":
         chosen["color"] = CLAY[part.tint % len(CLAY)]
@@ -266,5 +266,5 @@ def look(part: Part) -> dict[str, Any]:
 
 
 def solid(part: Part) -> bool:
-    """Whether a part throws a shadow."""
+    """Say whether a part throws a shadow."""
     return part.material not in ("syrup", "target", "glass") and part.shape != "trail"

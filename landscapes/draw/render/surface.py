@@ -1,4 +1,4 @@
-"""A slice as a lit surface of flat cells, with runs draped on it (pyvista, off-screen; labels by matplotlib)."""
+"""A slice as a lit surface of flat cells, with runs on it (pyvista, off-screen; labels by matplotlib)."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ ROOM = 0.02  # about the frame, in the picture
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """Hold a scene that is ready to be drawn in so many pixels."""
+    """A scene that is ready to be drawn at a size in pixels."""
 
     plotter: pv.Plotter
     relief: Relief
@@ -51,19 +51,18 @@ class Shown:
     projection: Grid  # the matrix that takes positions to the picture
 
     def on_picture(self, places: Grid) -> Grid:
-        """Return where positions, shape (point, 3), are in the picture [pixel], from its upper left corner."""
+        """Return the picture coordinates [pixel] of positions, shape (point, 3), from the upper left corner."""
         clip = np.concatenate([places, np.ones((len(places), 1))], axis=1) @ self.projection.T
         flat = clip[:, :2] / clip[:, 3:]
         return np.stack([flat[:, 0] + 1, 1 - flat[:, 1]], axis=1) / 2 * self.pixels
 
 
 def save_surface(dataset: xr.Dataset, runs: Runs, png: str | Path, gltf: str | Path) -> None:
-    """Write a slice, and runs laid over it as `overlay` does, as a picture and as a model to turn around.
+    """Write a slice with runs over it, as projected by `overlay`, as a picture and as a glTF model to turn.
 
-    The model is turned so that who opens it looks at it from where the picture does: in glTF y points up and z to who
-    looks.
+    The first view of the model is that of the picture: in glTF y points up and z points to the viewer.
 
-    Raises ValueError where the slice is a line.
+    Raises ValueError if the slice is a line.
     """
     page.save(surface_figure(dataset, runs), png)
     with scene(dataset, runs) as shown, replacing(Path(gltf)) as partial:
@@ -77,11 +76,11 @@ def save_surface(dataset: xr.Dataset, runs: Runs, png: str | Path, gltf: str | P
 
 
 def surface_figure(dataset: xr.Dataset, runs: Runs = (), *, width: float | None = None) -> page.Picture:
-    """Draw a slice as a body whose height and colour are the loss: every sample is flat, those that failed are holes.
+    """Draw a slice as a body whose height and colour are the loss: samples are flat, failed ones are holes.
 
-    It is seen from the side, of eight, from which most of the valley is, its lowest tenth.
+    It is seen from the one of eight sides that shows most of the valley, the lowest tenth of the losses.
 
-    Raises ValueError where the slice is a line, or the page too narrow or too wide.
+    Raises ValueError if the slice is a line, or if the page is too narrow or too wide.
     """
     sheet = style.Sheet.of(width, pitch=PITCH)
     fine = max(1.0, FINE * sheet.width / PIXELS[0]) if width else 1.0
@@ -100,9 +99,9 @@ def surface_figure(dataset: xr.Dataset, runs: Runs = (), *, width: float | None 
 
 @contextmanager
 def scene(dataset: xr.Dataset, runs: Runs, *, pixels: tuple[int, int] = PIXELS) -> Iterator[Shown]:
-    """Give the scene of a slice and of runs laid over it.
+    """Yield the scene of a slice with runs over it.
 
-    Raises ValueError where the slice is a line.
+    Raises ValueError if the slice is a line.
     """
     plane = plane_of(dataset)
     if plane.rank != 2:
@@ -148,7 +147,7 @@ def _add_frame(plotter: pv.Plotter, body: Relief) -> None:
 
 
 def _add_run(plotter: pv.Plotter, body: Relief, run: xr.Dataset) -> None:
-    """Drape a run's points on the surface, where its loss differs above or below it, and join its descents."""
+    """Draw a run's points at the height of their own losses, and join its descents."""
     places = body.at(*(run[name].to_numpy() for name in ("u", "v", "loss"))) + np.array([0.0, 0.0, LIFT])
     shown = ~run["outside"].to_numpy() & np.isfinite(run["loss"].to_numpy())
     label, color = run.attrs["label"], style.method(run)["color"]
@@ -170,7 +169,7 @@ def _add_run(plotter: pv.Plotter, body: Relief, run: xr.Dataset) -> None:
 
 
 def _crop(ax: Axes, shown: Shown) -> None:
-    """Show what the frame takes up of the picture, and a little about it."""
+    """Crop the picture to the frame with a small margin."""
     a = SIDE / 2
     box = np.array([(x, y, z) for x in (-a, a) for y in (-a, a) for z in (0.0, HEIGHT)])
     spots = shown.on_picture(box)
@@ -183,7 +182,7 @@ def _crop(ax: Axes, shown: Shown) -> None:
 
 
 def _label(ax: Axes, dataset: xr.Dataset, shown: Shown) -> None:
-    """Write ticks and names next to the frame's two lower edges in front and the one at the right."""
+    """Write ticks and names next to the two lower front edges of the frame and the right one."""
     sheet, body = page.sheet_of(ax), shown.relief
     room = sheet.type / sheet.zoom  # that type takes up of the scene
     for axis, name in enumerate((*body.plane.labels, page.loss_name(dataset))):
@@ -207,14 +206,14 @@ def _name(ax: Axes, shown: Shown, axis: int, name: str, away: float) -> None:
 
 
 def _signs(sheet: style.Sheet, runs: Runs) -> list[Artist | str]:
-    """Say what stands for kinds of points and for methods."""
+    """Return the legend of kinds of points and of methods."""
     dot = {"linestyle": "none", "marker": "o", "markersize": 6.0}
     kinds = dict.fromkeys(name for run in runs for name, _ in by_kind(run))
     found: list[Artist | str] = [page.sign(sheet, k, dot | {"color": style.POINT_MARKS[k]["color"]}) for k in kinds]
     methods = {str(run.attrs["method"]): style.method(run)["color"] for run in runs}
     found += [page.sign(sheet, f"{m}: best", dot | {"markersize": 10.0, "color": c}) for m, c in methods.items()]
     outside = sum(int(run["outside"].sum()) for run in runs)
-    return [*found, f"beyond the slice: {outside} points"] if outside else found
+    return [*found, f"outside the slice: {outside} points"] if outside else found
 
 
 def _holes(dataset: xr.Dataset) -> list[str]:

@@ -24,11 +24,11 @@ from gradscape.envs.mpm.fluid import (
     SEGMENTS,
     SHELL,
     SPAN,
+    SPEED,
     STEPS,
     SYRUP_DENSITY,
     TANK_HEIGHT,
     TANK_WIDTH,
-    UNIT,
     Fluid,
 )
 from gradscape.landscapes.objective import Status
@@ -142,7 +142,7 @@ def test_a_heavy_cube_that_is_half_in_goes_under(narrow):
 def test_walls_that_stick_slow_the_syrup_along_them():
     fidelity = replace(Fluid.fidelities["draft"], precision="float64")
     x = STILL.clone()
-    x[0, 1::2] = 2.0  # the ladle goes up and takes syrup along
+    x[0, 1::2] = SPEED  # the ladle goes up and takes syrup along
     moved = {}
     for walls in ("slip", "stick"):
         scene = Fluid(fidelity=fidelity, device="cpu", walls=walls, horizon=0.2)
@@ -155,20 +155,20 @@ def test_walls_that_stick_slow_the_syrup_along_them():
 
 def test_the_ladles_speed_eases(tiny):
     x = STILL.clone()
-    x[0, 0], x[0, 2] = 0.5, -0.5
-    speed = tiny.tools(x)[0, :, 0, 0].diff() / SPAN / UNIT
+    x[0, 0], x[0, 2] = 0.1, -0.1
+    speed = tiny.tools(x)[0, :, 0, 0].diff() / SPAN
     ramp = torch.arange(1, EASING + 1, dtype=torch.float64) / EASING
     steps = STEPS // SEGMENTS
     torch.testing.assert_close(tiny.tools(x)[0, 0, 0], torch.tensor(RIM, dtype=torch.float64))
-    torch.testing.assert_close(speed[:EASING], 0.5 * ramp)
-    torch.testing.assert_close(speed[steps : steps + EASING], 0.5 - ramp)
-    jumping = Fluid(fidelity=TINY, device="cpu", easing=False).tools(x)[0, :, 0, 0].diff() / SPAN / UNIT
-    torch.testing.assert_close(jumping[:steps], torch.full((steps,), 0.5, dtype=torch.float64))
+    torch.testing.assert_close(speed[:EASING], 0.1 * ramp)
+    torch.testing.assert_close(speed[steps : steps + EASING], 0.1 - 0.2 * ramp)
+    jumping = Fluid(fidelity=TINY, device="cpu", easing=False).tools(x)[0, :, 0, 0].diff() / SPAN
+    torch.testing.assert_close(jumping[:steps], torch.full((steps,), 0.1, dtype=torch.float64))
 
 
 def test_a_wall_seldom_stops_the_ladle(tiny):
     x = tiny.space.uniform(512, seed=0)
-    wanted = SPAN * ease(hold(UNIT * x.view(512, SEGMENTS, 2), STEPS), EASING)
+    wanted = SPAN * ease(hold(x.view(512, SEGMENTS, 2), STEPS), EASING)
     stopped = ((tiny.tools(x)[:, :, 0, :2].diff(dim=1) - wanted).abs() > 1e-9).any(dim=2)
     assert 0 < stopped.double().mean() < 0.15
 

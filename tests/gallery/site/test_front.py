@@ -235,7 +235,7 @@ def test_most_is_said_where_the_interval_says_so() -> None:
         tile("d", ["rugged"]),
     ]
     smooth, follow = answers([*tiles, tile("e", ["rugged"], census=False)])
-    assert "Of 4 environments" in smooth
+    assert "many slices of 4 environments" in smooth
     assert "very smooth in a, smooth with local minima in none, and rugged in c and d." in smooth
     assert "in most slices of a." in follow
     assert not _is_most(Estimate(0.9, 0.2, 1.0))

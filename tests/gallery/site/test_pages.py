@@ -74,7 +74,7 @@ def test_the_map_says_what_is_under_the_pointer_and_the_keys(filed: str, data: P
     assert told(page, "speed") == pytest.approx(float(dataset["u"][2]), rel=1e-3)
     assert told(page, "force") == pytest.approx(float(dataset["v"][4]), rel=1e-3)
     assert told(page, "Gradient along the slice") == pytest.approx(slope[4, 2, 0], rel=1e-3)
-    assert told(page, "Gradient’s length") == pytest.approx(np.linalg.norm(slope[4, 2]), rel=1e-3)
+    assert told(page, "Gradient norm") == pytest.approx(np.linalg.norm(slope[4, 2]), rel=1e-3)
     page.clock.install()
     page.mouse.move(*point_at(page, 11, 11))
     assert "Loss: not finite" in page.inner_text("#readout")

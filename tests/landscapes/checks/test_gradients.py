@@ -36,7 +36,7 @@ def test_a_gradient_that_grows_with_the_episode_alone_fails():
     checked = outcomes(Sound(), horizons={1: Sound, 4: steep})
     assert {name for name, found in checked.items() if found.bad} == {"growth over horizons"}
     found = checked["growth over horizons"]
-    assert found.why == "gradients grow where motions do not part: too steep at 3 of 3 points at 4x"
+    assert found.why == "gradients grow although motions do not diverge: too steep at 3 of 3 points at 4x"
     assert outcomes(Sound(), horizons={1: refusing})["growth over horizons"].outcome == "skip"
 
 
@@ -60,7 +60,7 @@ def test_forward_is_held_against_reverse():
 
 def test_a_wrong_gradient_at_a_special_place_is_said_with_what_it_should_be():
     found = outcomes(WrongWhere())["special places"]
-    assert "at zero, by a, the gradient is 243 and the loss rises by 6 and 6 to either side" in found.why
+    assert "at zero, by a, the gradient is 243, but the loss rises by 6 and 6 to either side" in found.why
 
 
 @pytest.mark.parametrize("side", [0.0, 0.4, 1.0])
@@ -99,4 +99,4 @@ def test_memory_that_runs_out_is_said_with_what_to_do():
 
     found = [finding for finding in check(Large(), Settings(power=0.3)) if finding.bad]
     assert found
-    assert all("end what else uses the device" in finding.why for finding in found)
+    assert all("end other programs on the device" in finding.why for finding in found)

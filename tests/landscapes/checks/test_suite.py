@@ -319,7 +319,7 @@ def test_an_expected_failure_is_excused_until_it_passes():
     no_longer = outcomes(Sound(), expected=reason)
     assert {name for name, finding in no_longer.items() if finding.bad} == GRADIENT
     assert no_longer["gradient"].outcome == "unexpected"
-    assert no_longer["gradient"].why == "it passes, so this is no longer true: the same"
+    assert no_longer["gradient"].why == "it passes, so this reason no longer applies: the same"
     never = outcomes(Sound(), expected={"dt 9x": "it explodes"})["dt 9x"]
     assert (never.outcome, never.bad) == ("unexpected", True)
 

@@ -63,7 +63,7 @@ def test_few_pairs_leave_more_points_and_two_parameters_one_slice() -> None:
     assert len(set(three.places)) == 16
     assert (len(two.bases), len(two.cuts)) == (1, 1)
     assert [len(drawn(5, slices).places) for slices in (1, 2, 3, 4)] == [1, 2, 2, 4]
-    with pytest.raises(ValueError, match="takes two parameters"):
+    with pytest.raises(ValueError, match="needs at least two parameters"):
         drawn(1, 16)
     with pytest.raises(ValueError, match="along pairs or random; got 'rows'"):
         drawn(5, 16, "rows")

@@ -120,7 +120,7 @@ def test_steps_are_as_long_as_they_say() -> None:
 def test_words_are_said_of_every_measure() -> None:
     rows = measured(bowl).rows()
     assert ("Points without a loss", "0 %", "") in rows
-    assert next(row.value for row in rows if "promises" in row.name).startswith("100 %, 9")
+    assert next(row.value for row in rows if "Decrease" in row.name).startswith("100 %, 9")
     assert all(row.value for row in measured(lambda x: bowl(x) * torch.nan).rows())
     env = from_torch(bowl, SPACE)
     assert measure_character(env, evaluations=20).character.evaluations == 20

@@ -72,11 +72,11 @@ def test_failed_points_are_left_out_and_counted() -> None:
     assert found.sobol.failed > 100
     assert found.sobol.points < 128
     few = features(Bowl(fails=0.85))
-    assert few.why.endswith("points have a loss; 20 are needed, 10 for each parameter")
+    assert few.why.endswith("points have a loss; at least 20 are needed, 10 for each parameter")
     assert few.exploratory is None
     assert few.rows()[-1].value == "cannot tell"
     flat = from_torch(lambda x: 3 + 0 * x.sum(dim=1), ParameterSpace.box(["a", "b"], -1, 1))
-    assert features(flat).why == "all losses are the same to rounding: 3 to 3"
+    assert features(flat).why == "all losses are equal up to rounding: 3 to 3"
 
 
 @pytest.mark.parametrize(("step", "named"), [(0.0, []), (4.0, ["b"])])

@@ -99,7 +99,7 @@ def test_it_says_that_it_cannot_tell() -> None:
     found = measure_growth(TIME, np.array([1.0, 6.0, 2.0, 9.0, 5.0])[:, None] * np.linspace(1, 2, 16))
     assert found.shape is Shape.UNDECIDED
     assert found.rate.low < 0 < found.rate.high  # sixteen points are not sixteen measurements
-    assert found.describe().startswith("cannot tell how gradients grow: as an exponential by ")
+    assert found.describe().startswith("the growth of gradients is undecided: an exponential has ")
 
 
 def test_points_without_a_gradient_are_left_out_and_too_few_say_nothing() -> None:
@@ -110,7 +110,9 @@ def test_points_without_a_gradient_are_left_out_and_too_few_say_nothing() -> Non
     norm[0, :9] = 0.0
     nothing = measure_growth(TIME, norm)
     assert math.isnan(nothing.rate.value)
-    assert nothing.describe().startswith("how gradients grow is not known: at 7 of 16 points")
+    assert nothing.describe().startswith(
+        "the growth of gradients is unknown: they exist at every horizon at 7 of 16 points"
+    )
     assert math.isnan(measure_growth(TIME[:3], norm[:3, 9:]).rate.value)
 
 

@@ -71,9 +71,9 @@ class Partly(Objective):
 def test_gradients_that_are_missing_are_said_to_be_and_losses_beside_them_count() -> None:
     half = Partly(0.5, 0.0).profile()
     assert set(half.words) == {"very smooth", "gradients missing"}
-    assert half.verdict.reasons["gradients missing"] == "no gradient at 52 % (42 to 62) of the points that have a loss"
+    assert half.verdict.reasons["gradients missing"] == "no gradient at 52 % (42 to 62) of the points with a loss"
     named = half.measures
-    assert named["Gradients missing beside a loss"].startswith("50.0 %")
+    assert named["Gradients missing at points with a loss"].startswith("50.0 %")
     assert "Samples that failed" not in named
     assert half.losses.failed == 0
     whole = Partly(0.0, 0.0).profile()
@@ -82,7 +82,7 @@ def test_gradients_that_are_missing_are_said_to_be_and_losses_beside_them_count(
     assert set(whole.words) == {"very smooth", "gradients follow"}
     few = Partly(0.1, 0.0).profile()
     assert set(few.words) == {"very smooth", "gradients follow"}
-    assert few.measures["Gradients missing beside a loss"].startswith("12.5 %")
+    assert few.measures["Gradients missing at points with a loss"].startswith("12.5 %")
 
 
 def test_a_slice_that_mostly_failed_is_called_nothing_else() -> None:

@@ -59,7 +59,7 @@ def test_ripples_of_the_grid_are_minima_without_replicas_and_none_with_them() ->
     said = "numerical floor 0.8 % of the range; gradients of replicas: cosine 0.9"
     assert said in foot(whole.data)
     assert said in repr(whole)
-    assert after.measures["Noise floor"].endswith(", that of numerics")
+    assert after.measures["Noise floor"].endswith(", the numerical floor")
     assert bare.floor is before.floor is None
     assert "numerical floor" not in foot(bare.data)
 
@@ -142,7 +142,7 @@ def test_replicas_that_raise_are_warned_of_and_lose_no_slice() -> None:
         def evaluate(self, x: Tensor, *, grad: bool = True) -> Evaluation:
             raise RuntimeError("no such grid")
 
-    with pytest.warns(RuntimeWarning, match="replicas raised, so its numerical floor is not known: .*no such grid"):
+    with pytest.warns(RuntimeWarning, match="raised an error, so the numerical floor is not known: .*no such grid"):
         assert gs.slice(Raises(), resolution=8).floor is None
 
 

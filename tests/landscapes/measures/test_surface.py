@@ -130,5 +130,5 @@ def test_lines_have_a_word_too_and_noise_hides_what_is_below_it() -> None:
     assert measure_surface(wells).word == "smooth with local minima"
     step, noisy = measure_surface(data(fine**2 + (fine > 0.3))), measure_surface(wells, floor=0.1)
     assert step.word is noisy.word is None
-    assert "may be a jump, of " in step.unresolved
-    assert noisy.unresolved == "noise or numerics hide what is below 28 % of the range"
+    assert "could be a jump, of " in step.unresolved
+    assert noisy.unresolved == "noise or numerics hide differences below 28 % of the range"

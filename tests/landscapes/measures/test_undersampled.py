@@ -176,7 +176,7 @@ def test_what_raises_between_the_samples_is_warned_of() -> None:
     def raising(x: object) -> object:
         raise RuntimeError("no more")
 
-    with pytest.warns(RuntimeWarning, match="raising raised between the samples.*no more"):
+    with pytest.warns(RuntimeWarning, match="raising raised an error between samples.*no more"):
         assert look_between(from_numpy(raising, SPACE), dataset) == {}
     with warnings.catch_warnings(), pytest.raises(OSError, match="gone"):
         look_between(Gone(), dataset)

@@ -63,5 +63,5 @@ def test_flat_and_failed_slices_have_no_other_word() -> None:
     for name, word in (("flat", "flat"), ("failed in two thirds", "mostly failed")):
         found = judge(BY_NAME[name], 24)
         assert (found.words, found.open) == ((word,), ())
-    assert judge(BY_NAME["flat"], 24).reasons["flat"] == "all losses are the same"
+    assert judge(BY_NAME["flat"], 24).reasons["flat"] == "all losses are equal"
     assert np.isnan(judge(BY_NAME["flat"], 24).surface.minima.value)

@@ -111,7 +111,7 @@ def test_an_objective_is_made_once_in_each_worker(tmp_path, alone, processes):
 def test_what_cannot_be_sent_is_refused_with_what_to_do(tmp_path, processes):
     lock = threading.Lock()
     holding = from_torch(lambda x: wave(x) + lock.locked(), SPACE, name="locked")
-    with pytest.raises(ValueError, match=r"locked cannot be sent .* give sample made="):
+    with pytest.raises(ValueError, match=r"locked cannot be sent .* pass sample made="):
         sample(holding, PLANE, store_at(tmp_path / "s.zarr"), executor=processes)
 
 

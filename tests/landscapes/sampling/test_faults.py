@@ -60,8 +60,8 @@ def test_a_batch_that_does_not_fit_is_halved_with_a_warning_and_the_same_bits(wh
         dataset = sample(device, PLANE, batch=60)
     assert same(dataset, whole)
     assert [str(one.message).split(" at ")[1] for one in said] == [
-        "64 points; going on with 32",
-        "32 points; going on with 16",
+        "64 points; continuing with 32",
+        "32 points; continuing with 16",
     ]
     assert device.sizes[:3] == [64, 32, 16]
     assert max(device.sizes[2:]) == 16  # learnt
@@ -139,7 +139,7 @@ def test_a_damaged_tile_is_named_and_computed_again_and_one_that_never_was_is_no
         assert same(sample(device, PLANE, store_at(path)), whole)
     place = r"s\.zarr\.zip: tile \(0, 0\)" if damage == "finished" else r"s\.filling: tile \(2, 3\)"
     assert len(said) == (damage != "removed")
-    assert all(re.search(f"{place} is damaged and computed again", str(one.message)) for one in said)
+    assert all(re.search(f"{place} is damaged and is computed again", str(one.message)) for one in said)
     assert device.sizes == ([288] if damage == "finished" else [POINTS, 16])  # those that are verified first
 
 
@@ -162,7 +162,7 @@ def test_a_full_disk_ends_it_with_what_is_kept_and_the_slice_goes_on(tmp_path, w
         replace(source, target)
 
     monkeypatch.setattr(os, "replace", full)
-    said = r"the disk is full; 80 of 288 points are kept in .*s\.filling: make room, and the same command continues"
+    said = r"the disk is full; 80 of 288 points are kept in .*s\.filling: free some space, and the same command"
     with pytest.raises(OSError, match=said) as ended:
         sample(from_torch(wave, SPACE), PLANE, store)
     assert ended.value.errno == code

@@ -168,7 +168,7 @@ class Bent(Wave):
             r"counted must return loss of shape \(16,\).*got \(15,\)",
         ),
         (lambda e: Evaluation(e.loss, e.grad[:, :2], e.status), r"grad of shape \(16, 3\).*got \(16, 2\)"),
-        (lambda e: Evaluation(e.loss, None, e.status), "asked for gradients and returned none"),
+        (lambda e: Evaluation(e.loss, None, e.status), "returned no gradients with grad=True"),
         (lambda e: Evaluation(e.loss, e.grad, 0 * e.status), "got status MISSING"),
         (lambda e: Evaluation(e.loss, e.grad, 0 * e.status + Status.INTERPOLATED), "got status INTERPOLATED"),
     ],

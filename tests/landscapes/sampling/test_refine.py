@@ -153,7 +153,7 @@ def test_a_budget_is_not_exceeded_and_is_used(budget: int) -> None:
 
 @pytest.mark.parametrize(("share", "budget"), [(None, None), (0.0, None), (1.5, None), (math.nan, None), (None, 80)])
 def test_a_share_and_a_budget_are_numbers_that_make_sense(share: float | None, budget: int | None) -> None:
-    said = "begins with 81 points; got a budget of 80" if budget else "a slice is refined to a share"
+    said = "begins with 81 points; got a budget of 80" if budget else "refining takes a share"
     with pytest.raises(ValueError, match=said):
         refined(bowl, 65, share, budget)
 
@@ -292,5 +292,5 @@ def test_a_function_that_raises_says_so() -> None:
     def raising(x: object) -> object:
         raise RuntimeError("no more")
 
-    with pytest.raises(ValueError, match=r"raising raised wherever it was tried.*RuntimeError: no more"):
+    with pytest.raises(ValueError, match=r"raising raised at all .* points where it was tried.*RuntimeError: no more"):
         refine(from_numpy(raising, SPACE), plane(33), SliceStore.in_memory(plane(33), SPACE), Refinement(0.1))

@@ -115,7 +115,7 @@ def test_no_more_than_a_batch_of_either_kind_is_evaluated_ahead() -> None:
 
 def test_gradients_that_do_not_fit_into_memory_are_halved_to_the_same_bits() -> None:
     small = Torn(batch=64, room=40)
-    with pytest.warns(RuntimeWarning, match="counted ran out of memory at 64 points; going on with 32"):
+    with pytest.warns(RuntimeWarning, match="counted ran out of memory at 64 points; continuing with 32"):
         found = sample(small, SQUARE, gradients=3)
     assert {len(one) for one in small.batches[True][:-1]} == {32}
     assert same(found, sample(Torn(), SQUARE, gradients=3))
@@ -190,7 +190,7 @@ def test_other_gradients_are_another_slice(tmp_path: Path) -> None:
         ({"gradients": 17}, "got 17 x 17 samples and gradients at every 17"),
         ({"gradients": 2, "refine": 0.05}, "leave out one of the two"),
         ({"gradients": -1}, "gradients is a whole number of at least 0; got -1"),
-        ({"gradients": 2.5}, "slice takes a whole number as gradients; got 2.5"),
+        ({"gradients": 2.5}, "slice takes a whole number for gradients; got 2.5"),
     ],
 )
 def test_what_cannot_be_is_refused(how: dict[str, object], said: str) -> None:

@@ -64,7 +64,7 @@ def test_a_slice_with_anything_else_in_it_is_not_replaced(
     file = made(tmp_path / "slice.zarr") / mine
     file.parent.mkdir(parents=True, exist_ok=True)
     file.write_text("precious")
-    with pytest.raises(ValueError, match=rf"is not replaced, as it holds files that are not of a slice: {mine}; move"):
+    with pytest.raises(ValueError, match=rf"because it has files that do not belong to a slice: {mine}; move"):
         make(tmp_path / "slice.zarr", overwrite=True)
     assert file.read_text() == "precious"
     file.unlink()
@@ -76,7 +76,7 @@ def test_a_link_in_a_slice_is_not_ours_unless_it_leads_nowhere(tmp_path: Path) -
     (tmp_path / "mine").mkdir()
     link = finished(tmp_path / "slice.zarr") / "loss/c/7"
     link.symlink_to(tmp_path / "mine")
-    with pytest.raises(ValueError, match="not of a slice: loss/c/7;"):
+    with pytest.raises(ValueError, match="do not belong to a slice: loss/c/7;"):
         make(tmp_path / "slice.zarr", overwrite=True)
     link.unlink()
     link.symlink_to(link)
@@ -111,7 +111,7 @@ def test_a_file_in_the_place_of_a_slice_is_replaced_only_if_it_was_one(tmp_path:
         assert make(tmp_path / "slice.zarr", overwrite=True).pending()
         assert own(tmp_path) == ["slice.filling"]
     else:
-        with pytest.raises(StoreError, match="no slice store, so it is not replaced"):
+        with pytest.raises(StoreError, match="is not a slice store and is not replaced"):
             make(tmp_path / "slice.zarr", overwrite=True)
         assert own(tmp_path) == ["slice.zarr.zip"]
 
@@ -119,9 +119,9 @@ def test_a_file_in_the_place_of_a_slice_is_replaced_only_if_it_was_one(tmp_path:
 def test_another_zarr_store_of_our_names_is_not_replaced(tmp_path: Path) -> None:
     root = finished(tmp_path / "slice.zarr") / "zarr.json"
     root.write_text('{"zarr_format": 3, "node_type": "group", "attributes": {"title": "wind"}}')
-    with pytest.raises(StoreError, match="no slice store, so it is not replaced"):
+    with pytest.raises(StoreError, match="is not a slice store and is not replaced"):
         make(tmp_path / "slice.zarr", overwrite=True)
-    with pytest.raises(StoreError, match=r"no slice store of format(?!.*--force)"):
+    with pytest.raises(StoreError, match=r"not a slice store of format(?!.*--force)"):
         SliceStore.open(tmp_path / "slice.zarr")
 
 
@@ -152,7 +152,7 @@ def test_a_study_with_anything_else_among_its_pieces_is_not_begun_anew(tmp_path:
     checkpoint = Checkpoint.open(tmp_path, {"seed": 0}, what="pairs")
     checkpoint.save("one", loss=torch.zeros(2).numpy())
     (tmp_path / "pieces/queen.obj").write_text("precious")
-    with pytest.raises(ValueError, match=r"holds files that are not of a pairs: queen\.obj; move"):
+    with pytest.raises(ValueError, match=r"has files that do not belong to a pairs: queen\.obj; move"):
         Checkpoint.open(tmp_path, {"seed": 1}, what="pairs", force=True)
     assert checkpoint.count() == 1
     (tmp_path / "pieces/queen.obj").unlink()

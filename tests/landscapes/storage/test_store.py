@@ -92,7 +92,7 @@ def test_what_xarray_writes_of_a_slice_is_a_slice(tmp_path):
         xr.testing.assert_equal(back, ours)
         assert back.attrs == ours.attrs
     ours.isel(u=slice(1, None)).to_zarr(tmp_path / "cut.zarr", consolidated=False)
-    with pytest.raises(StoreError, match=r"u is damaged \(it is not what the store's identity says"):
+    with pytest.raises(StoreError, match=r"u is damaged \(it contradicts the store's identity"):
         open_slice(tmp_path / "cut.zarr")
 
 

@@ -147,7 +147,7 @@ def test_what_is_no_slice_store_is_never_touched(tmp_path):
     (tmp_path / "folder" / "thesis.tex").write_text("five years")
     (tmp_path / "file").write_text("five years")
     for path in (tmp_path / "folder", tmp_path / "file"):
-        with pytest.raises(StoreError, match="no slice store"):
+        with pytest.raises(StoreError, match="not a slice store"):
             make(path)
         for overwrite in (False, True):
             with pytest.raises(StoreError):
@@ -161,7 +161,7 @@ def test_overwriting_is_asked_for_and_leaves_only_the_new_store(tmp_path):
     path = tmp_path / "s.zarr"
     for prepare in (lambda: fill(make(path)), lambda: finished(path, identity={"objective": "hill"})):
         old = prepare()
-        with pytest.raises(StoreError, match="exists already"):
+        with pytest.raises(StoreError, match="already exists"):
             SliceStore.create(path, PLANE, SPACE, identity=IDENTITY)
         new = SliceStore.create(path, PLANE, SPACE, identity={"objective": "hill"}, overwrite=True)
         assert new.pending() == new.tiles()

@@ -5,6 +5,8 @@
   const token = new URLSearchParams(location.search).get("token");
   const place_ = { dims: [...SPACE.dims], at: [...SPACE.at] }; // which parameters vary, and the point in the unit cube
   const progress = document.getElementById("progress");
+  let mapped = null; // the place whose map is shown
+  const isMapped = () => mapped === JSON.stringify([place_.dims, place_.at]);
   let look = 0; // counts the places somebody looked at, so that answers about earlier ones are dropped
 
   async function ask(question, asked = {}) {
@@ -79,8 +81,9 @@
     }
     asking = false;
   }
+  const early = new Error("The plane that you chose is not on the map yet.");
   const failed = (error) => (progress.textContent = error.message);
-  document.getElementById("here").addEventListener("click", () => move(shares(node)));
+  document.getElementById("here").addEventListener("click", () => (isMapped() ? move(shares(node)) : failed(early)));
   document.getElementById("centre").addEventListener("click", () => move(place_.at.map(() => 0.5)));
   document.getElementById("random").addEventListener("click", () => move(place_.at.map(() => Math.random())));
 
@@ -91,7 +94,7 @@
       try {
         seen = await ask("seen", { number: known });
       } catch {
-        progress.textContent = "The explorer has ended; start it again with its command.";
+        progress.textContent = "The explorer has stopped. Start it again with its command.";
         return;
       }
       if (seen.slice && seen.number !== known) {
@@ -100,6 +103,7 @@
         const runs = there === before ? SLICE.runs : [];
         before = there;
         load({ ...seen.slice, runs, episodes: [] });
+        mapped = JSON.stringify([seen.look.dims, seen.look.at]);
       }
       known = seen.number;
       if (seen.error) progress.textContent = seen.error;
@@ -112,6 +116,7 @@
   const descents = document.getElementById("descents");
   const wanted = (id) => document.getElementById(id)?.checked;
   async function visit() {
+    if (!isMapped()) return failed(early);
     const [asked, index, from] = [look, node, shares(node)];
     const same = () => asked === look;
     const note = (text) => same() && (document.getElementById("spoken").textContent = text);
@@ -128,7 +133,7 @@
       const film = await ask("film", { at: from });
       if (!same() || !film.mp4) return note(film.said);
       const [column, row] = at(index);
-      SLICE.episodes = [{ ...film, row, column, why: "episode of the node" }];
+      SLICE.episodes = [{ ...film, row, column, why: "episode at this node" }];
       if (node !== index) return redraw();
       showEpisode();
       redraw();
@@ -156,7 +161,7 @@
   document.getElementById("keep").addEventListener("click", async (event) => {
     const [said, command] = [document.getElementById("kept"), document.getElementById("kept-command")];
     event.target.disabled = true;
-    said.textContent = "Sampling, and drawing the picture.";
+    said.textContent = "Sampling the plane and drawing its picture.";
     try {
       const kept = await ask("keep");
       said.textContent = `${kept.folder}: ${kept.files.join(", ")}`;

@@ -37,7 +37,7 @@ function dropProfile() {
 function pinProfile() {
   if (pinned === null) {
     pinned = node;
-    say("A line begins here; go to its other end and press P again.", 0);
+    say("The line starts here. Go to its other end and press P again.", 0);
   } else {
     const from = pinned;
     pinned = null;
@@ -52,7 +52,7 @@ function sayProfile() {
   const failed = along.length - known.length;
   const range = known.length ? `${number(Math.min(...known))} to ${number(Math.max(...known))}${SLICE.unit ? " " + SLICE.unit : ""}` : "none";
   const place = (index) => `${valueSaid(across, across.values[at(index)[0]])}, ${valueSaid(up, up.values[at(index)[1]])}`;
-  const text = `Line from ${place(profile[0])} to ${place(profile[1])}: ${along.length} nodes, losses ${range}${failed ? `, ${failed} without` : ""}.`;
+  const text = `Line from ${place(profile[0])} to ${place(profile[1])}: ${along.length} nodes, losses ${range}${failed ? `, ${failed} without a loss` : ""}.`;
   document.getElementById("profile-said").textContent = text;
   chart.setAttribute("aria-label", "Loss along the line drawn over the map. " + text);
   say(text);

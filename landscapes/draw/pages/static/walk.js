@@ -21,10 +21,10 @@ function tell() {
   lines.push("Loss: " + lossSaid(losses[node], statusOf(node)));
   if (slopes && slopes[0][node] === slopes[0][node]) {
     lines.push("Gradient along the slice: " + slopes.map((part) => number(part[node])).join(", "));
-    lines.push("Gradient\u2019s length in all dimensions: " + number(gradients[node]));
+    lines.push("Gradient norm over all parameters: " + number(gradients[node]));
   }
   if (floors && floors[node] === floors[node]) lines.push("Numerical floor: " + lossSaid(floors[node], ""));
-  if (node === lowest && losses[node] === losses[node]) lines.push("The lowest loss of the slice");
+  if (node === lowest && losses[node] === losses[node]) lines.push("Lowest loss of the slice");
   const episode = episodeAt(node);
   if (episode) lines.push("Episode here: " + episode.why);
   readout.textContent = lines.join("\n");

@@ -82,7 +82,7 @@ def test_every_kind_of_points_has_a_bar_and_its_number() -> None:
         (checked(kinds={Kind.NAN: 27}), "gradients are NaN at 42 % (30 to 55 %)", "factor 2"),
         (checked(wrong=0, passed=True), "check passes: gradients are", "a defect in less than 5 % of the box"),
         (checked(wrong=0), "check fails, though gradients are", "factor 2"),
-        (replace(checked(), share=None), "there is no gradient to compare", "factor 2"),
+        (replace(checked(), share=None), "no gradient to compare", "factor 2"),
     ],
 )
 def test_it_says_the_verdict_with_its_interval_and_causes(found: object, title: str, remark: str) -> None:
@@ -104,8 +104,8 @@ def test_nothing_to_compare_is_said_and_drawn_as_that() -> None:
         assert gaps[-1].get_x() + gaps[-1].get_width() == pytest.approx(right)
         assert bars.get_title().split() == ["no", "gradient", "was", "compared"]
         assert entries(picture) == [
-            "too few changes of the loss are clear of its noise",
-            "first step of an optimiser (at most, of gradient descent)",
+            "too few changes of the loss above its noise",
+            "first step of an optimiser (for gradient descent: at most)",
         ]
 
 

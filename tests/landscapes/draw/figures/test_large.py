@@ -62,7 +62,7 @@ def test_of_a_spike_the_gradients_beside_it_are_not_zero():
 
 
 def test_what_needs_differences_says_why_it_has_none():
-    why = r"values as large as 1e\+308 cannot be measured or drawn, since differences between them overflow"
+    why = r"values up to 1e\+308 cannot be measured or drawn, because their differences overflow"
     objective, dataset = cut("both", (0, 1))
     with pytest.raises(ValueError, match=why):
         ruggedness(dataset, floor=0.0)

@@ -57,7 +57,7 @@ def test_losses_over_decades_get_a_logarithmic_axis(loss, scale):
 def test_outliers_leave_the_picture_and_are_counted():
     ax = run_figure(table([*np.linspace(1, 3, 300), 1e9])).axes[0]
     assert ax.get_ylim()[1] < 10
-    assert any("1 above the picture" in line.get_label() for line in ax.lines)
+    assert any("1 above the plot" in line.get_label() for line in ax.lines)
 
 
 NAN = np.nan

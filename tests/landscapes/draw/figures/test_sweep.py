@@ -158,5 +158,5 @@ def test_smoothing_is_a_gaussian_of_that_share_of_each_side() -> None:
 
 
 def test_smoothing_refuses_a_negative_width() -> None:
-    with pytest.raises(ValueError, match="width that is not negative; got -1"):
+    with pytest.raises(ValueError, match="width of at least 0; got -1"):
         smooth(SWEEP.slices[0], -1.0)

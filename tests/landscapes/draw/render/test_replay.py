@@ -17,7 +17,7 @@ from gradscape.envs.outlines import rotate_about, skin, triangles
 from gradscape.envs.registry import BUILTIN, make
 from gradscape.landscapes.draw.figures.contact import Caption, episode_figure, save_sheet
 from gradscape.landscapes.draw.render import solids
-from gradscape.landscapes.draw.render.replay import Shot, add_title, axes, frames, missed_surface, save_replay
+from gradscape.landscapes.draw.render.replay import Shot, add_title, axes, frames, missed_surface, outside, save_replay
 from gradscape.landscapes.draw.render.solids import lump, mesh
 from gradscape.landscapes.episode import Episode, Part, View
 
@@ -53,6 +53,16 @@ def test_every_scene_says_what_it_looks_like_and_is_drawn(name: str) -> None:
     assert picture.shape[0] == SMALL
     assert (picture.min(axis=2) < 200).mean() > 0.01, "blank"
     assert (picture[SMALL // 4 : -SMALL // 4].min(axis=2) < 200).any(), "nothing in the middle"
+
+
+def test_a_ball_that_has_left_the_picture_is_named_as_long_as_it_is_away() -> None:
+    ball = Part("sphere", "rubber", torch.tensor([[[x, 0.0, 0.0]] for x in (0.0, 1.1, 2.0, 0.5)]), (0.1,))
+    view = View((-1.0,) * 3, (1.0,) * 3, eye=(0.0, 0.0, 1.0), ground=None)
+    episode = Episode(torch.arange(4.0), {}, {}, (ball, replace(ball, material="target")), view)
+    shot = Shot.of(view, SMALL)
+    assert [outside(episode, shot, frame) for frame in range(4)] == [[], [], ["ball"], []]
+    seen = [picture[: SMALL // 5] for picture in frames(episode, range(4), height=SMALL)]
+    assert [bool((one.min(axis=2) < 200).any()) for one in seen] == [False, False, True, False]
 
 
 def test_the_scooped_cube_rises_and_the_syrup_stays_in_the_tank() -> None:
