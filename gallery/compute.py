@@ -118,7 +118,7 @@ class _Work:
         """Announce the cost of one kind of part, and make the missing ones."""
         left = [part for part in parts if not self._try(part, part.there)]
         left = self._sound(left)
-        self.watch.note(f"{name}: {len(parts) - len(left)} of {len(parts)} are there already")
+        self.watch.note(f"{name}: {len(parts) - len(left)} of {len(parts)} are done already")
         self._announce(name, left)
         for part in left:
             if part.figure.id not in self.failed and not part.there():  # figures may share what one of them made

@@ -260,7 +260,7 @@ class ExtremesStudy(Study):
 
     def describe_left(self) -> str:
         """Describe the remaining measurements."""
-        kept = f", {self.checkpoint.count()} already stored" if self.checkpoint.count() else ""
+        kept = f", {self.checkpoint.count()} are done already" if self.checkpoint.count() else ""
         return f"about {self._count()} settings to measure{kept}"
 
     def expected(self) -> Iterator[Expected]:

@@ -443,7 +443,7 @@ class VariantStudy(Study):
     def describe_left(self) -> str:
         """Describe the remaining measurements."""
         left = len(self.left())
-        kept = f", {len(self.variants) - left} already stored" if left < len(self.variants) else ""
+        kept = f", {len(self.variants) - left} are done already" if left < len(self.variants) else ""
         known = f", the {self.variants[0].name} from stored results" if self._is_known(self.variants[0]) else ""
         return f"{left} {self.what} to measure{kept}{known}"
 

@@ -24,7 +24,8 @@ def archived(folder: Path) -> tuple[bytes, str]:
 def test_the_version_is_the_same_everywhere():
     newest = re.search(r"^## (\S+)", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
     cited = re.search(r"^version: (\S+)$", (ROOT / "CITATION.cff").read_text(), re.MULTILINE)
-    assert newest and cited
+    assert newest
+    assert cited
     assert {newest[1], cited[1]} == {gradscape.__version__}
 
 

@@ -19,7 +19,7 @@ from .kinds import KINDS, MADE, before, copy, files, numbers, say, whole
 pytestmark = pytest.mark.e2e
 
 BEGINS = {"png": b"\x89PNG", "pdf": b"%PDF", "svg": b"<?xml"}
-THERE, OTHER = "there already", "made by other settings"
+THERE, OTHER = "done already", "made by other settings"
 DIM = "--set dim=4"  # of another scene than `ackley --set dim=3`
 
 
@@ -161,7 +161,7 @@ def test_a_folder_of_other_files_is_left_alone(kind: str, force: bool) -> None:
     force = force and any("--force" in one.names for one in verbs()[VERBS[kind]].options)
     done = repeated(kind, folder, *(["--force"] if force else []))
     assert done.returncode == 2
-    assert f"{MADE} has other files but no {RESULTS[kind].mine}" in done.stderr
+    assert f"{MADE} contains files that are not part of this {RESULTS[kind].mine}" in done.stderr
     assert [file.read_text() for file in files(folder / MADE)] == ["precious"] * 2
 
 

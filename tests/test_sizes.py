@@ -113,8 +113,8 @@ def test_dimensions_and_methods_that_cannot_be_are_refused(said: dict[str, tuple
     assert (code, text.count("\n"), "would fit" in text) == (2, 1, True)  # before it is made
     code, text = said[RACE]
     assert code == 2
-    assert "without cma-es: cma-es: number of parameters 100000 takes" in text
-    assert "budget 1000000 takes" in text
+    assert "cma-es cannot run here: cma-es: number of parameters 100000 needs" in text
+    assert "budget 1000000 needs" in text
 
 
 @pytest.mark.parametrize("name", methods())
@@ -139,7 +139,7 @@ def huge_options() -> list[tuple[str, str]]:
 def test_an_option_that_takes_too_much_is_refused_by_name(name: str, option: str) -> None:
     options = optimizer_class(name).Options()
     object.__setattr__(options, option, HUGE)  # whatever else it may be refused for
-    with pytest.raises(TooLargeError, match=f"{name} option {option} {HUGE} takes .* would fit"):
+    with pytest.raises(TooLargeError, match=f"{name} option {option} {HUGE} needs about .* would fit"):
         optimizer_class(name).require_memory(options, SearchSize(2, budget=10**9))
 
 

@@ -219,8 +219,8 @@ def refuse_others(folder: Path, strange: Iterable[Path], what: str) -> None:
     if names:
         more = f" and {len(names) - LISTED_FILES} more" if len(names) > LISTED_FILES else ""
         raise ValueError(
-            f"{folder} has other files but no {what}: {', '.join(names[:LISTED_FILES])}{more}; give --out a new or an "
-            "empty folder"
+            f"{folder} contains files that are not part of this {what}: {', '.join(names[:LISTED_FILES])}{more}; give "
+            "--out a new or an empty folder"
         )
 
 

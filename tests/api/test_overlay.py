@@ -170,7 +170,7 @@ def test_a_table_as_a_spreadsheet_writes_it_is_read(cut: gs.Slice, tmp_path: Pat
     path.write_text("x0,x0,x1,loss\n1,1,2,3\n")
     with pytest.raises(ValueError, match=r"several columns for 'x0': 'x0' \(column 1\) and 'x0' \(column 2\)"):
         gs.overlay(cut, path)
-    for nothing, said in (("", "it is empty"), ("x0,x1,loss\n", "sheet holds no point")):
+    for nothing, said in (("", "it is empty"), ("x0,x1,loss\n", "sheet has no point")):
         path.write_text(nothing)
         with pytest.raises(ValueError, match=said):
             gs.overlay(cut, path)

@@ -71,7 +71,7 @@ def test_another_comparison_is_replaced_by_force_alone(run: Run, desk: Path) -> 
     run.refuse(
         "compare b a --out both",
         cwd=desk,
-        said="both holds a comparison made by other settings (a.fidelity: wanted 'standard', found 'draft'",
+        said="both contains a comparison made by other settings (a.fidelity: wanted 'standard', found 'draft'",
     )
     run.ok("compare b a --out both --force")
     assert json.loads((desk / "both/compare.json").read_text())["a"] == "bounce · standard"

@@ -77,7 +77,7 @@ def test_envs_says_where_a_margin_is_of_another_model_and_of_other_options_nothi
     (path,) = own_data.rglob("*.json")
     record = read_json(path)
     write_record(path, {**record, "identity": {**record["identity"], "model_version": 0}})
-    assert "by stepping model 0, this is model 1" in run("envs stepping").stdout
+    assert "with stepping model 0; this is model 1" in run("envs stepping").stdout
     write_record(path, {**record, "identity": {**record["identity"], "options": {"soft": 1.0}}})
     assert "stability: not measured" in run("envs stepping").stdout
     path.write_text("{}")

@@ -97,7 +97,7 @@ def test_compute_goes_on_where_it_stopped_and_computes_nothing_twice(
     points.clear()
     assert compute(tmp_path, *command) == 0
     assert not points
-    assert "slices: 1 of 1 are there already" in capsys.readouterr().err
+    assert "slices: 1 of 1 are done already" in capsys.readouterr().err
 
 
 def test_a_figure_that_fails_does_not_stop_the_others(

@@ -83,7 +83,7 @@ def test_a_page_is_written_of_a_report_that_is_there_and_other_folders_are_refus
     (told / "report.html").unlink()
     assert "report.html" in run.ok(words).stderr
     assert "The check" not in Page(told / "report.html").text
-    run.refuse(f"{words} --include {told}", said="no run")
+    run.refuse(f"{words} --include {told}", said="is not a run")
 
 
 def test_no_text_of_a_user_ends_the_script_of_a_page(tmp_path: Path) -> None:
@@ -104,7 +104,7 @@ def test_of_many_samples_the_map_has_every_so_many(told: Path, tmp_path: Path, m
     nodes, axis = nodes_of(page), open_slice(told.parent / "cut")["u"].to_numpy()
     np.testing.assert_allclose(nodes["axes"][0]["values"], axis[::2])
     assert len(nodes["axes"][1]["values"]) == 6
-    assert "The map has one of every 2 samples" in Page(page).text
+    assert "The map shows one of every 2 samples" in Page(page).text
 
 
 def test_a_page_shows_episodes_at_the_ends_of_the_losses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -45,7 +45,7 @@ def test_the_parts_of_a_model_are_printed_drawn_and_kept(run: Run, tmp_path: Pat
     assert "about " in done.stderr.partition("models to measure")[2]  # the estimate comes first
     again = run(*TRADE)
     assert "0 models" not in again.stderr
-    assert "8 are there already" in again.stderr  # those that are refused are tried again
+    assert "8 are done already" in again.stderr  # those that are refused are tried again
 
 
 @pytest.mark.parametrize(("name", "kind"), [("tradeoff", "fidelity"), ("extremes", "extremes")])

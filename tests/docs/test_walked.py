@@ -141,7 +141,7 @@ def test_a_slice_is_judged_by_which_of_the_paper_s_words_were_measured(
     assert reproduction.verdict_of(one) == verdict
     page = reproduction.pages(replace(Kept.read(tmp_path / "none"), figures=[one]), tmp_path)["reproduction.md"]
     assert f"| **verdict** | **{verdict}** |" in page
-    assert (f"| **not measured of its words** | {', '.join(unseen)} |" in page) == bool(misses)
+    assert (f"| **words of the paper that we did not find** | {', '.join(unseen)} |" in page) == bool(misses)
     options = report.options | environment_class(figure.env).preset_options("paper")
     one.report, one.figure = replace(report, options=options), replace(one.figure, id="of-no-finding")
     assert reproduction.verdict_of(one) == ("refuted" if verdict == "not seen here" else verdict)

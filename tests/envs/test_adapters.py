@@ -247,11 +247,11 @@ def of_warp(fn: Any, **how: Any) -> Callable[[], Any]:
     ("make", "said"),
     [
         (of_torch(lambda x: (x**2).sum(1, keepdim=True)), r"squeeze the last axis"),
-        (of_torch(lambda x: ((x**2).sum(1), x)), r"must return losses alone"),
+        (of_torch(lambda x: ((x**2).sum(1), x)), r"must return losses only"),
         (of_torch(torch.nn.Linear(2, 1)), r"pass precision='float32' to from_torch"),
         (of_torch(lambda x: x), r"own must return losses of shape \(7,\); got shape \(7, 2\)"),
         (of_torch(lambda x: 3.0), "own must return a tensor; got float"),
-        (of_torch(lambda x: x.detach()[:, 0]), "carry no gradient.*--no-gradients"),
+        (of_torch(lambda x: x.detach()[:, 0]), "without a gradient.*--no-gradients"),
         (of_torch(lambda x: 1.0, vectorized=False), "must return a tensor; got float"),
         (of_numpy(lambda x: x[0]), r"losses of shape \(7,\); got shape \(2,\) .*vectorized=False"),
         (of_numpy(lambda x: (x[:, 0], x[0])), r"gradients of shape \(7, 2\); got shape \(2,\)"),
@@ -394,7 +394,7 @@ def test_a_horizon_is_a_number_of_steps_and_another_step_keeps_the_time() -> Non
     ("said", "wanted"),
     [
         ({"options": {"mass": 1.0}}, "takes no keyword argument mass; it takes stiffness, dt, steps"),
-        ({"options": {"stiffness": [1.0]}}, "needs a number, a text or a truth value as default"),
+        ({"options": {"stiffness": [1.0]}}, "needs a number, a text or a truth value as its default"),
         ({"options": {"dt": 0.1}, "fidelities": {"a": {"dt": 0.1}}}, "dt in both options and fidelities"),
         ({"fidelities": {"a": {"dt": 0.1}, "b": {"steps": 2}}}, "fidelity a lacks steps"),
         ({"horizon": "length"}, "horizon must be one of its options or fidelity settings; got 'length'"),

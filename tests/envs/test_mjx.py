@@ -203,7 +203,7 @@ def test_a_shorter_horizon_ends_earlier_and_a_longer_one_goes_on(dart):
             "MuJoCo cannot read the model of wrong: .*bod",
         ),
         ({"mjcf": "nowhere.xml"}, "MuJoCo cannot read the model of wrong: there is no file nowhere.xml"),
-        ({"parameters": (Parameter("a", "qvel", "y", 0, 1),)}, "wrong has no joint 'y' to find qvel by"),
+        ({"parameters": (Parameter("a", "qvel", "y", 0, 1),)}, "wrong has no joint 'y' for qvel"),
         ({"parameters": (Parameter("a", "qvel", 7, 0, 1),)}, r"wrong has qvel of shape \(2,\); got index 7"),
         ({"parameters": (Parameter("a", "body_mas", 0, 0, 1),)}, "wrong has no field 'body_mas' to vary"),
         ({"parameters": (Parameter("a", "geom_friction", "dart", 0, 1),)}, r"geom_friction of shape \(1, 3\)"),

@@ -190,7 +190,7 @@ def test_wider_smoothing_flattens() -> None:
     ("text", "said"),
     [
         ("polish:1", "no remedy 'polish'; the remedies are smooth:WIDTH"),
-        ("smooth", "spelt smooth:WIDTH"),
+        ("smooth", "write the remedy as smooth:WIDTH"),
         ("smooth:0", "width above 0"),
         ("smooth:2%:second", "first, zeroth, mixed"),
         ("smooth:2%:mixed:4", "at least 6 if mixed"),

@@ -90,7 +90,7 @@ def test_everything_is_made_once(small: Path, capsys: pytest.CaptureFixture[str]
     assert compute(small) == 0
     assert {file: file.stat().st_mtime_ns for file in small.rglob("*") if file.is_file()} == before
     said = capsys.readouterr().err
-    assert all(f"{part}: 3 of 3 are there already" in said for part in PARTS if part not in IF_NAMED)
+    assert all(f"{part}: 3 of 3 are done already" in said for part in PARTS if part not in IF_NAMED)
     assert not any(f"{part}:" in said for part in IF_NAMED)
     assert not (small / "league").exists()
 

@@ -62,19 +62,19 @@ def race(tmp_path_factory: pytest.TempPathFactory) -> Race:
 def test_a_scene_is_raced_once_for_all_its_figures_and_kept(small: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert compute(small, "--only", "branin") == 0
     said = capsys.readouterr().err
-    assert "league: 0 of 2 are there already" in said
+    assert "league: 0 of 2 are done already" in said
     assert said.count("2 methods, 3 seeds: after 12 episodes ") == 1
     assert {path.name for path in (small / "league").iterdir()} == {
         "branin.json", "branin.npz", "branin.png", "branin-dark.png"
     }  # fmt: skip
     assert compute(small) == 0  # and continues with the scene that is left
-    assert "league: 2 of 3 are there already" in capsys.readouterr().err
+    assert "league: 2 of 3 are done already" in capsys.readouterr().err
     league = read_league(small)
     assert league is not None
     assert [scene.env for scene in league.scenes] == ["beale", "branin"]
     before = {file: file.stat().st_mtime_ns for file in small.rglob("*") if file.is_file()}
     assert compute(small) == 0
-    assert "league: 3 of 3 are there already" in capsys.readouterr().err
+    assert "league: 3 of 3 are done already" in capsys.readouterr().err
     assert {file: file.stat().st_mtime_ns for file in small.rglob("*") if file.is_file()} == before
 
 
@@ -215,10 +215,10 @@ def test_median_runs_are_laid_over_the_slice_through_the_best_point(
         assert not left.value.code
         return capsys.readouterr().err
 
-    assert "league-slices: 3 of 3 are there already" in slices()  # no league, no slice
+    assert "league-slices: 3 of 3 are done already" in slices()  # no league, no slice
     assert compute(small, "--only", "branin") == 0
     capsys.readouterr()
-    assert "league-slices: 1 of 3 are there already" in slices()
+    assert "league-slices: 1 of 3 are done already" in slices()
     standings, files = read_standings(small / "league/branin.json"), LeagueFiles.of(small, "branin").slice
     assert {path.name for path in files.record.parent.iterdir()} == {
         "slice.zarr.zip", "medians.json", "medians.png", "medians-dark.png"
@@ -228,7 +228,7 @@ def test_median_runs_are_laid_over_the_slice_through_the_best_point(
     plane, best = plane_of(dataset), torch.tensor(standings.best.x, dtype=torch.float64)
     assert float(plane.distance(best[None])) < 1e-9
     assert stored_identity(dataset)["fidelity"] == standings.fidelity
-    assert "3 of 3 are there already" in slices()
+    assert "3 of 3 are done already" in slices()
     for run in KeptRuns.read(small / "league/branin.npz").medians.values():
         assert (np.diff(run["loss"]) < 0).all()
         assert run["episodes"][0] == 1
@@ -238,7 +238,7 @@ def test_median_runs_are_laid_over_the_slice_through_the_best_point(
     record["key"]["best"][0] += 1
     files.record.write_text(json.dumps(record))
     capsys.readouterr()
-    assert "league-slices: 1 of 3 are there already" in slices()
+    assert "league-slices: 1 of 3 are done already" in slices()
 
 
 def test_the_league_is_a_part_that_figures_share() -> None:

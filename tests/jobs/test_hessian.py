@@ -180,7 +180,7 @@ def test_what_it_prints(here: Path, run: Run, name: str, said: list[str]) -> Non
     ("words", "said"),
     [
         ("saddle --through nowhere", "got 'nowhere', which is none of these"),
-        ("saddle --through far.txt", "beyond its bounds"),
+        ("saddle --through far.txt", "outside its bounds"),
         ("saddle --eigenpairs 0", "--eigenpairs"),
         ("saddle --probes 0", "--probes"),
         ("heavy", "broken failed near this point"),

@@ -131,7 +131,7 @@ def test_a_scene_that_breaks_is_named_and_the_others_are_raced(tmp_path: Path) -
     league = job(tmp_path, Broken, "branin").run(watch)
     assert [scene.env for scene in league.scenes] == ["branin"]
     (why,) = league.failed.values()
-    assert "points: RuntimeError: the engine is on fire" in why
+    assert "tried: RuntimeError: the engine is on fire" in why
     assert any(f"broken@exact is left out: {why}" in line for line in watch.said)
     assert read_json(tmp_path / "league.json")["failed"] == league.failed
     with pytest.raises(ValueError, match="no scene of the league could be raced: broken@exact: SimulatorError"):

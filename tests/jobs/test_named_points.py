@@ -42,7 +42,7 @@ def test_an_environment_goes_through_them_too(tmp_path: Path) -> None:
 
 def test_what_names_no_row_is_refused(tmp_path: Path) -> None:
     path = table(tmp_path / "points.csv")
-    with pytest.raises(ValueError, match="4 rows and no column 'loss'; say which one"):
+    with pytest.raises(ValueError, match="4 rows and no column 'loss'; choose one"):
         named_point(BOWL, str(path))
     for row in ("0", "1", "6"):
         with pytest.raises(ValueError, match=rf"has points in rows 2 to 5 \(1 is the heading\); got row {row}"):

@@ -86,7 +86,7 @@ REFUSED: dict[str, tuple[Callable[[], Any], str]] = {
     "masked gradients": (lambda: from_numpy(lambda x: (x[:, 0], MASKED), SPACE).evaluate(X), "with masked ones"),
     "masked gradients of points": (
         lambda: from_numpy(lambda x: (x[0], MASKED[0]), SPACE, vectorized=False).evaluate(X),
-        "the gradient of .* masks some",
+        "the gradient of .* masked ones",
     ),
     "masked points": (lambda: BOWL.evaluate(MASKED), "bowl takes numbers; got an array with masked ones"),
     "masked bounds": (

@@ -175,7 +175,7 @@ def test_taichi_refuses_what_it_cannot_do():
     with pytest.raises(ValueError, match="cpu and cuda; got device 'tpu'"):
         start("tpu")
     start("cpu")
-    with pytest.raises(ValueError, match="runs on cpu in this process"):
+    with pytest.raises(ValueError, match="runs only on cpu in this process"):
         start("cuda")
     with pytest.raises(ValueError, match="float32 or float64; got 'float16'"):
         real("float16")
