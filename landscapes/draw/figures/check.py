@@ -90,7 +90,7 @@ def _causes(found: CheckReport) -> str:
         where = f", with {one.region.rule}" if one.region else ""
         said.append(f"{one.cause or 'no known cause'} ({one.certainty}){by}{where}")
     if found.share and found.share.judged and not found.share.wrong:
-        said.append(f"a defect in less than {percent(found.share.missed)} of the box may be missed")
+        said.append(f"a defect in less than {percent(found.share.missed)} of the box could be missed")
     return "; ".join(said)
 
 
