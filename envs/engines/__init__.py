@@ -8,12 +8,17 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 
+from ... import __version__
+from ...landscapes.identity import PACKAGE
+
 IMPORTED_AT = time.time()  # a file of ours that is changed later is not what this process runs
 EXTRAS = {"mjx": ("mujoco", "mujoco-mjx", "jax"), "newton": ("newton",)}  # of this package, and what each brings
 
 
 def installed_version(package: str) -> str | None:
     """Return the version of a package, without importing it; None where it is not installed."""
+    if package == PACKAGE:  # what pip wrote about a clone can be older than its code
+        return __version__
     try:
         return version(package)
     except PackageNotFoundError:

@@ -6,6 +6,7 @@ import os
 import shutil
 import sqlite3
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -114,7 +115,7 @@ def test_no_byte_of_the_table_changes_a_row(many: Path) -> None:
 
 def test_a_table_of_another_version_is_made_again(many: Path) -> None:
     whole = gs.slices(many)
-    with sqlite3.connect(many / TABLE) as table:
+    with closing(sqlite3.connect(many / TABLE)) as table, table:
         table.execute("ALTER TABLE slices DROP COLUMN lowest")
         table.execute("PRAGMA user_version = 3")
     pd.testing.assert_frame_equal(gs.slices(many), whole)
