@@ -29,7 +29,7 @@ def show(found: Hessian, console: Console) -> None:
     bounds = "" if found.whole and not found.undecided else f" ({share.low:.0%} to {share.high:.0%})"
     console.print(f"negative curvature: {share.value:.0%} of the eigenvalues{bounds}{untold}")
     console.print(
-        f"asymmetry: {found.asymmetry:.1g}, of which the finite differences explain {found.asymmetry_explained:.1g}"
+        f"asymmetry: {found.asymmetry:.1g}; the finite differences explain {found.asymmetry_explained:.1g} of it"
     )
     for warning in found.warnings:
         console.print(f"warning: {warning}")

@@ -286,9 +286,9 @@ def refuse_unknown(
     engine: str | None = None,
     dims: Sequence[str] = (),
 ) -> None:
-    """Raise ValueError for unknown settings, as far as possible without importing the scene or running its file.
+    """Raise ValueError for settings that are wrong without importing the scene or running its file.
 
-    Making the environment checks everything else, after an import that takes seconds. `dims` are parameters. Their
+    Making the environment checks the others, after an import that takes seconds. `dims` are parameters. Their
     numbers are compared with the number of parameters, where that is fixed.
     """
     if IN_FILE.fullmatch(what):

@@ -130,7 +130,7 @@ class Grade:
 
     @property
     def cause(self) -> str:
-        """The cause of wrong gradients, as far as known."""
+        """The cause of wrong gradients; empty if it is unknown."""
         return self.diagnosis.cause if self.diagnosis is not None else ""
 
     @property

@@ -241,7 +241,7 @@ class Quadtree:
         )
 
     def _trusts_cubic(self) -> NDArray[np.bool_]:
-        """Return for each cell whether gradients predicted better than losses alone, as far as both were tested."""
+        """Return for each cell whether it has gradients that did not predict worse than losses alone."""
         tested = self._tested()
         untested: NDArray[np.bool_] = np.asarray(np.isnan(tested).all(axis=1))
         error = np.where(untested[:, None], self.cells.error, tested)

@@ -338,7 +338,7 @@ class SliceStore:
     def coarse(self) -> xr.Dataset | None:
         """Return the largest complete coarse picture of the whole, axes ascending; None before the first.
 
-        It has no gradients where the whole has them only at some samples, of which the picture has only a few.
+        If the whole has gradients only at some samples, the picture has none, because it would have too few of them.
         """
         pending = self.pending()
         if not pending:

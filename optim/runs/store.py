@@ -121,9 +121,9 @@ class Journal:
     """The content of a run's file `state`: the valid rows, their checksums, and the state of the optimiser.
 
     Its first line is the SHA-256 digest of everything after it, its second a JSON object, and the rest is a result of
-    `encode`. A changed file is refused. There are `rows` rows, of which the optimiser has been told `told`; `sums` are
-    the checksums of every 64 of them. `gradient_cost` is that of the run, `about` the digest of the run's attributes;
-    `state` is encoded.
+    `encode`. A changed file is refused. There are `rows` rows, and the optimiser has received the first `told` of
+    them; `sums` are the checksums of every 64 rows. `gradient_cost` is that of the run, `about` the digest of the run's
+    attributes; `state` is encoded.
     """
 
     rows: int = 0

@@ -44,7 +44,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Contact:
-    """The two bodies that touch: a disc and a wall, or two discs of which the second is `other`."""
+    """The two bodies that touch: `disc`, and a `wall` or the disc `other`."""
 
     disc: int
     wall: Wall | None

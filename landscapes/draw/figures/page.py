@@ -113,7 +113,7 @@ def title(dataset: xr.Dataset) -> str:
 
 
 def provenance(dataset: xr.Dataset) -> str:
-    """Return version, device, date and command, as far as they are known."""
+    """Return the known ones of version, device, date and command."""
     known = {**stored_provenance(dataset), **stored_identity(dataset)}
     version = known.get(VERSIONS, {}).get(PACKAGE)
     said = [f"{PACKAGE} {version}"] if version else []
@@ -122,7 +122,7 @@ def provenance(dataset: xr.Dataset) -> str:
 
 
 def made_by(record: Any, *keys: str) -> list[str]:
-    """Return how a study was made, as far as known: device, date and command, or other `keys`."""
+    """Return the known ones of device, date and command of a study, or of other `keys`."""
     known = {**record.provenance, **record.identity}
     return [str(known[key]) for key in keys or ("device", "created", "command") if known.get(key)]
 

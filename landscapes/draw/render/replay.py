@@ -93,6 +93,7 @@ def frames(episode: Episode, chosen: Sequence[int], *, height: int = HEIGHT, mar
         moving = [part for part in parts if part not in still]
         bodies = [part for part in parts if part.shape == "lump"]
         goals = [mesh(part, 0) for part in goal_parts(episode)]
+        tracked = tracked_parts(moving)
         _place(plotter, still, [mesh(part, 0) for part in still], "still")
         if marked:
             _write_scale(plotter, shot)
@@ -104,7 +105,7 @@ def frames(episode: Episode, chosen: Sequence[int], *, height: int = HEIGHT, mar
             if marked:
                 said = f"{style.number(float(episode.time[frame]), '.3g')} s"
                 _stamp(plotter, said, "time", solids.INSET)
-                _name_lost(plotter, outside(episode, shot, frame), shot)
+                _name_lost(plotter, outside(tracked, shot, frame), shot)
             plotter.render()
             picture = np.array(plotter.screenshot(return_img=True))
             if marked:
@@ -158,7 +159,7 @@ class Shot:
 @contextmanager
 def _stage(view: View, shot: Shot) -> Iterator[pv.Plotter]:
     """Yield a plotter with lights and a camera that sees the view's box."""
-    center, (_, _, eye) = shot.center, axes(view)
+    center, (_, _, eye) = shot.center, shot.axes
     diagonal = float(np.linalg.norm(np.array(view.upper) - np.array(view.lower)))
     with off_screen(shot.size) as plotter:
         for direction, strength in solids.LIGHTS:
@@ -211,12 +212,16 @@ def axes(view: View) -> tuple[Grid, Grid, Grid]:
     return right, np.cross(eye, right), eye
 
 
-def outside(episode: Episode, shot: Shot, frame: int) -> list[str]:
-    """Name the bodies that a picture of a frame does not show: sheets and lumps, or else balls."""
-    moving = [part for part in episode.parts if part.material not in ("target", "goal") and not is_still(part)]
-    bodies = [part for part in moving if part.shape in ("sheet", "lump")]
-    bodies = bodies or [part for part in moving if part.shape == "sphere"]
-    lost = [part for part in bodies if not shot.shows(part.at[frame].double().numpy(), (part.size or (0.0,))[0])]
+def tracked_parts(moving: Sequence[Part]) -> list[Part]:
+    """Return the bodies that a viewer looks for in a picture: sheets and lumps, or else balls, but no targets."""
+    bodies = [part for part in moving if part.material not in ("target", "goal")]
+    soft = [part for part in bodies if part.shape in ("sheet", "lump")]
+    return soft or [part for part in bodies if part.shape == "sphere"]
+
+
+def outside(tracked: Sequence[Part], shot: Shot, frame: int) -> list[str]:
+    """Name the bodies that a picture of a frame does not show."""
+    lost = [part for part in tracked if not shot.shows(part.at[frame].double().numpy(), (part.size or (0.0,))[0])]
     return list(dict.fromkeys("ball" if part.shape == "sphere" else part.material for part in lost))
 
 

@@ -6,7 +6,8 @@
   const place_ = { dims: [...SPACE.dims], at: [...SPACE.at] }; // which parameters vary, and the point in the unit cube
   const progress = document.getElementById("progress");
   let mapped = null; // the place whose map is shown
-  const isMapped = () => mapped === JSON.stringify([place_.dims, place_.at]);
+  const placeSaid = ({ dims, at }) => JSON.stringify([dims, at]);
+  const isMapped = () => mapped === placeSaid(place_);
   let look = 0; // counts the places somebody looked at, so that answers about earlier ones are dropped
 
   async function ask(question, asked = {}) {
@@ -98,12 +99,12 @@
         return;
       }
       if (seen.slice && seen.number !== known) {
-        const held = place_.at.map((share, place) => (place_.dims.includes(place) ? null : share));
-        const there = JSON.stringify([seen.slice.axes.map((axis) => axis.label), held]);
+        const { dims, at } = seen.look;
+        const there = placeSaid({ dims, at: at.map((share, place) => (dims.includes(place) ? null : share)) });
         const runs = there === before ? SLICE.runs : [];
         before = there;
         load({ ...seen.slice, runs, episodes: [] });
-        mapped = JSON.stringify([seen.look.dims, seen.look.at]);
+        mapped = placeSaid(seen.look);
       }
       known = seen.number;
       if (seen.error) progress.textContent = seen.error;

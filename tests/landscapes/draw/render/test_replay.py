@@ -17,7 +17,16 @@ from gradscape.envs.outlines import rotate_about, skin, triangles
 from gradscape.envs.registry import BUILTIN, make
 from gradscape.landscapes.draw.figures.contact import Caption, episode_figure, save_sheet
 from gradscape.landscapes.draw.render import solids
-from gradscape.landscapes.draw.render.replay import Shot, add_title, axes, frames, missed_surface, outside, save_replay
+from gradscape.landscapes.draw.render.replay import (
+    Shot,
+    add_title,
+    axes,
+    frames,
+    missed_surface,
+    outside,
+    save_replay,
+    tracked_parts,
+)
 from gradscape.landscapes.draw.render.solids import lump, mesh
 from gradscape.landscapes.episode import Episode, Part, View
 
@@ -60,7 +69,7 @@ def test_a_ball_that_has_left_the_picture_is_named_as_long_as_it_is_away() -> No
     view = View((-1.0,) * 3, (1.0,) * 3, eye=(0.0, 0.0, 1.0), ground=None)
     episode = Episode(torch.arange(4.0), {}, {}, (ball, replace(ball, material="target")), view)
     shot = Shot.of(view, SMALL)
-    assert [outside(episode, shot, frame) for frame in range(4)] == [[], [], ["ball"], []]
+    assert [outside(tracked_parts(episode.parts), shot, frame) for frame in range(4)] == [[], [], ["ball"], []]
     seen = [picture[: SMALL // 5] for picture in frames(episode, range(4), height=SMALL)]
     assert [bool((one.min(axis=2) < 200).any()) for one in seen] == [False, False, True, False]
 
