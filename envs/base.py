@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import abc
 import inspect
-import queue
 import threading
 import weakref
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import suppress
 from dataclasses import asdict, replace
 from functools import partial
 from importlib import import_module
 from types import MethodType, ModuleType
-from typing import Any, ClassVar, Generic, TypeVar, final
+from typing import Any, ClassVar, TypeVar, final
 
 import torch
 from jaxtyping import Float, Int
@@ -24,7 +23,7 @@ from ..landscapes.episode import Episode as Episode
 from ..landscapes.identity import MODEL_VERSION
 from ..landscapes.objective import Evaluation, Objective, SimulatorError, Status, check_points
 from ..landscapes.options import NoOptions, read_options, record_options
-from ..landscapes.sampling.memory import free_memory, is_out_of_memory
+from ..landscapes.sampling.memory import Pool, free_memory, is_out_of_memory
 from ..landscapes.space import ParameterSpace, as_tensor
 from .engines import EXTRAS, Engine, find_engine
 from .records import Fidelity as Fidelity
@@ -32,8 +31,6 @@ from .records import MaterialRange as MaterialRange
 from .records import ModelPart as ModelPart
 from .records import Work as Work
 from .records import unknown_fidelity
-
-# ---- Spread a batch over threads, and lend them the solvers that serve one thread at a time.
 
 T = TypeVar("T")
 
@@ -43,36 +40,6 @@ def cores() -> int:
     from .engines import runtime
 
     return runtime.cores()
-
-
-class Pool(Generic[T]):
-    """Lend objects that serve one thread at a time; make a new one where none is idle, up to `most` of them."""
-
-    def __init__(self, make: Callable[[], T], *, most: int | None = None) -> None:
-        self._make = make
-        self._idle: queue.LifoQueue[T] = queue.LifoQueue()
-        self._making = threading.Lock()
-        self._room = threading.Semaphore(most) if most else nullcontext()
-
-    @contextmanager
-    def lend(self) -> Iterator[T]:
-        """Lend an idle object, or a new one, for the length of a with block."""
-        with self._room:
-            try:
-                item = self._idle.get_nowait()
-            except queue.Empty:
-                with self._making:
-                    item = self._make()
-            try:
-                yield item
-            finally:
-                self._idle.put(item)
-
-    def clear(self) -> None:
-        """Drop the idle objects, which frees their memory."""
-        with suppress(queue.Empty):
-            while True:
-                self._idle.get_nowait()
 
 
 class OwnMethod:
@@ -380,6 +347,8 @@ class Environment(Objective):
         """Free the memory that solvers hold between evaluations; the next evaluation makes them again."""
         if self._solvers is not None:
             self._solvers.clear()
+        for one in self._within():
+            one.release()
         free_memory()
 
     def memory(self) -> int:
@@ -571,6 +540,10 @@ class Environment(Objective):
 
     def _setup(self) -> None:
         """Prepare the parts that all evaluations share; sets `space` unless the class does."""
+
+    def _within(self) -> Iterable[Environment]:
+        """Return the environments that this one evaluates."""
+        return ()
 
     def _compile_ahead(self) -> None:
         """Compile all kernels in parallel."""

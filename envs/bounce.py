@@ -15,8 +15,9 @@ from torch import Tensor
 from ..landscapes.episode import Part, View
 from ..landscapes.objective import Evaluation, Status
 from ..landscapes.options import added
+from ..landscapes.sampling.memory import Pool
 from ..landscapes.space import ParameterSpace
-from .base import Environment, Episode, Fidelity, MaterialRange, ModelPart, Pool, Work, copied
+from .base import Environment, Episode, Fidelity, MaterialRange, ModelPart, Work, copied
 from .engines.balls.rigid import Ball, Solver
 from .engines.runtime import to_torch
 from .records import EpisodeOptions

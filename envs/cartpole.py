@@ -14,8 +14,9 @@ from torch import Tensor
 
 from ..landscapes.episode import Part, View
 from ..landscapes.objective import Evaluation, Status
+from ..landscapes.sampling.memory import Pool
 from ..landscapes.space import ParameterSpace
-from .base import Environment, Episode, Fidelity, ModelPart, Pool, Work, copied
+from .base import Environment, Episode, Fidelity, ModelPart, Work, copied
 from .controls import extend, hold
 from .engines.chain import Chain, Solver
 from .records import EpisodeOptions

@@ -14,8 +14,9 @@ from torch.nn.functional import normalize, pad
 
 from ..landscapes.episode import Part, View
 from ..landscapes.objective import Evaluation, Status
+from ..landscapes.sampling.memory import Pool
 from ..landscapes.space import ParameterSpace
-from .base import Environment, Episode, Fidelity, MaterialRange, ModelPart, Pool, Work
+from .base import Environment, Episode, Fidelity, MaterialRange, ModelPart, Work
 from .engines.balls.impacts import INERTIA, RIGID, SPARE, Board, Solver
 from .records import EpisodeOptions
 

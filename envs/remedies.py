@@ -52,6 +52,14 @@ class Remedy(ABC):
         """Return the points of `env` that points with the remedy stand for."""
         return x
 
+    def over(self, env: Environment) -> Remedy:
+        """Return the same remedy for `env`, the inner environment with other settings."""
+        return self
+
+    def others(self) -> tuple[Environment, ...]:
+        """Return the environments that it evaluates besides the inner one."""
+        return ()
+
 
 class RemediedEnvironment(Environment):
     """An environment with a remedy.
@@ -134,11 +142,11 @@ class RemediedEnvironment(Environment):
 
     def replicas(self) -> Mapping[str, Environment]:
         """Return the replicas of the inner environment, each with the remedy."""
-        return {name: RemediedEnvironment(one, self.remedy) for name, one in self.inner.replicas().items()}
+        return {name: self._over(one) for name, one in self.inner.replicas().items()}
 
     def with_horizon(self, horizon: float) -> Environment:
         """Return this environment with episodes of another length."""
-        return type(self)(self.inner.with_horizon(horizon), self.remedy)
+        return self._over(self.inner.with_horizon(horizon))
 
     def plain_point(self, x: Float[Tensor, "*batch dim"]) -> Float[Tensor, "*batch dim"]:
         """Return the corresponding points of the environment without its remedies."""
@@ -149,11 +157,20 @@ class RemediedEnvironment(Environment):
         return self.inner.without()
 
     def _remake(self, **settings: Any) -> Environment:
-        return type(self)(self.inner.remake(**settings), self.remedy)
+        return self._over(self.inner.remake(**settings))
+
+    def _over(self, inner: Environment) -> RemediedEnvironment:
+        """Return another inner environment with the same remedy."""
+        return type(self)(inner, self.remedy.over(inner))
+
+    def _within(self) -> tuple[Environment, ...]:
+        return self.inner, *self.remedy.others()
 
     def _setup(self) -> None:
         if self._max_rows < type(self)._max_rows:  # a batch took too much memory
-            self.inner.shrink(max(1, self._max_rows * self.remedy.cost))
+            within = self._within()
+            for one in within:
+                one.shrink(max(1, self._max_rows * self.remedy.cost // len(within)))
         self._capacity = self._max_rows
 
     def _prepare(self) -> None:
@@ -322,6 +339,14 @@ class Average(Remedy):
     def text(self) -> str:
         """How the command line spells it."""
         return ":".join(["average", *self.names])
+
+    def over(self, env: Environment) -> Remedy:
+        """Return the average over `env` and its own replicas."""
+        return average(env, self.names).remedy
+
+    def others(self) -> tuple[Environment, ...]:
+        """Return the replicas."""
+        return self.replicas
 
     def evaluate(self, env: Environment, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation:
         """Return mean losses and gradients; a point fails where one of them does."""

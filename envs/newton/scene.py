@@ -13,8 +13,9 @@ from torch import Tensor
 
 from ...landscapes.episode import Part, View
 from ...landscapes.objective import Evaluation
+from ...landscapes.sampling.memory import Pool
 from ...landscapes.space import ParameterSpace
-from ..base import Environment, Episode, Pool, Work
+from ..base import Environment, Episode, Work
 from ..records import EpisodeOptions
 
 GRAVITY = 9.8  # [m/s^2]

@@ -15,7 +15,8 @@ from torch import Tensor
 
 from ...landscapes.episode import Part, View
 from ...landscapes.objective import Evaluation, Status
-from ..base import Environment, Episode, Pool, Work, copied
+from ...landscapes.sampling.memory import Pool
+from ..base import Environment, Episode, Work, copied
 from ..controls import describe_motion, watch
 from ..engines.sheets.contact import Rule
 from ..engines.sheets.springs import Sheet, Solver, capacity

@@ -1,11 +1,15 @@
-"""Memory of the device: batches are halved when it runs out."""
+"""Memory of the device: when it runs out, idle solvers are dropped and batches are halved."""
 
 from __future__ import annotations
 
 import gc
+import queue
 import re
-from collections.abc import Iterator
-from contextlib import contextmanager
+import threading
+import weakref
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext, suppress
+from typing import Any, ClassVar, Generic, TypeVar
 
 import torch
 from jaxtyping import Float
@@ -18,6 +22,51 @@ SAID = re.compile(
     r"out of memory|out of CUDA|fail\w* to allocate|can't allocate memory|not enough memory", re.IGNORECASE
 )
 ADVICE = "end other programs on the device, or use a lower --fidelity or another --device"
+
+T = TypeVar("T")
+
+
+class Pool(Generic[T]):
+    """Lend objects that serve one thread at a time; make a new one where none is idle, up to `most` of them."""
+
+    every: ClassVar[weakref.WeakSet[Pool[Any]]] = weakref.WeakSet()
+
+    def __init__(self, make: Callable[[], T], *, most: int | None = None) -> None:
+        self._make = make
+        self._idle: queue.LifoQueue[T] = queue.LifoQueue()
+        self._making = threading.Lock()
+        self._room = threading.Semaphore(most) if most else nullcontext()
+        Pool.every.add(self)
+
+    @contextmanager
+    def lend(self) -> Iterator[T]:
+        """Lend an idle object, or a new one, for the length of a with block."""
+        with self._room:
+            try:
+                item = self._idle.get_nowait()
+            except queue.Empty:
+                with self._making:
+                    item = self._made()
+            try:
+                yield item
+            finally:
+                self._idle.put(item)
+
+    def clear(self) -> None:
+        """Drop the idle objects, which frees their memory."""
+        with suppress(queue.Empty):
+            while True:
+                self._idle.get_nowait()
+
+    def _made(self) -> T:
+        """Return a new object, in the memory of all idle ones where there is too little without."""
+        try:
+            return self._make()
+        except (RuntimeError, MemoryError) as error:
+            if not is_out_of_memory(error):
+                raise
+        release_idle()  # here, where the error no longer holds what was made of it
+        return self._make()
 
 
 class MemoryBound(ObjectiveWrapper):
@@ -43,7 +92,11 @@ class MemoryBound(ObjectiveWrapper):
             rows = x[start : start + (self._most or len(x))]
             part = self._try(rows, grad=grad)
             if part is None:
-                free_memory()  # the arrays of the attempt that failed
+                release_idle()  # with the arrays of the attempt that failed
+                if len(rows) == 1:
+                    parts.append(self._last(rows, grad=grad))
+                    start += 1
+                    continue
                 self._most = len(rows) // 2
                 self.shrink(self._most)
                 self._notes.append(f"{self.name} ran out of memory at {len(rows)} points; continuing with {self._most}")
@@ -64,9 +117,23 @@ class MemoryBound(ObjectiveWrapper):
         except (RuntimeError, MemoryError) as error:
             if not is_out_of_memory(error):
                 raise
-            if len(x) == 1:
-                raise MemoryError(f"{self.name} ran out of memory at a single point: {error}; {ADVICE}") from error
             return None
+
+    def _last(self, x: Float[Tensor, "1 dim"], *, grad: bool) -> Evaluation:
+        """Return the evaluation of a single point, now that nothing else holds memory."""
+        try:
+            return evaluate(self.objective, x, grad=grad)
+        except (RuntimeError, MemoryError) as error:
+            if not is_out_of_memory(error):
+                raise
+            raise MemoryError(f"{self.name} ran out of memory at a single point: {error}; {ADVICE}") from error
+
+
+def release_idle() -> None:
+    """Free the memory that idle solvers of all environments in this process hold."""
+    for pool in list(Pool.every):
+        pool.clear()
+    free_memory()
 
 
 def free_memory() -> None:

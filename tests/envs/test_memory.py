@@ -11,8 +11,10 @@ import torch
 import gradscape as gs
 from gradscape.envs.base import Environment, OwnMethod
 from gradscape.envs.engines.mpm.solver import Solver
+from gradscape.envs.engines.sheets.springs import Solver as Springs
 from gradscape.envs.mpm.scene import MpmScene
-from gradscape.landscapes.objective import Evaluation, SimulatorError
+from gradscape.landscapes.objective import Evaluation, SimulatorError, Status
+from gradscape.landscapes.sampling.memory import MemoryBound
 
 from .scenes import SIMULATED, made, of_family, one_of_each
 
@@ -49,6 +51,7 @@ def use(env):
 
 @pytest.mark.parametrize("name", one_of_each(SIMULATED))
 def test_a_scene_and_its_solver_are_freed_with_their_last_reference(name):
+    made(name)  # imports its engine: what Newton raises meanwhile holds the first scene
     with no_collection():
         env = made(name)
         use(env)
@@ -135,3 +138,49 @@ def test_a_method_of_ones_own_keeps_nobody_alive_and_goes_to_other_processes():
         assert owner.method(3) == sent.method(3) == 6
         del owner
         assert held() is None
+
+
+def test_a_solver_gets_the_memory_of_idle_ones(monkeypatch):
+    held, room = gs.make("flip", fidelity="draft", horizon=0.1), list[int]()
+    held.evaluate(x := held.space.uniform(1, seed=0))
+    idle, init = solver_of(held), Springs.__init__
+
+    def fitting(self, *args, **settings):
+        room.append(idle() is None)
+        if not room[-1]:
+            raise RuntimeError("Failed to allocate 1 bytes on device 'cuda:0'")
+        init(self, *args, **settings)
+
+    monkeypatch.setattr(Springs, "__init__", fitting)
+    other = gs.make("flip", fidelity="draft", horizon=0.1)
+    assert other.evaluate(x).loss == held.evaluate(x).loss
+    assert room[:2] == [False, True]
+
+
+def test_a_single_point_gets_all_memory_before_it_fails():
+    held = gs.make("flip", fidelity="draft", horizon=0.1)
+    held.evaluate(held.space.uniform(1, seed=0))
+    idle = solver_of(held)
+
+    def greedy(x):
+        if idle() is not None:
+            raise RuntimeError("CUDA out of memory")
+        return x.sum(dim=1)
+
+    bound = MemoryBound(gs.from_torch(greedy, SPACE))
+    assert bound.evaluate(SPACE.center[None]).status == Status.OK
+    assert idle() is None
+
+
+def test_a_remedy_shrinks_and_releases_all_that_it_evaluates():
+    env = gs.average(gs.make("flip", fidelity="draft", horizon=0.1))
+    within = [env.inner, *env.remedy.others()]
+    env.evaluate(env.space.uniform(2, seed=0))
+    solvers = [solver_of(one) for one in within]
+    env.release()
+    assert [one() for one in solvers] == [None] * len(within)
+    env.shrink(2)
+    assert {one._capacity for one in within} == {2}
+    smoothed = gs.smooth(env, 0.1, samples=6)
+    smoothed.shrink(1)
+    assert {one._capacity for one in within} == {6}

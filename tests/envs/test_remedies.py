@@ -161,6 +161,14 @@ def test_the_average_is_the_mean_of_the_replicas() -> None:
     assert average(env, names[:1]).identity()["remedy"] == f"average:{names[0]}"
 
 
+def test_the_average_takes_the_replicas_of_its_own_settings() -> None:
+    env = average(gs.make("bounce", fidelity="draft"))
+    assert {one.horizon for one in env.with_horizon(0.5).remedy.others()} == {0.5}
+    finer = env.remake(fidelity="standard")
+    x = env.space.sobol(2, seed=0)
+    torch.testing.assert_close(finer.evaluate(x).loss, average(gs.make("bounce", fidelity="standard")).evaluate(x).loss)
+
+
 def test_settings_of_the_scene_are_remedies_too() -> None:
     env = gs.make("bounce", fidelity="draft")
     assert shorten(env, 0.5).horizon == env.horizon / 2

@@ -26,6 +26,7 @@ import numpy as np
 import torch
 import warp as wp
 
+from ....landscapes.sampling.memory import release_idle
 from .. import cpp
 from ..cpp import threads
 from ..launches import Launches
@@ -304,6 +305,7 @@ def capacity(model: Model, device: str) -> int:
     """Return how many environments of a model a solver should take at once."""
     if device == "cpu":
         return max(1, min(4, CROWD // model.particles))  # few enough for the cache
+    release_idle()
     free, whole = free_memory() * 7 // 8, model.bytes_per_environment(model.steps, columns=True)
     fitting = free // memory(model, device)
     return max(1, min(1024, FULL_CARD // model.particles, fitting, max(free // whole, BUSY // model.particles)))

@@ -18,6 +18,7 @@ import numpy as np
 import torch
 import warp as wp
 
+from ....landscapes.sampling.memory import release_idle
 from .. import cpp
 from ..launches import Launches
 from ..runtime import fill_struct, free_memory, load, precision, to_torch
@@ -76,6 +77,7 @@ def capacity(size: int, device: str) -> int:
     """Return how many episodes of a `size` in bytes a solver should take at once."""
     if device == "cpu":
         return max(1, min(32, (1 << 28) // size))
+    release_idle()
     return max(1, min(1024, free_memory() * 3 // 4 // size))
 
 
