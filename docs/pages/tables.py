@@ -48,13 +48,12 @@ ROOT = Path(__file__).parents[2]
 FLOORS = DATA / "floors.json"  # which benchmarks/symmetry.py writes
 UNMEASURED, MISSING = "not measured since the scene changed", "not measured"
 UNCOUNTED = "no census since the verdicts changed"
-COLUMNS = {  # of README: what a slice may be, and the words that say so, of which a slice has one at most
+SURFACES = {  # of README: what a slice may be, and the words that say so, of which a slice has one at most
     "very smooth": ("very smooth",),
     "smooth with local minima": ("smooth with local minima",),
     "rugged": ("rugged", "extremely rugged"),
-    "with jumps": ("discontinuous",),
-    "gradients follow": ("gradients follow",),
 }
+OTHERS = {"with jumps": ("discontinuous",), "gradients follow": ("gradients follow",)}
 Record = Mapping[str, Any]
 
 
@@ -111,9 +110,12 @@ def short_censuses() -> str:
         if isinstance(found, str):
             left.append(f"`{scene}`")
             continue
-        cells = [str(found.solid), *(_interval(found.share(words)) for words in COLUMNS.values())]
+        surface, other = ([found.share(words) for words in columns.values()] for columns in (SURFACES, OTHERS))
+        known = found.share([word for words in SURFACES.values() for word in words])
+        unknown = Estimate(1 - known.value, 1 - known.high, 1 - known.low)
+        cells = [str(found.solid), *map(_interval, [*surface, unknown, *other])]
         rows.append([f"`{scene}`", *cells, ", ".join(_paper_words(scene))])
-    shown = table(("environment", "slices", *COLUMNS, "the paper says"), rows)
+    shown = table(("environment", "slices", *SURFACES, "none of the three", *OTHERS, "the paper says"), rows)
     return f"{shown}\n\nNo census since the verdicts changed: {', '.join(left)}." if left else shown
 
 

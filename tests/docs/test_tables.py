@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from docs.pages import tables
-from docs.pages.tables import COLUMNS, MISSING, UNCOUNTED, UNMEASURED, kept, scenes, settle, studies
+from docs.pages.tables import MISSING, OTHERS, SURFACES, UNCOUNTED, UNMEASURED, kept, scenes, settle, studies
 
 from gradscape.envs.registry import entries, environment_class
 from gradscape.gallery.files import DATA
@@ -122,9 +122,10 @@ def test_a_claim_that_breaks_is_named_with_what_it_lacks(monkeypatch: pytest.Mon
         assert {row[-1] for row in lines(tables.fidelities()) if row[0] == "`torus`"} == {said}
 
 
-def test_shares_of_a_column_count_no_slice_twice() -> None:
+def test_a_slice_has_one_surface_at_most() -> None:
+    surface = {word for words in SURFACES.values() for word in words}
     for path in sorted((DATA / "census").glob("*.json")):
-        for words in COLUMNS.values():
+        for words in (surface, *OTHERS.values()):
             assert all(len(set(words) & set(one["words"])) < 2 for one in read_json(path)["slices"])
 
 
