@@ -53,6 +53,7 @@ SURFACES = {  # of README: what a slice may be, and the words that say so, of wh
     "smooth with local minima": ("smooth with local minima",),
     "rugged": ("rugged", "extremely rugged"),
 }
+OFTEN = 0.1  # share of slices from which on a word is in the table of presets
 OTHERS = {"with jumps": ("discontinuous",), "gradients follow": ("gradients follow",)}
 Record = Mapping[str, Any]
 
@@ -119,8 +120,28 @@ def short_censuses() -> str:
     return f"{shown}\n\nNo census since the verdicts changed: {', '.join(left)}." if left else shown
 
 
-def _census(scene: str) -> Census | str:
-    found = kept("census/{}-{}.json", scene)
+def presets() -> str:
+    """The verdicts on slices with our settings and with the paper's, where these differ."""
+    rows = []
+    for scene in scenes():
+        if not environment_class(scene).presets.get("paper"):
+            continue
+        said, cells = _paper_words(scene), list[str]()
+        for settings in ("default", "paper"):
+            found = _census(scene, f"presets/{{}}-{{}}-{settings}.json")
+            if isinstance(found, str):
+                cells += ["", found]
+                continue
+            often = [word for word, one in found.words.items() if one.value >= OFTEN or word in said]
+            order = sorted(often, key=lambda word: -found.words[word].value)
+            cells += [found.fidelity, ", ".join(f"{word} {_interval(found.words[word])}" for word in order)]
+        rows.append([f"`{scene}`", cells[0], cells[1], cells[3], ", ".join(said)])
+    head = ("environment", "fidelity", "with our settings", "with `--preset paper`", "the paper's words")
+    return table(head, rows)
+
+
+def _census(scene: str, pattern: str = "census/{}-{}.json") -> Census | str:
+    found = kept(pattern, scene)
     if isinstance(found, str):
         return UNCOUNTED if found == MISSING else found
     return from_json(Census, found[0])
@@ -367,6 +388,7 @@ TABLES: dict[tuple[str, str], Callable[[], str]] = {  # by page and name
     ("BENCHMARKS.md", "accuracy"): accuracy,
     ("docs/measured.md", "measured"): measured,
     ("docs/measured.md", "censuses"): censuses,
+    ("docs/measured.md", "presets"): presets,
     ("docs/measured.md", "margins"): margins,
     ("docs/fidelities.md", "fidelities"): fidelities,
     ("docs/parts.md", "parts"): parts,
