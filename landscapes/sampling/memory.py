@@ -19,7 +19,8 @@ from ..objective import Evaluation, Objective, ObjectiveWrapper, evaluate
 
 # What torch, Warp, Taichi and CUDA say; the first of them alone has a type of its own.
 SAID = re.compile(
-    r"out of memory|out of CUDA|fail\w* to allocate|can't allocate memory|not enough memory", re.IGNORECASE
+    r"out of memory|out of CUDA|fail\w* to allocate|can't allocate memory|not enough memory|acquire primary context",
+    re.IGNORECASE,
 )
 ADVICE = "end other programs on the device, or use a lower --fidelity or another --device"
 

@@ -32,6 +32,7 @@ MESSAGES = [
     "Failed to allocate 123456 bytes on device 'cuda:0'",
     "DefaultCPUAllocator: can't allocate memory: you tried to allocate 8000000000000 bytes",
     "Out of CUDA pre-allocated memory",
+    "Failed to acquire primary context for device cuda:0",  # Warp's, on a GPU that other programs fill
 ]
 
 
