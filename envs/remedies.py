@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -141,8 +142,15 @@ class RemediedEnvironment(Environment):
         return None
 
     def replicas(self) -> Mapping[str, Environment]:
-        """Return the replicas of the inner environment, each with the remedy."""
-        return {name: self._over(one) for name, one in self.inner.replicas().items()}
+        """Return the replicas of the inner environment, each with the remedy; one that cannot have it is left out.
+
+        A function's replica has no further replicas to average over.
+        """
+        found: dict[str, Environment] = {}
+        for name, one in self.inner.replicas().items():
+            with suppress(ValueError):
+                found[name] = self._over(one)
+        return found
 
     def with_horizon(self, horizon: float) -> Environment:
         """Return this environment with episodes of another length."""

@@ -169,6 +169,22 @@ def test_the_average_takes_the_replicas_of_its_own_settings() -> None:
     torch.testing.assert_close(finer.evaluate(x).loss, average(gs.make("bounce", fidelity="standard")).evaluate(x).loss)
 
 
+def test_an_average_of_functions_has_no_replicas_of_its_own() -> None:
+    def moved(x: torch.Tensor, horizon: float = 1.0, by: float = 0.1) -> torch.Tensor:
+        return horizon * ((x + by) ** 2).sum(dim=1)
+
+    options = {"horizon": 1.0}
+    env = average(
+        gs.from_torch(
+            lambda x, horizon: moved(x, horizon, 0.0), SQUARE, name="bowl", options=options, horizon="horizon",
+            replicas={"moved": moved},
+        )
+    )  # fmt: skip
+    assert not env.replicas()
+    half = env.with_horizon(0.5)
+    torch.testing.assert_close(half.evaluate(POINTS).loss, env.evaluate(POINTS).loss / 2)
+
+
 def test_settings_of_the_scene_are_remedies_too() -> None:
     env = gs.make("bounce", fidelity="draft")
     assert shorten(env, 0.5).horizon == env.horizon / 2
