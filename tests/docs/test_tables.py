@@ -66,6 +66,8 @@ def test_every_scene_has_a_row_and_every_part_has_one() -> None:
     for table, rows in ((tables.censuses(), 1), (tables.fidelities(), len(CLAIMS))):
         assert [row[0].strip("`") for row in lines(table)] == [name for name in scenes() for _ in range(rows)]
     assert {row[0].strip("`") for row in lines(tables.margins())} == set(scenes())
+    differing = [name for name in scenes() if environment_class(name).presets.get("paper")]
+    assert [row[0].strip("`") for row in lines(tables.presets())] == differing
     named = [(name, part.name) for name in sorted(entries()) for part in environment_class(name).model_parts]
     assert [(row[0].strip("`"), row[1]) for row in lines(tables.parts())] == named
 
