@@ -72,7 +72,7 @@ html_copy_source = False
 html_sidebars = {"start": [], "generated/wall": []}  # which have no pages below them
 TABLES = ("measured", "remedies", "fidelities", "races", "benchmarks", "parts")
 html_theme_options = {
-    "secondary_sidebar_items": {"**": ["page-toc"], **dict.fromkeys(TABLES, [])},  # tables get its room
+    "secondary_sidebar_items": {"**": ["page-toc"], **{page: [] for page in TABLES}},  # tables get its room
     "show_toc_level": 2,
     "navigation_with_keys": False,
     "navbar_align": "left",
