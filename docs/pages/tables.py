@@ -53,8 +53,8 @@ SURFACES = {  # of README: what a slice may be, and the words that say so, of wh
     "smooth with local minima": ("smooth with local minima",),
     "rugged": ("rugged", "extremely rugged"),
 }
-OFTEN = 0.1  # share of slices from which on a word is in the table of presets
 OTHERS = {"with jumps": ("discontinuous",), "gradients follow": ("gradients follow",)}
+OFTEN = 0.1  # share of slices from which on a word is in the table of presets
 Record = Mapping[str, Any]
 
 

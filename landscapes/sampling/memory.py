@@ -94,10 +94,8 @@ class MemoryBound(ObjectiveWrapper):
             part = self._try(rows, grad=grad)
             if part is None:
                 release_idle()  # with the arrays of the attempt that failed
-                if len(rows) == 1:
-                    parts.append(self._last(rows, grad=grad))
-                    start += 1
-                    continue
+                part = self._try(rows, grad=grad, last=True) if len(rows) == 1 else None
+            if part is None:
                 self._most = len(rows) // 2
                 self.shrink(self._most)
                 self._notes.append(f"{self.name} ran out of memory at {len(rows)} points; continuing with {self._most}")
@@ -111,23 +109,19 @@ class MemoryBound(ObjectiveWrapper):
         notes, self._notes = tuple(self._notes), []
         return notes
 
-    def _try(self, x: Float[Tensor, "batch dim"], *, grad: bool) -> Evaluation | None:
-        """Return the evaluation, None where the device has too little memory for this many points."""
-        try:
-            return evaluate(self.objective, x, grad=grad)
-        except (RuntimeError, MemoryError) as error:
-            if not is_out_of_memory(error):
-                raise
-            return None
+    def _try(self, x: Float[Tensor, "batch dim"], *, grad: bool, last: bool = False) -> Evaluation | None:
+        """Return the evaluation, None where the device has too little memory for this many points.
 
-    def _last(self, x: Float[Tensor, "1 dim"], *, grad: bool) -> Evaluation:
-        """Return the evaluation of a single point, now that nothing else holds memory."""
+        The `last` try of a single point raises MemoryError there.
+        """
         try:
             return evaluate(self.objective, x, grad=grad)
         except (RuntimeError, MemoryError) as error:
             if not is_out_of_memory(error):
                 raise
-            raise MemoryError(f"{self.name} ran out of memory at a single point: {error}; {ADVICE}") from error
+            if last:
+                raise MemoryError(f"{self.name} ran out of memory at a single point: {error}; {ADVICE}") from error
+            return None
 
 
 def release_idle() -> None:
