@@ -22,7 +22,7 @@ from ..landscapes.verification import LAST_PLACE
 from .folder import CENSUS, ROOT, folder_named
 from .job import CheckpointedJob
 from .plan import simulation_seconds
-from .scene import SceneSpec, provenance
+from .scene import SceneSpec, first_line, provenance
 from .watch import PREPARING, Watch, Work
 from .workers import recipe
 
@@ -233,7 +233,7 @@ class CensusJob(CheckpointedJob["Census"]):
     def _announce(self, watch: Watch) -> None:
         left, samples = self.left(), self.design.resolution**2
         bases, cuts = len(self.design.bases), len(self.design.cuts)
-        watch.note(f"{self.env.name} · {self.env.fidelity.name} · {self.env.device} · {self.folder}")
+        watch.note(first_line(self.env.identity(), self.folder))
         without, having = self.design.samples
         what = (
             f"{len(self.design.places)} slices through {bases} base points along {cuts} cuts, {samples} samples each"

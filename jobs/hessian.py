@@ -32,7 +32,7 @@ from ..landscapes.storage.files import replacing
 from .folder import HESSIAN, folder_named
 from .job import CheckpointedJob
 from .plan import simulation_seconds
-from .scene import SceneSpec, given_point, provenance
+from .scene import SceneSpec, first_line, given_point, provenance
 from .watch import PREPARING, Watch, Work
 
 if TYPE_CHECKING:
@@ -157,7 +157,7 @@ class HessianJob(CheckpointedJob[Hessian]):
 
     def _announce(self, watch: Watch) -> None:
         env, (work,) = self.env, self.work()
-        watch.note(f"{env.name} · {env.fidelity.name} · {env.device} · {self.folder}")
+        watch.note(first_line(env.identity(), self.folder))
         with watch.busy(f"{env.name}: {PREPARING}"):
             each = simulation_seconds(env, work.losses, work.gradients, env.preferred_batch)
         dim, seconds = env.space.dim, each + PICTURE_SECONDS

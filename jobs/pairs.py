@@ -13,7 +13,7 @@ from ..landscapes.measures.sensitivity import Design, Pair, default_samples, exp
 from ..landscapes.storage.checkpoint import Checkpoint
 from .folder import PAIRS, folder_named
 from .job import CheckpointedJob
-from .scene import SceneSpec, provenance
+from .scene import SceneSpec, first_line, provenance
 from .watch import PREPARING, Watch, Work
 
 if TYPE_CHECKING:
@@ -152,7 +152,7 @@ class PairsJob(CheckpointedJob[PairRanking]):
             env.prepare()
             each = seconds_per_episode(env, design.move_one(range(1))[: env.preferred_batch], grad=False)
         samples, dim = len(design.base), env.space.dim
-        watch.note(f"{env.name} · {env.fidelity.name} · {env.device} · {self.folder}")
+        watch.note(first_line(env.identity(), self.folder))
         seconds = design.episodes * each
         watch.announce(
             f"{design.episodes} episodes, {samples} with gradients, for {dim} parameters and {dim * (dim - 1) // 2} "

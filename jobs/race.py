@@ -27,7 +27,7 @@ from ..optim.search import SearchProgress
 from .folder import RACE, RUN_STORE, folder_named
 from .job import Job, filling
 from .plan import simulation_seconds
-from .scene import provenance
+from .scene import first_line, provenance
 from .search import divide_methods, make_optimizer, open_run_store, points_within
 from .watch import PREPARING, Watch, Work
 from .workers import recipe
@@ -215,7 +215,7 @@ class RaceJob(Job[Race]):
     def _announce(self, watch: Watch) -> float | None:
         """Say what is left to compute, and return what an episode with gradient costs if any method asks for it."""
         env = self.env
-        watch.note(f"{env.name} · {env.fidelity.name} · {env.device} · {self.folder}")
+        watch.note(first_line(env.identity(), self.folder))
         needs = self._needs_grad
         left = {
             way: sum(self._count_left(one) for one in self.competitors if needs[one.method] == way) for way in (0, 1)

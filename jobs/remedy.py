@@ -24,7 +24,7 @@ from ..studies.remedies import WITHOUT, Ends, RemedyStudy, candidates, conclude,
 from .folder import REMEDY, folder_named
 from .job import CheckpointedJob
 from .plan import simulation_seconds
-from .scene import SceneSpec, plane_through, provenance
+from .scene import SceneSpec, first_line, plane_through, provenance
 from .search import points_within
 from .watch import PREPARING, Watch, Work
 
@@ -156,7 +156,7 @@ class RemedyJob(CheckpointedJob[RemedyStudy]):
 
     def _announce(self, watch: Watch) -> None:
         env = self.env
-        watch.note(f"{env.name} · {env.fidelity.name} · {env.device} · {self.folder}")
+        watch.note(first_line(env.identity(), self.folder))
         with watch.busy(f"{env.name}: {PREPARING}"):
             (work,) = self.work()
             each = simulation_seconds(env, work.losses, work.gradients, env.preferred_batch)

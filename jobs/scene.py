@@ -14,7 +14,16 @@ from typing import TYPE_CHECKING, Any
 from .. import __version__
 from ..envs.engines import installed_version
 from ..envs.registry import find_environment, make, registered_environment, source_of
-from ..landscapes.identity import MODEL_VERSION, PACKAGE, POLICY, REMEDY, VERSIONS, stored_identity
+from ..landscapes.identity import (
+    EPISODES_PER_POINT,
+    MODEL_VERSION,
+    PACKAGE,
+    POLICY,
+    REMEDY,
+    VERSIONS,
+    simulator_parts,
+    stored_identity,
+)
 from ..landscapes.options import record_options
 from ..landscapes.plain import digest, number, plain_json, read_share
 from ..landscapes.storage.files import moved_by, write_json
@@ -111,6 +120,13 @@ def made_over(env: Environment, policy: str | None, remedy: str | None) -> Envir
 
         env = remedied(env, remedy)
     return env
+
+
+def first_line(identity: Mapping[str, Any], *parts: object) -> str:
+    """Return the first line of a job: the simulator, its remedy and what that costs, the device, and more `parts`."""
+    times = identity.get(EPISODES_PER_POINT, 1)
+    cost = [f"each episode runs the simulator {times} times"] if times > 1 else []
+    return " · ".join(map(str, [*simulator_parts(identity), *cost, identity["device"], *parts]))
 
 
 def provenance(objective: Objective, command: str) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..landscapes.cost import duration, episode_cost
-from ..landscapes.identity import METHOD_VERSION, simulator_parts
+from ..landscapes.identity import METHOD_VERSION
 from ..landscapes.objective import FAILED, Objective, Status, describe_errors
 from ..landscapes.space import as_whole
 from ..landscapes.storage.files import check_free, clear
@@ -23,7 +23,7 @@ from ..optim.runs.store import RunStore
 from ..optim.search import SearchProgress, search
 from .folder import RUN, SUMMARY, folder_named
 from .job import SummaryJob, filling
-from .scene import provenance
+from .scene import first_line, provenance
 from .watch import PREPARING, Watch, Work
 
 if TYPE_CHECKING:
@@ -190,8 +190,7 @@ class SearchJob(SummaryJob[SearchSummary]):
         return ratio if grad else None
 
     def _place(self) -> str:
-        parts = " · ".join(simulator_parts(self.env.identity()))
-        return f"{parts} · {self.env.device} · {self.optimizer.name} · {self.folder}"
+        return first_line(self.env.identity(), self.optimizer.name, self.folder)
 
     def _summary(self, resumed: int, seconds: float, files: list[str]) -> SearchSummary:
         run, identity = self.store.read(), self.store.identity

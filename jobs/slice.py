@@ -58,7 +58,7 @@ from ..landscapes.training import Training, TrainingPath
 from ..landscapes.verification import verify_dataset
 from .folder import ROOT, SLICE, SUMMARY, folder_named
 from .job import SummaryJob
-from .scene import provenance
+from .scene import first_line, provenance
 from .watch import PREPARING, Watch, Work, resumable
 from .workers import recipe
 
@@ -298,7 +298,7 @@ class SliceJob(SummaryJob[SliceSummary]):
                 cost = cost.less(int((partly_refined(self.store)["status"] > 0).sum()))
         total, whole = math.prod(self.plane.resolution), self.store.grad and self.store.every == 1
         kind = kind_of(self.store)
-        watch.note(" · ".join([env, str(about.get("fidelity")), str(about.get("device")), str(self.folder)]))
+        watch.note(first_line(about, self.folder))
         if not cost.episodes:
             watch.note(f"all {total} {kind} are done already")
             return

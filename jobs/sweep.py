@@ -31,7 +31,7 @@ from ..landscapes.storage.paths import check_replaceable, slice_exists, slice_pl
 from ..landscapes.storage.store import SliceStore
 from .folder import ROOT, SWEEP, folder_named
 from .job import SummaryJob
-from .scene import provenance
+from .scene import first_line, provenance
 from .slice import (
     MAX_NAME_LETTERS,
     SliceCost,
@@ -232,7 +232,7 @@ class SweepJob(SummaryJob[SweepSummary]):
     def _announce(self, watch: Watch) -> None:
         """Say what is left to compute and what that costs."""
         left, env, kind = self.total - self.done(), self.env, kind_of(self.stores[0])
-        watch.note(f"{env.name} · {env.fidelity.name} · {env.device} · {self.folder}")
+        watch.note(first_line(env.identity(), self.folder))
         if not left:
             watch.note(f"all {self.total} {kind} of {len(self.stores)} slices are done already")
             return

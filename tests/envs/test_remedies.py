@@ -20,6 +20,7 @@ from gradscape.envs.remedies import (
     smooth,
     soften,
 )
+from gradscape.jobs.scene import first_line
 from gradscape.landscapes.randomised import ORDERS, Order, reflect
 
 SQUARE = gs.ParameterSpace({"a": (-1, 1), "b": (-1, 1)})
@@ -248,3 +249,10 @@ def test_a_remedy_around_a_function_goes_through_every_door(function, tmp_path: 
     assert best.data["forwards"][-1] >= 40
     gs.race(env, ["random"], seeds=1, budget=8, out=tmp_path / "race")
     gs.census(env, slices=1, resolution=6, out=tmp_path / "census")
+
+
+def test_a_job_says_first_how_often_an_episode_runs_the_simulator() -> None:
+    smoothed = smooth(average(gs.make("bounce", fidelity="draft")), 0.02, samples=6)
+    said = first_line(smoothed.identity(), "out")
+    assert said == "bounce · draft · average,smooth:0.02:mixed:6 · each episode runs the simulator 18 times · cpu · out"
+    assert first_line(smoothed.without().identity()) == "bounce · draft · cpu"
