@@ -125,8 +125,9 @@ def made_over(env: Environment, policy: str | None, remedy: str | None) -> Envir
 def first_line(identity: Mapping[str, Any], *parts: object) -> str:
     """Return the first line of a job: the simulator, its remedy and what that costs, the device, and more `parts`."""
     times = identity.get(EPISODES_PER_POINT, 1)
-    cost = [f"each episode runs the simulator {times} times"] if times > 1 else []
-    return " · ".join(map(str, [*simulator_parts(identity), *cost, identity["device"], *parts]))
+    more = [f"each episode runs the simulator {times} times"] if times > 1 else []
+    more += [identity["device"]] if "device" in identity else []
+    return " · ".join(map(str, [*simulator_parts(identity), *more, *parts]))
 
 
 def provenance(objective: Objective, command: str) -> dict[str, Any]:
