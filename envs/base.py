@@ -345,10 +345,7 @@ class Environment(Objective):
     @final
     def release(self) -> None:
         """Free the memory that solvers hold between evaluations; the next evaluation makes them again."""
-        if self._solvers is not None:
-            self._solvers.clear()
-        for one in self._within():
-            one.release()
+        self._drop_solvers()
         free_memory()
 
     def memory(self) -> int:
@@ -544,6 +541,12 @@ class Environment(Objective):
     def _within(self) -> Iterable[Environment]:
         """Return the environments that this one evaluates."""
         return ()
+
+    def _drop_solvers(self) -> None:
+        if self._solvers is not None:
+            self._solvers.clear()
+        for one in self._within():
+            one._drop_solvers()
 
     def _compile_ahead(self) -> None:
         """Compile all kernels in parallel."""

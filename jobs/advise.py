@@ -22,6 +22,7 @@ from ..optim.registry import optimizer_class
 from ..studies.kept import find_fidelity
 from .folder import ADVICE, IDENTITY
 from .job import Job
+from .scene import first_line
 from .search import BestRecord, divide_methods, points_within
 from .watch import PREPARING, Watch, Work
 
@@ -122,9 +123,7 @@ class AdviseJob(Job[Advice]):
         env, count = self.env, self.evaluations
         with watch.busy(f"{env.name}: {PREPARING}"):
             env.prepare()
-        watch.note(
-            f"{env.name} · {env.fidelity.name} · {env.device}: measuring takes {count} of {self.budget} episodes"
-        )
+        watch.note(f"{first_line(env.identity())}: measuring takes {count} of {self.budget} episodes")
         with watch.busy(f"{env.name}: measuring the landscape"):
             try:
                 found, sloped = measure_character(env, evaluations=count, seed=self.seed), True

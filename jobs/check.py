@@ -23,7 +23,7 @@ from ..landscapes.options import record_options
 from ..landscapes.storage.files import until_full
 from .folder import CHECK, IDENTITY
 from .job import Job
-from .scene import SceneSpec
+from .scene import SceneSpec, first_line
 from .watch import PREPARING, Say, Stopped, Watch, Work
 
 if TYPE_CHECKING:
@@ -263,7 +263,7 @@ class CheckJob:
         plain, sloped = work.losses, work.gradients
         compiling = self._compiling_seconds()
         seconds = (plain * cost.forward + sloped * cost.gradient) / env.threads + compiling + OWN_SECONDS
-        subject = f"{env.name} · {env.fidelity.name} · {env.device} · {env.engine} · {points_for(self.power)} points"
+        subject = first_line(env.identity(), env.engine, f"{points_for(self.power)} points")
         if env.precision != env.fidelity.precision:
             subject += f" · its losses are {env.precision}"
         whole = f"{subject}: about {plain} episodes and {sloped} with gradients, in about {duration(seconds)}"

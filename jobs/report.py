@@ -34,7 +34,7 @@ from ..landscapes.verification import LAST_PLACE, RESAMPLE, verify_dataset
 from .features import features_of, features_work
 from .folder import REPORT, REPORTS, ROOT, SLICE_FILE, SLICE_STORE, folder_named, store_in
 from .plan import simulation_seconds
-from .scene import environment_of
+from .scene import environment_of, first_line
 from .watch import PREPARING, Watch, Work, resumable
 
 if TYPE_CHECKING:
@@ -331,7 +331,7 @@ def _announce(env: Environment, dataset: xr.Dataset, points: int, watch: Watch) 
     device = f", {size(episodes)} of GPU memory" if env.device == "cuda" else ""
     memory = peak_memory() + own_bytes + need_of(rank, env.space.dim, points).memory + (0 if device else episodes)
     watch.announce(
-        f"{env.name} · {env.fidelity.name} · {env.device}: up to {losses} episodes and {gradients} with gradients: "
+        f"{first_line(env.identity())}: up to {losses} episodes and {gradients} with gradients: "
         f"about {duration(seconds)}, plus {duration(own_seconds)} to measure {dataset['loss'].size} samples; "
         f"{size(memory)} of memory{device}",
         seconds + own_seconds,

@@ -13,7 +13,7 @@ from ..studies import study_class
 from ..studies.variants import NamedPoint, Study, StudyOptions, StudyRecord, expected_work
 from .folder import STUDIES, Results, folder_named
 from .job import CheckpointedJob
-from .scene import SceneSpec, given_point, provenance
+from .scene import SceneSpec, first_line, given_point, provenance
 from .watch import PREPARING, Watch, Work
 
 if TYPE_CHECKING:
@@ -98,7 +98,7 @@ class StudyJob(CheckpointedJob[StudyRecord]):
     def _announce(self, watch: Watch) -> None:
         """Say what is left to measure and about how long that takes."""
         study, env = self.study, self.study.env
-        watch.note(f"{env.name} · {env.fidelity.name} · {env.device} · {env.engine} · {self.folder}")
+        watch.note(first_line(env.identity(), env.engine, self.folder))
         watch.note(f"{study.describe_left()} at {len(study.x)} points")
         with watch.busy(f"{env.name}: {PREPARING}"):
             seconds = self.seconds()

@@ -93,12 +93,10 @@ def censuses() -> str:
         if isinstance(found, str):
             rows.append([f"`{scene}`", "", "", found, ", ".join(said)])
             continue
-        told = {word: f"{word} {_interval(one)}" for word, one in found.words.items() if word != FLAT}
-        order = sorted(told, key=lambda word: -found.words[word].value)
-        measured = [told[word] for word in order if found.words[word].value > 0]
+        measured = [word for word, one in found.words.items() if word != FLAT and one.value > 0]
         flat = str(len(found.slices) - found.solid)
-        paper = ", ".join(told[word] for word in said)
-        rows.append([f"`{scene}`", str(len(found.slices)), flat, ", ".join(measured), paper])
+        paper = ", ".join(_share(found, word) for word in said)
+        rows.append([f"`{scene}`", str(len(found.slices)), flat, _most_first(found, measured), paper])
     head = ("environment", "slices", "flat", "measured: share of the other slices (95 % interval)", "the paper's words")
     return table(head, rows)
 
@@ -133,8 +131,7 @@ def presets() -> str:
                 cells += ["", found]
                 continue
             often = [word for word, one in found.words.items() if one.value >= OFTEN or word in said]
-            order = sorted(often, key=lambda word: -found.words[word].value)
-            cells += [found.fidelity, ", ".join(f"{word} {_interval(found.words[word])}" for word in order)]
+            cells += [found.fidelity, _most_first(found, often)]
         rows.append([f"`{scene}`", cells[0], cells[1], cells[3], ", ".join(said)])
     head = ("environment", "fidelity", "with our settings", "with `--preset paper`", "the paper's words")
     return table(head, rows)
@@ -150,6 +147,14 @@ def _census(scene: str, pattern: str = "census/{}-{}.json") -> Census | str:
 def _paper_words(scene: str) -> tuple[str, ...]:
     words = read_paper().words
     return words[scene].words if scene in words else ()
+
+
+def _most_first(found: Census, words: Sequence[str]) -> str:
+    return ", ".join(_share(found, word) for word in sorted(words, key=lambda word: -found.words[word].value))
+
+
+def _share(found: Census, word: str) -> str:
+    return f"{word} {_interval(found.words[word])}"
 
 
 def _interval(share: Estimate) -> str:

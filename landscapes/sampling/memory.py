@@ -66,7 +66,8 @@ class Pool(Generic[T]):
         except (RuntimeError, MemoryError) as error:
             if not is_out_of_memory(error):
                 raise
-        release_idle()  # here, where the error no longer holds what was made of it
+        release_idle()
+        free_memory()  # here, where the error no longer holds what was made of it
         return self._make()
 
 
@@ -93,7 +94,8 @@ class MemoryBound(ObjectiveWrapper):
             rows = x[start : start + (self._most or len(x))]
             part = self._try(rows, grad=grad)
             if part is None:
-                release_idle()  # with the arrays of the attempt that failed
+                release_idle()
+                free_memory()  # the arrays of the attempt that failed
                 part = self._try(rows, grad=grad, last=True) if len(rows) == 1 else None
             if part is None:
                 self._most = len(rows) // 2
@@ -125,10 +127,9 @@ class MemoryBound(ObjectiveWrapper):
 
 
 def release_idle() -> None:
-    """Free the memory that idle solvers of all environments in this process hold."""
+    """Drop the idle solvers of all environments in this process, which frees their memory."""
     for pool in list(Pool.every):
         pool.clear()
-    free_memory()
 
 
 def free_memory() -> None:
